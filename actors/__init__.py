@@ -1,0 +1,1 @@
+"""A hand: ask for work, do it with functions of ``icrl_dist``, send what happened."""

@@ -1,0 +1,1 @@
+"""Robust in-context reinforcement learning, distributed."""

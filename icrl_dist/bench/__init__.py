@@ -1,0 +1,1 @@
+"""Benchmarks: ``icrl-dist bench NAME``, one file each."""

@@ -1,0 +1,343 @@
+"""Every number of a run, with the section of the paper it comes from.
+
+A run file is TOML with one table a section below; ``load`` reads it strictly (an unknown
+key, a wrong type or an impossible value is a ConfigError that names it) and the command
+line overrides it.  Functions take the section they need, never the whole ``Run``, unless
+they need many.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+import typing
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+METHOD_NAMES = ("dpt", "icag", "icaa")
+
+
+class ConfigError(ValueError):
+    """A value that a run cannot have: what, where, and the remedy, on one line."""
+
+
+@dataclass(frozen=True)
+class DarkRoomConfig:
+    """The room (appendix C.1)."""
+
+    size: int = 10
+    """Side of the square room, in cells."""
+    horizon: int = 100
+    """Steps an episode, H."""
+    train_fraction: float = 0.8
+    """Share of the goals that is trained on; the rest is only tested (80/20 goals)."""
+    split_seed: int = 0
+    """Seed of the shuffle that splits the goals."""
+    gamma: float = 0.99
+    """Discount of the optimal action values that labels come from."""
+    label_slack: float = 0.1
+    """A label is uniform over the actions whose value is within this of the best."""
+    labels: Literal["soft", "sampled", "heuristic"] = "soft"
+    """``soft``: see label_slack; ``sampled``: one action drawn from it (eq. 1 to the letter);
+    ``heuristic``: the paper's "y first, then x" rule, optimal only without disturbance."""
+
+
+@dataclass(frozen=True)
+class AdversaryConfig:
+    """The disturbances of pretraining (appendix C.1)."""
+
+    count: int = 8
+    """K, adversaries a task, phi_0 among them (appendix D.1 settles on 8)."""
+    p_max: float = 0.2
+    """An adversary overrides with probability p ~ U(0, p_max)."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """The pretraining dataset D_pre and the fit to it (sections 2 and 4.1)."""
+
+    contexts: int = 80000
+    """Random-policy episodes in all, the same for every method and every K (appendix C.1)."""
+    queries: int = 16
+    """Labelled query states an episode."""
+    steps: int = 20000
+    """Optimiser steps."""
+
+
+@dataclass(frozen=True)
+class ICAAConfig:
+    """In-Context Adversarial Adaptation (Algorithm 3)."""
+
+    rounds: int = 3
+    """J: rounds j = 0..J are collected and fine-tuned on, so J + 1 in all."""
+    trials: int = 40
+    """N: each variation is rolled out for N + 1 trials."""
+    context_trials: int = 20
+    """N_: the first N_ + 1 trials become contexts, labels come from strictly later ones."""
+    label_trials: Literal["later", "top_return"] = "later"
+    """``later``: every later trial (Algorithm 3); ``top_return``: the better half of them."""
+    context: Literal["trial", "history"] = "history"
+    """``trial``: D_n = xi_n (Algorithm 3, line 13); ``history``: all trials up to n, which is
+    what the deployed agent sees (Algorithm 1, line 16)."""
+    steps: int = 4000
+    """Fine-tuning steps a round."""
+    new_fraction: float = 0.5
+    """Share of a fine-tuning batch that comes from self-labelled data; the rest from D^0."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The transformer T_theta (appendix B.2)."""
+
+    layers: int = 4
+    """Attention layers."""
+    heads: int = 1
+    """Attention heads a layer."""
+    width: int = 32
+    """Embedding size: 32 in Dark Room, 256 elsewhere."""
+    fourier: int = 0
+    """Sine and cosine pairs added to each observation component; 0 gives the scaled values
+    only, which keep no gap between training and held-out goals (docs/decisions.md)."""
+    dropout: float = 0.0
+    """Dropout on attention and feed-forward outputs."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """The optimiser (appendix B.2: AdamW, weight decay 1e-4, learning rate 1e-3, batch 128)."""
+
+    learning_rate: float = 1e-3
+    """Peak learning rate."""
+    weight_decay: float = 1e-4
+    """AdamW's decoupled weight decay."""
+    batch: int = 128
+    """Contexts a step."""
+    queries: int = 32
+    """(prefix, query) pairs a context; each sees its own random prefix (eq. 1, many times)."""
+    episodes: int = 4
+    """Episodes in a training context, at most; each context draws its own number."""
+    warmup: int = 200
+    """Steps of linear warm-up; then the rate falls to a tenth along a cosine."""
+    clip: float = 1.0
+    """Largest gradient norm."""
+
+
+@dataclass(frozen=True)
+class ContextConfig:
+    """The context D at deployment (Algorithm 1)."""
+
+    max: int = 4000
+    """Transitions a context may hold; beyond it the oldest whole episodes are dropped."""
+    keep: Literal["all", "last"] = "all"
+    """``all``: every episode so far (Algorithm 1, line 16); ``last``: only the newest."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Online evaluation on held-out tasks (section 5.1)."""
+
+    episodes: int = 40
+    """Online episodes a task."""
+    p: tuple[float, ...] = (0.0, 0.2)
+    """Override probabilities that are tested."""
+    prior: Literal["uniform", "unseen"] = "unseen"
+    """The test adversary's law: ``unseen`` Dirichlet priors, or ``uniform`` over the actions."""
+    seeds: int = 10
+    """Independent evaluations of every task (the paper's 10 random seeds)."""
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """The streams between workers and learner."""
+
+    endpoint: str = "tcp/127.0.0.1:0"
+    """Where the learner listens; port 0 takes a free one.  Loopback unless you change it."""
+    credits: int = 8
+    """W: trajectories a worker may have unanswered."""
+    reply_timeout_s: float = 10.0
+    """A trajectory without a reply for so long is sent again."""
+    lease_s: float = 60.0
+    """A job not finished within so long goes to another worker."""
+    max_message_bytes: int = 16 << 20
+    """A larger message is refused."""
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """The learner process."""
+
+    threads: int = 0
+    """Threads of a fit; 0 takes every core, for the workers wait meanwhile.  The weights
+    digest depends on it, so it is recorded."""
+    restarts: int = 3
+    """Restarts of the learner, and of each worker, before the run gives up."""
+    device: str = "auto"
+    """``auto`` takes a GPU where there is one; ``cpu`` or ``cuda`` decide."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: a method, a problem and every number."""
+
+    method: Literal["dpt", "icag", "icaa"] = "icag"
+    """Which method of section 4 pretrains the transformer."""
+    seed: int = 0
+    """Every random draw of the run is keyed by this and by the identity of the work."""
+    darkroom: DarkRoomConfig = field(default_factory=DarkRoomConfig)
+    adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    icaa: ICAAConfig = field(default_factory=ICAAConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    context: ContextConfig = field(default_factory=ContextConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    stream: StreamConfig = field(default_factory=StreamConfig)
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+
+
+def load(name_or_path: str) -> Run:
+    """The run file of this name among the packaged ones, or at this path.
+
+    Raises ConfigError if there is none, or if any key or value in it is impossible.
+    """
+    path = Path(name_or_path)
+    packaged = resources.files("icrl_dist") / "runs"
+    if path.suffix == ".toml" or "/" in name_or_path:
+        if not path.is_file():
+            raise ConfigError(f"run file {name_or_path!r}: no such file")
+        text = path.read_text()
+    else:
+        file = packaged / f"{name_or_path}.toml"
+        if not file.is_file():
+            names = sorted(f.name.removesuffix(".toml") for f in packaged.iterdir() if f.name.endswith(".toml"))
+            raise ConfigError(
+                f"run {name_or_path!r}: no packaged run of that name{_nearest(name_or_path, names)}; "
+                f"there are {', '.join(names)}; a path must end in .toml"
+            )
+        text = file.read_text()
+    return parse(text, name_or_path)
+
+
+def parse(text: str, source: str) -> Run:
+    """The run that TOML ``text`` describes.  Raises ConfigError naming ``source`` and the key."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    run = typing.cast(Run, _build(Run, tables, source, ""))
+    validate(run, source)
+    return run
+
+
+def validate(run: Run, source: str) -> None:
+    """Raises ConfigError for values that are well typed but impossible."""
+
+    def need(condition: bool, where: str, value: object, remedy: str) -> None:
+        if not condition:
+            raise ConfigError(f"{source}: {where} = {value!r}: {remedy}")
+
+    room, icaa, optim = run.darkroom, run.icaa, run.optim
+    need(room.size >= 2, "darkroom.size", room.size, "a room has at least 2 cells a side")
+    need(room.horizon >= 1, "darkroom.horizon", room.horizon, "an episode has at least 1 step")
+    need(0 < room.train_fraction < 1, "darkroom.train_fraction", room.train_fraction, "use a share between 0 and 1")
+    need(0 < room.gamma <= 1, "darkroom.gamma", room.gamma, "a discount lies in (0, 1]")
+    train = round(room.train_fraction * room.size**2)
+    need(0 < train < room.size**2, "darkroom.train_fraction", room.train_fraction, "leave goals to train and to test")
+    need(0 <= run.adversary.p_max <= 1, "adversary.p_max", run.adversary.p_max, "a probability lies in [0, 1]")
+    need(run.adversary.count >= 1, "adversary.count", run.adversary.count, "at least 1, the null adversary")
+    need(run.seed >= 0, "seed", run.seed, "seeds are not negative")
+    for p in run.evaluate.p:
+        need(0 <= p <= 1, "evaluate.p", p, "a probability lies in [0, 1]")
+    need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
+    need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
+    need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
+    need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
+    need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
+    need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
+    need(run.context.max >= room.horizon, "context.max", run.context.max, "must hold at least one episode")
+    need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
+    need(run.learner.device in ("auto", "cpu", "cuda"), "learner.device", run.learner.device, "use auto, cpu or cuda")
+    positive = {
+        "pretrain.queries": run.pretrain.queries,
+        "pretrain.steps": run.pretrain.steps,
+        "icaa.steps": icaa.steps,
+        "model.layers": run.model.layers,
+        "model.heads": run.model.heads,
+        "optim.learning_rate": optim.learning_rate,
+        "optim.batch": optim.batch,
+        "optim.queries": optim.queries,
+        "optim.episodes": optim.episodes,
+        "optim.clip": optim.clip,
+        "evaluate.episodes": run.evaluate.episodes,
+        "evaluate.seeds": run.evaluate.seeds,
+        "stream.credits": run.stream.credits,
+        "stream.lease_s": run.stream.lease_s,
+        "stream.reply_timeout_s": run.stream.reply_timeout_s,
+        "stream.max_message_bytes": run.stream.max_message_bytes,
+    }
+    for where, value in positive.items():
+        need(value > 0, where, value, "must be above 0")
+
+
+def dumps(run: Run) -> str:
+    """The run as TOML that ``parse`` reads back to an equal value."""
+    lines: list[str] = []
+    tables: list[str] = []
+    for item in dataclasses.fields(run):
+        value = getattr(run, item.name)
+        if dataclasses.is_dataclass(value):
+            rows = [f"{f.name} = {_toml(getattr(value, f.name))}" for f in dataclasses.fields(value)]
+            tables.append("\n".join([f"[{item.name}]", *rows]))
+        else:
+            lines.append(f"{item.name} = {_toml(value)}")
+    return "\n".join(lines) + "\n\n" + "\n\n".join(tables) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return repr(value)
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _build(cls: type, table: dict[str, Any], source: str, prefix: str) -> object:
+    hints = typing.get_type_hints(cls)
+    for key in table:
+        if key not in hints:
+            known = list(hints)
+            raise ConfigError(f"{source}: unknown key {prefix}{key}{_nearest(key, known)}; known keys here: {', '.join(known)}")
+    values = {key: _value(hints[key], value, source, prefix + key) for key, value in table.items()}
+    return cls(**values)
+
+
+def _value(hint: Any, value: Any, source: str, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise ConfigError(f"{source}: {where} = {value!r}: expected a table [{where}]")
+        return _build(typing.cast(type, hint), value, source, where + ".")
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        if value not in typing.get_args(hint):
+            choices = ", ".join(map(repr, typing.get_args(hint)))
+            raise ConfigError(f"{source}: {where} = {value!r}: choose one of {choices}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise ConfigError(f"{source}: {where} = {value!r}: expected a list")
+        return tuple(_value(typing.get_args(hint)[0], v, source, where) for v in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not hint:
+        raise ConfigError(f"{source}: {where} = {value!r}: expected {hint.__name__}, got {type(value).__name__}")
+    return value

@@ -1,0 +1,103 @@
+"""Contexts D, and how trajectories of one variation become training examples (D, s_query, a*)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from icrl_dist.types import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """What one variation offers to learn from: episodes for contexts, labelled queries.
+
+    Any query of a variation goes with any context of it, for its label depends on (tau, phi)
+    alone.  ``history`` says that a context must be the episodes from the first on, in order,
+    as the deployed agent met them; otherwise it is any of the episodes in any order.
+    """
+
+    observations: Float32[np.ndarray, "E H+1 S"]
+    actions: Int64[np.ndarray, "E H"]
+    rewards: Float32[np.ndarray, "E H"]
+    queries: Float32[np.ndarray, "Q S"]
+    labels: Float32[np.ndarray, "Q A"]
+    history: bool
+
+    @classmethod
+    def of(
+        cls,
+        episodes: Sequence[Trajectory],
+        queries: Float32[np.ndarray, "Q S"],
+        labels: Float32[np.ndarray, "Q A"],
+        history: bool = False,
+    ) -> Examples:
+        """Raises ValueError without an episode or without a label."""
+        if not episodes or not len(queries):
+            raise ValueError(f"examples need an episode and a label, got {len(episodes)} and {len(queries)}")
+        return cls(
+            np.stack([t.observations for t in episodes]),
+            np.stack([t.actions for t in episodes]).astype(np.int64),
+            np.stack([t.rewards for t in episodes]),
+            np.asarray(queries, np.float32),
+            np.asarray(labels, np.float32),
+            history,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """B contexts of up to T transitions, zero-padded at the end, and N queries of each.
+
+    Padding needs no mask: context tokens see only earlier ones, and ``prefix`` never
+    reaches beyond a context's real length.
+    """
+
+    observations: Float32[np.ndarray, "B T S"]
+    actions: Int64[np.ndarray, "B T"]
+    next_observations: Float32[np.ndarray, "B T S"]
+    rewards: Float32[np.ndarray, "B T"]
+    queries: Float32[np.ndarray, "B N S"]
+    labels: Float32[np.ndarray, "B N A"]
+    prefix: Int64[np.ndarray, "B N"]
+
+
+def draw(rng: np.random.Generator, pool: Sequence[Examples], batch: int, queries: int, episodes: int) -> Batch:
+    """A training batch: random variations, random contexts of them, random prefixes and queries.
+
+    All contexts of a batch have the same drawn number of episodes (at most ``episodes``, and
+    at most what the variation has), so little is padding.
+    """
+    count = int(rng.integers(1, episodes + 1))
+    rows = [_context(rng, pool[i], count, queries) for i in rng.integers(0, len(pool), size=batch)]
+    length = max(len(r[1]) for r in rows)
+
+    def padded(column: int) -> np.ndarray:
+        first = rows[0][column]
+        out = np.zeros((batch, length, *first.shape[1:]), dtype=first.dtype)
+        for b, row in enumerate(rows):
+            out[b, : len(row[column])] = row[column]
+        return out
+
+    stacked = [np.stack([r[c] for r in rows]) for c in (4, 5, 6)]
+    return Batch(padded(0), padded(1), padded(2), padded(3), *stacked)
+
+
+def _context(rng: np.random.Generator, examples: Examples, count: int, queries: int) -> tuple[np.ndarray, ...]:
+    total = len(examples.actions)
+    chosen = np.arange(min(count, total)) if examples.history else rng.permutation(total)[:count]
+    states = examples.observations[chosen]
+    query = rng.integers(0, len(examples.queries), size=queries)
+    length = len(chosen) * examples.actions.shape[1]
+    return (
+        states[:, :-1].reshape(length, -1),
+        examples.actions[chosen].reshape(length),
+        states[:, 1:].reshape(length, -1),
+        examples.rewards[chosen].reshape(length),
+        examples.queries[query],
+        examples.labels[query],
+        rng.integers(0, length + 1, size=queries),
+    )

@@ -1,0 +1,60 @@
+"""The override adversary of Dark Room (appendix C.1): its law, exactly, and its priors."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.special import gammainc, gammaln
+
+from icrl_dist.types import NULL, Adversary
+
+ALPHA_RANGE = (0.05, 2.0)
+"""Prior of each Dirichlet parameter; the paper gives none (docs/decisions.md)."""
+
+
+def argmax_law(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
+    """q_b = P(argmax of x ~ Dirichlet(alpha) is b), to about 1e-9.
+
+    x is a normalised vector of independent Gamma(alpha_b), so
+    q_b = integral of f_b(t) * prod_{c != b} F_c(t) dt.  With t = exp(y) the integrand is
+    smooth and dies off at both ends, where the trapezoid rule converges exponentially.
+    """
+    a = np.asarray(alpha, dtype=np.float64)[:, None]
+    y = np.linspace(-120.0, 7.0, 6001)[None, :]
+    t = np.exp(y)
+    log_density = a * y - t - gammaln(a)
+    cdf = gammainc(a, t)
+    others = np.stack([np.prod(np.delete(cdf, b, axis=0), axis=0) for b in range(len(alpha))])
+    q = np.trapezoid(np.exp(log_density) * others, y[0], axis=1)
+    return q / q.sum()
+
+
+def override_law(adversary: Adversary, actions: int) -> tuple[float, Float64[np.ndarray, " A"]]:
+    """``(p, q)``: with probability p the executed action is drawn from q.
+
+    Raises ValueError if p is outside [0, 1] or the adversary is of another family.
+    """
+    if adversary.kind == "null":
+        return 0.0, np.full(actions, 1.0 / actions)
+    p = adversary.number("p") if adversary.kind in ("dirichlet", "uniform") else 0.0
+    if not 0.0 <= p <= 1.0:
+        raise ValueError(f"adversary p={p}: the probability of an override must lie in [0, 1]")
+    if adversary.kind == "uniform":
+        return p, np.full(actions, 1.0 / actions)
+    if adversary.kind == "dirichlet":
+        alpha = tuple(float(a) for a in adversary.vector("alpha"))
+        if len(alpha) != actions or min(alpha) <= 0:
+            raise ValueError(f"adversary alpha={alpha}: expected {actions} numbers above 0, one an action")
+        return p, argmax_law(alpha)
+    raise ValueError(f"adversary {adversary.kind!r}: Dark Room knows null, uniform and dirichlet")
+
+
+def sample_dirichlet(rng: np.random.Generator, actions: int, p_max: float) -> Adversary:
+    """A random adversary phi^{i,k}: p ~ U(0, p_max) and alpha_b ~ U(0.05, 2) (appendix C.1)."""
+    p = float(rng.uniform(0.0, p_max))
+    return Adversary.of("dirichlet", p=p, alpha=rng.uniform(*ALPHA_RANGE, size=actions))
+
+
+def adversary_set(rng: np.random.Generator, count: int, actions: int, p_max: float) -> tuple[Adversary, ...]:
+    """K adversaries of one task; the first is always phi_0 (section 4.1)."""
+    return (NULL, *(sample_dirichlet(rng, actions, p_max) for _ in range(count - 1)))

@@ -1,0 +1,1 @@
+"""Networks: the GPT-2 trunk and the models on it."""

@@ -1,0 +1,101 @@
+"""T_theta of DPT, ICAG and ICAA: transitions in, a distribution over actions out.
+
+Every transition (s, a, s', r) of the context is one token (appendix B.2); a query state is
+one token.  Observations are scaled to [-1, 1] by the spec, so nothing here knows a game.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from icrl_dist.config import ModelConfig
+from icrl_dist.models.gpt import GPT, Cache
+from icrl_dist.types import Spec
+
+
+class Transitions(NamedTuple):
+    """T transitions of each of B contexts."""
+
+    observations: Float[Tensor, "B T S"]
+    actions: Int[Tensor, "B T"]
+    next_observations: Float[Tensor, "B T S"]
+    rewards: Float[Tensor, "B T"]
+
+
+class PretrainedTransformer(nn.Module):
+    """T_theta(a | s_query, D) of eq. (1)."""
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, spec: Spec, config: ModelConfig) -> None:
+        super().__init__()
+        if not spec.discrete:
+            raise ValueError("PretrainedTransformer: only discrete actions are built so far")
+        self.spec, self.config = spec, config
+        self.register_buffer("low", torch.tensor(spec.low), persistent=False)
+        self.register_buffer("high", torch.tensor(spec.high), persistent=False)
+        features = spec.observation * (1 + 2 * config.fourier)
+        self.embed_transition = nn.Linear(2 * features + spec.actions + 1, config.width)
+        self.embed_query = nn.Linear(features, config.width)
+        self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
+        self.head = nn.Linear(config.width, spec.actions)
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.normal_(module.weight, std=0.02 if module.in_features > 4 * features else module.in_features**-0.5)
+                nn.init.zeros_(module.bias)
+
+    def features(self, observations: Float[Tensor, "*B S"]) -> Float[Tensor, "*B F"]:
+        """Observations scaled to [-1, 1], with ``fourier`` sine and cosine pairs of each."""
+        x = 2 * (observations - self.low) / (self.high - self.low) - 1
+        waves = [f(0.5 * torch.pi * k * x) for k in range(1, self.config.fourier + 1) for f in (torch.sin, torch.cos)]
+        return torch.cat([x, *waves], dim=-1)
+
+    def encode(self, context: Transitions, past: Cache | None = None) -> Cache:
+        """Keys and values of a context, appended to an earlier one's."""
+        one_hot = nn.functional.one_hot(context.actions, self.spec.actions).to(context.rewards.dtype)
+        token = torch.cat(
+            [
+                self.features(context.observations),
+                one_hot,
+                self.features(context.next_observations),
+                context.rewards.unsqueeze(-1),
+            ],
+            dim=-1,
+        )
+        return self.trunk.encode(self.embed_transition(token), past)
+
+    def decide(
+        self, queries: Float[Tensor, "B Q S"], cache: Cache, prefix: Int[Tensor, "B Q"] | None = None
+    ) -> Float[Tensor, "B Q A"]:
+        """Logits of T_theta at query states, each given its own prefix of the context.
+
+        ``prefix`` is the number of transitions that a query sees; None shows it all of them.
+        """
+        seen = None
+        if prefix is not None:
+            length = cache[0][0].shape[2]
+            seen = torch.arange(length, device=queries.device) < prefix.unsqueeze(-1)
+        logits: Tensor = self.head(self.trunk.query(self.embed_query(self.features(queries)), cache, seen))
+        return logits
+
+    def forward(
+        self, context: Transitions, queries: Float[Tensor, "B Q S"], prefix: Int[Tensor, "B Q"]
+    ) -> Float[Tensor, "B Q A"]:
+        return self.decide(queries, self.encode(context), prefix)
+
+
+def weights_of(model: nn.Module) -> dict[str, np.ndarray]:
+    """The parameters as numpy arrays by name: copies, little-endian."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in model.state_dict().items()}
+
+
+def load_weights(model: nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises RuntimeError naming the parameters unless names and shapes are the model's own."""
+    model.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in arrays.items()})

@@ -1,0 +1,1 @@
+"""Packaged run files: ``icrl-dist train NAME`` reads ``NAME.toml`` here."""

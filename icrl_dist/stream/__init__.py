@@ -1,0 +1,1 @@
+"""The streams between workers and learner: messages, links, credits."""

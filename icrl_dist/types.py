@@ -1,0 +1,257 @@
+"""The values that cross every boundary of the system: frozen, numpy only.
+
+A *game* (section 3.1 of the paper) closed with a fixed adversary is a *variation
+environment* (section 4.1).  Everything that names one, or that came out of one, is here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float32, Int16, Shaped
+
+Value = int | float | str | tuple[int, ...] | tuple[float, ...]
+Params = tuple[tuple[str, Value], ...]
+
+STAGES = ("pretrain", "adapt", "evaluate")
+
+
+def _params(values: Mapping[str, object]) -> Params:
+    """Sorted ``(name, value)`` pairs, so that equal parameters are equal values."""
+    pairs: list[tuple[str, Value]] = []
+    for name, value in sorted(values.items()):
+        if isinstance(value, (list, tuple, np.ndarray)):
+            flat = tuple(v.item() if isinstance(v, np.generic) else v for v in value)
+            if not all(isinstance(v, (int, float)) for v in flat):
+                raise TypeError(f"parameter {name}={value!r} is not a flat list of numbers")
+            pairs.append((name, flat))
+        elif isinstance(value, np.generic):
+            pairs.append((name, value.item()))
+        elif isinstance(value, (int, float, str)):
+            pairs.append((name, value))
+        else:
+            raise TypeError(f"parameter {name}={value!r} must be a number, a string or a flat list")
+    return tuple(pairs)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Named:
+    """A kind and its parameters: data, not a class, so that any wire can carry it."""
+
+    kind: str
+    params: Params = ()
+
+    @classmethod
+    def of(cls, kind: str, /, **params: object) -> Self:
+        return cls(kind, _params(params))
+
+    def __getitem__(self, name: str) -> Value:
+        for key, value in self.params:
+            if key == name:
+                return value
+        known = ", ".join(key for key, _ in self.params) or "none"
+        raise KeyError(f"{self.kind} has no parameter {name!r}; it has: {known}")
+
+    def get(self, name: str, default: Value) -> Value:
+        return dict(self.params).get(name, default)
+
+    def vector(self, name: str) -> tuple[float, ...]:
+        """The parameter as a tuple of numbers.  Raises TypeError if it is not one."""
+        value = self[name]
+        if not isinstance(value, tuple):
+            raise TypeError(f"{self.kind}: {name}={value!r} is not a list of numbers")
+        return value
+
+    def number(self, name: str) -> float:
+        """The parameter as one number.  Raises TypeError if it is not one."""
+        value = self[name]
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{self.kind}: {name}={value!r} is not a number")
+        return value
+
+    def replace(self, **params: object) -> Self:
+        return type(self)(self.kind, _params({**dict(self.params), **params}))
+
+
+class Task(_Named):
+    """An MDP tau: the game's name (``kind``) and its parameters.
+
+    ``Task.of("darkroom", size=10, horizon=100, goal=(3, 4))``.
+    """
+
+    __slots__ = ()
+
+
+class Adversary(_Named):
+    """A fixed disturbance policy phi: its family (``kind``) and its parameters."""
+
+    __slots__ = ()
+
+
+NULL = Adversary("null")
+"""phi_0: the adversary that does nothing; it belongs to every adversary set (section 4.1)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Variation:
+    """A variation environment (tau, phi) of the augmented task space M_v."""
+
+    task: Task
+    adversary: Adversary = NULL
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Spec:
+    """What an agent needs to know of an environment's shape, and nothing else.
+
+    A checkpoint holds the spec it was trained for and refuses another.
+    """
+
+    low: tuple[float, ...]
+    """Smallest value of each observation component, in the environment's own unit."""
+    high: tuple[float, ...]
+    """Largest value of each observation component."""
+    actions: int
+    """Number of discrete actions, or the action's dimension if ``discrete`` is false."""
+    horizon: int
+    """Steps an episode, H."""
+    discrete: bool = True
+
+    @property
+    def observation(self) -> int:
+        """Number of observation components, S."""
+        return len(self.low)
+
+
+class Identity(NamedTuple):
+    """Which trajectory this is, the same everywhere: wire, ledger, seeds and leases."""
+
+    stage: str
+    round: int
+    task: int
+    variation: int
+    trial: int
+
+    def key(self) -> tuple[int, ...]:
+        """The identity as integers, for canonical order and as a seed's spawn key."""
+        return (STAGES.index(self.stage), self.round, self.task, self.variation, self.trial)
+
+    def rng(self, seed: int) -> np.random.Generator:
+        """The generator of this trajectory's draws; which worker runs it makes no difference."""
+        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=self.key()))
+
+    def __str__(self) -> str:
+        return "/".join(map(str, self))
+
+    @classmethod
+    def parse(cls, text: str) -> Identity:
+        """The inverse of ``str``.  Raises ValueError naming the form expected."""
+        parts = text.split("/")
+        if len(parts) != 5 or parts[0] not in STAGES or not all(p.isdigit() for p in parts[1:]):
+            raise ValueError(f"identity {text!r}: expected STAGE/ROUND/TASK/VARIATION/TRIAL, STAGE one of {STAGES}")
+        return cls(parts[0], *map(int, parts[1:]))
+
+
+class Step(NamedTuple):
+    """One step of a batch of B environments."""
+
+    observation: Float32[np.ndarray, "B S"]
+    reward: Float32[np.ndarray, " B"]
+    done: bool
+    """The horizon was reached: all environments of a batch end together."""
+    adversary: Int16[np.ndarray, " B"]
+    """The action the adversary put in the agent's place, or -1 where it did not."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """An episode xi_n in one variation environment, and what its collector knew better.
+
+    ``labels`` are written by whoever knows the right actions (an exact solver, an expert
+    network, nobody), so expert policies never travel.
+    """
+
+    identity: Identity
+    variation: Variation
+    weights: int
+    """Version of the weights that acted; -1 for a policy without weights."""
+    digest: str
+    """Digest of those weights; empty for a policy without weights."""
+    worker: str
+    observations: Float32[np.ndarray, "H+1 S"]
+    actions: Int16[np.ndarray, " H"]
+    rewards: Float32[np.ndarray, " H"]
+    adversary: Int16[np.ndarray, " H"]
+    queries: Float32[np.ndarray, "Q S"]
+    """Query states s_query; none (Q = 0) if the collector knew no labels."""
+    labels: Float32[np.ndarray, "Q A"]
+    """A distribution over actions at each query state."""
+    origin: str
+    """Where the labels came from: ``optimal``, ``heuristic`` or ``none``."""
+
+    @property
+    def episode_return(self) -> float:
+        return float(self.rewards.sum())
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Every array by name, in the one order used by wire, store and digest."""
+        return {name: getattr(self, name) for name in ARRAYS}
+
+
+ARRAYS: dict[str, tuple[str, int]] = {
+    "observations": ("<f4", 2),
+    "actions": ("<i2", 1),
+    "rewards": ("<f4", 1),
+    "adversary": ("<i2", 1),
+    "queries": ("<f4", 2),
+    "labels": ("<f4", 2),
+}
+"""A trajectory's arrays: their dtype and number of dimensions."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """One version of T_theta's parameters; version j is the model T_theta^j."""
+
+    version: int
+    arrays: Mapping[str, Shaped[np.ndarray, "..."]]
+    digest: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Job:
+    """A fixed batch of work: all K variations of one task, for a number of trials.
+
+    The batch is part of the job and not of the worker, so floating-point results do not
+    depend on how jobs are spread.
+    """
+
+    kind: str
+    """A function of ``jobs.py``: ``random_context`` or ``adapt``."""
+    stage: str
+    round: int
+    task: int
+    variations: tuple[Variation, ...]
+    trials: int
+    """Episodes in each variation."""
+    weights: int
+    """Weights version that must act; -1 for none."""
+    seed: int
+    settings: Params = ()
+    """Further numbers that the function needs, from the run's config."""
+
+    def setting(self, name: str) -> Value:
+        return _Named(self.kind, self.settings)[name]
+
+    def identities(self) -> Iterable[Identity]:
+        """Every trajectory this job will deliver."""
+        for variation in range(len(self.variations)):
+            for trial in range(self.trials):
+                yield Identity(self.stage, self.round, self.task, variation, trial)
+
+    @property
+    def name(self) -> tuple[str, int, int]:
+        return (self.stage, self.round, self.task)

@@ -1,0 +1,1 @@
+"""A memory: hand out work, take in trajectories, fine-tune, broadcast."""
