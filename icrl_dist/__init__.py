@@ -1,1 +1,39 @@
-"""Robust in-context reinforcement learning, distributed."""
+"""Robust in-context reinforcement learning, distributed.
+
+``load_agent`` a trained model and deploy it; ``make`` a variation environment to deploy it
+in; ``oracle`` knows the exact answers of Dark Room.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from icrl_dist import oracle
+    from icrl_dist.agent import InContextAgent, load_agent
+    from icrl_dist.envs import make
+    from icrl_dist.types import NULL, Adversary, Task, Variation
+
+__version__ = "0.1.0"
+
+__all__ = ["NULL", "Adversary", "InContextAgent", "Task", "Variation", "load_agent", "make", "oracle"]
+
+_HOME = {
+    "InContextAgent": "icrl_dist.agent",
+    "load_agent": "icrl_dist.agent",
+    "make": "icrl_dist.envs",
+    "NULL": "icrl_dist.types",
+    "Adversary": "icrl_dist.types",
+    "Task": "icrl_dist.types",
+    "Variation": "icrl_dist.types",
+}
+
+
+def __getattr__(name: str) -> object:
+    """The public names, imported when first asked for: most commands need no torch."""
+    if name == "oracle":
+        return importlib.import_module("icrl_dist.oracle")
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'icrl_dist' has no attribute {name!r}")

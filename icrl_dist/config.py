@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
+import math
 import tomllib
 import typing
 from dataclasses import dataclass, field
@@ -80,8 +82,9 @@ class ICAAConfig:
     label_trials: Literal["later", "top_return"] = "later"
     """``later``: every later trial (Algorithm 3); ``top_return``: the better half of them."""
     context: Literal["trial", "history"] = "history"
-    """``trial``: D_n = xi_n (Algorithm 3, line 13); ``history``: all trials up to n, which is
-    what the deployed agent sees (Algorithm 1, line 16)."""
+    """``history``: a context is trials 0 to n, what the deployed agent sees (Algorithm 1, line
+    16); ``trial``: any of the trials, and with optim.episodes = 1 one of them (Algorithm 3,
+    line 13)."""
     steps: int = 4000
     """Fine-tuning steps a round."""
     new_fraction: float = 0.5
@@ -208,7 +211,10 @@ def load(name_or_path: str) -> Run:
     if path.suffix == ".toml" or "/" in name_or_path:
         if not path.is_file():
             raise ConfigError(f"run file {name_or_path!r}: no such file")
-        text = path.read_text()
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"run file {name_or_path!r}: cannot be read: {error}") from None
     else:
         file = packaged / f"{name_or_path}.toml"
         if not file.is_file():
@@ -217,7 +223,7 @@ def load(name_or_path: str) -> Run:
                 f"run {name_or_path!r}: no packaged run of that name{_nearest(name_or_path, names)}; "
                 f"there are {', '.join(names)}; a path must end in .toml"
             )
-        text = file.read_text()
+        text = file.read_text(encoding="utf-8")
     return parse(text, name_or_path)
 
 
@@ -256,6 +262,7 @@ def validate(run: Run, source: str) -> None:
     need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
     need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
     need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
+    need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
     need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
     need(run.context.max >= room.horizon, "context.max", run.context.max, "must hold at least one episode")
     need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
@@ -265,7 +272,7 @@ def validate(run: Run, source: str) -> None:
         "pretrain.steps": run.pretrain.steps,
         "icaa.steps": icaa.steps,
         "model.layers": run.model.layers,
-        "model.heads": run.model.heads,
+        "model.width": run.model.width,
         "optim.learning_rate": optim.learning_rate,
         "optim.batch": optim.batch,
         "optim.queries": optim.queries,
@@ -279,7 +286,18 @@ def validate(run: Run, source: str) -> None:
         "stream.max_message_bytes": run.stream.max_message_bytes,
     }
     for where, value in positive.items():
-        need(value > 0, where, value, "must be above 0")
+        need(0 < value < math.inf, where, value, "must be above 0 and finite")
+    not_negative = {
+        "darkroom.split_seed": room.split_seed,
+        "darkroom.label_slack": room.label_slack,
+        "model.fourier": run.model.fourier,
+        "optim.weight_decay": optim.weight_decay,
+        "optim.warmup": optim.warmup,
+        "learner.threads": run.learner.threads,
+        "learner.restarts": run.learner.restarts,
+    }
+    for where, value in not_negative.items():
+        need(0 <= value < math.inf, where, value, "must not be negative, and be finite")
 
 
 def dumps(run: Run) -> str:
@@ -300,7 +318,7 @@ def _toml(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return json.dumps(value, ensure_ascii=False)
     if isinstance(value, tuple):
         return "[" + ", ".join(map(_toml, value)) + "]"
     return repr(value)

@@ -20,8 +20,8 @@ class Examples:
     as the deployed agent met them; otherwise it is any of the episodes in any order.
     """
 
-    observations: Float32[np.ndarray, "E H+1 S"]
     actions: Int64[np.ndarray, "E H"]
+    observations: Float32[np.ndarray, "E H+1 S"]
     rewards: Float32[np.ndarray, "E H"]
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
@@ -39,13 +39,21 @@ class Examples:
         if not episodes or not len(queries):
             raise ValueError(f"examples need an episode and a label, got {len(episodes)} and {len(queries)}")
         return cls(
-            np.stack([t.observations for t in episodes]),
             np.stack([t.actions for t in episodes]).astype(np.int64),
+            np.stack([t.observations for t in episodes]),
             np.stack([t.rewards for t in episodes]),
             np.asarray(queries, np.float32),
             np.asarray(labels, np.float32),
             history,
         )
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Examples of many variations, and the share of a training batch that comes from them."""
+
+    share: float
+    examples: Sequence[Examples]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +73,18 @@ class Batch:
     prefix: Int64[np.ndarray, "B N"]
 
 
-def draw(rng: np.random.Generator, pool: Sequence[Examples], batch: int, queries: int, episodes: int) -> Batch:
+def draw(rng: np.random.Generator, pools: Sequence[Pool], batch: int, queries: int, episodes: int) -> Batch:
     """A training batch: random variations, random contexts of them, random prefixes and queries.
+
+    Each row chooses its pool by share and then a variation of it uniformly.
 
     All contexts of a batch have the same drawn number of episodes (at most ``episodes``, and
     at most what the variation has), so little is padding.
     """
     count = int(rng.integers(1, episodes + 1))
-    rows = [_context(rng, pool[i], count, queries) for i in rng.integers(0, len(pool), size=batch)]
+    shares = np.array([pool.share for pool in pools])
+    chosen = [pools[i].examples for i in rng.choice(len(pools), size=batch, p=shares / shares.sum())]
+    rows = [_context(rng, examples[rng.integers(0, len(examples))], count, queries) for examples in chosen]
     length = max(len(r[1]) for r in rows)
 
     def padded(column: int) -> np.ndarray:

@@ -50,16 +50,18 @@ def fit(
     steps: int,
     batch: Callable[[int], Batch],
     progress: Callable[[int, float], None] = lambda step, value: None,
+    first: int = 0,
 ) -> float:
     """Minimise eq. (1) for ``steps`` steps; ``batch(step)`` draws the data.
 
-    Returns the mean loss of the last tenth.  Raises FloatingPointError if the loss stops
-    being a number.
+    A step depends on its number, the weights and the optimiser alone, so a fit stopped after
+    ``first`` steps goes on as if it had never stopped.  Returns the mean loss of the last
+    tenth.  Raises FloatingPointError if the loss stops being a number.
     """
     model.train()
     warmup = min(config.warmup, max(1, steps // 10))
     total, counted = 0.0, 0
-    for step in range(steps):
+    for step in range(first, steps):
         for group in opt.param_groups:
             group["lr"] = config.learning_rate * rate(step, steps, warmup)
         value = batch_loss(model, batch(step))
@@ -74,4 +76,4 @@ def fit(
             total, counted = total + current, counted + 1
         progress(step + 1, current)
     model.eval()
-    return total / counted
+    return total / max(1, counted)

@@ -150,7 +150,7 @@ class Identity(NamedTuple):
     def parse(cls, text: str) -> Identity:
         """The inverse of ``str``.  Raises ValueError naming the form expected."""
         parts = text.split("/")
-        if len(parts) != 5 or parts[0] not in STAGES or not all(p.isdigit() for p in parts[1:]):
+        if len(parts) != 5 or parts[0] not in STAGES or not all(p.isascii() and p.isdigit() for p in parts[1:]):
             raise ValueError(f"identity {text!r}: expected STAGE/ROUND/TASK/VARIATION/TRIAL, STAGE one of {STAGES}")
         return cls(parts[0], *map(int, parts[1:]))
 
@@ -181,8 +181,8 @@ class Trajectory:
     digest: str
     """Digest of those weights; empty for a policy without weights."""
     worker: str
-    observations: Float32[np.ndarray, "H+1 S"]
     actions: Int16[np.ndarray, " H"]
+    observations: Float32[np.ndarray, "H+1 S"]
     rewards: Float32[np.ndarray, " H"]
     adversary: Int16[np.ndarray, " H"]
     queries: Float32[np.ndarray, "Q S"]

@@ -33,9 +33,9 @@ def task(goal: Sequence[int], size: int = 10, horizon: int = 100, start: Sequenc
 def check(task: Task) -> None:
     """Raises ValueError, naming the value, unless the task describes a room."""
     size, horizon = task.number("size"), task.number("horizon")
-    if size < 2 or size != int(size):
+    if not (size >= 2 and float(size).is_integer()):
         raise ValueError(f"darkroom size={size}: expected a whole number of cells, at least 2")
-    if horizon < 1 or horizon != int(horizon):
+    if not (horizon >= 1 and float(horizon).is_integer()):
         raise ValueError(f"darkroom horizon={horizon}: expected a whole number of steps, at least 1")
     for name in ("goal", "start"):
         if name == "start" and task.get("start", "random") == "random":
@@ -77,6 +77,7 @@ class DarkRoom:
         size = int(tasks[0].number("size"))
         self.spec = spec(tasks[0])
         self.batch = len(tasks)
+        self._h = self.spec.horizon
         self._cells = cells(size)
         self._next = next_cell(size).ravel()
         self._goal = np.array([int(g[0]) * size + int(g[1]) for g in (t.vector("goal") for t in tasks)])
@@ -100,9 +101,11 @@ class DarkRoom:
         return observation
 
     def step(self, actions: Int[np.ndarray, " B"]) -> Step:
-        """Act in every row.  Raises RuntimeError past the horizon."""
+        """Act in every row.  Raises RuntimeError past the horizon or before a reset."""
         if self._h >= self.spec.horizon:
             raise RuntimeError(f"darkroom: stepped past the horizon of {self.spec.horizon}; call reset first")
+        if actions.shape != (self.batch,) or actions.min() < 0 or actions.max() >= ACTIONS:
+            raise ValueError(f"darkroom: actions {actions}: expected {self.batch} numbers in 0..{ACTIONS - 1}")
         u = self._noise[self._h]
         drawn = np.zeros(self.batch, dtype=np.int64)
         for edge in self._edges.T:

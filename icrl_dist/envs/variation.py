@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -22,7 +22,7 @@ class VariationEnv(gymnasium.Env[Observation, np.int64]):
     An episode is truncated at the horizon and never terminates.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata = {"render_modes": []}  # noqa: RUF012 - gymnasium declares it so
     render_mode: str | None = None
 
     def __init__(self, variation: Variation, batch: Batch) -> None:

@@ -1,0 +1,154 @@
+"""Deploying agents on held-out tasks, beside the oracle that knows task and adversary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from icrl_dist import envs
+from icrl_dist.config import Run
+from icrl_dist.envs import tasks
+from icrl_dist.envs.darkroom import ACTIONS
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.oracle import Hypotheses, OptimalAgent, cell_numbers, optimal_returns, soft_labels
+from icrl_dist.recipes import Dataset, Phase, by_variation, self_labelled
+from icrl_dist.rollout import InContextPolicy, Policy, RandomPolicy, deploy_offline, deploy_online, episode
+from icrl_dist.stats import mean_and_error
+from icrl_dist.types import Identity, Variation
+
+MakePolicy = Callable[[Sequence[Variation]], Policy]
+ORACLE = "oracle"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Returns of one agent at one disturbance, and the exact optimum of the same variations."""
+
+    agent: str
+    p: float
+    returns: Float[np.ndarray, "tasks seeds episodes"]
+    optimum: Float[np.ndarray, " tasks"]
+    """Expected return of the optimal policy in each task's variation, by value iteration."""
+
+    def last(self, episodes: int) -> float:
+        """Mean return over the last episodes."""
+        return float(self.returns[:, :, -episodes:].mean())
+
+    def row(self) -> dict[str, Any]:
+        """The result as plain values, for JSON."""
+        mean, error = mean_and_error(self.returns)
+        return {
+            "agent": self.agent,
+            "p": self.p,
+            "episodes": [round(float(m), 3) for m in mean],
+            "standard_error": [None if np.isnan(e) else round(float(e), 3) for e in error],
+            "optimum": round(float(self.optimum.mean()), 3),
+            "last5": round(self.last(5), 3),
+            "last5_over_optimum": round(self.last(5) / float(self.optimum.mean()), 4),
+        }
+
+
+def variations(run: Run, p: float) -> tuple[Variation, ...]:
+    """Every held-out task under its test adversary of strength p, started in the origin."""
+    test = tasks.split(run).test
+    return tuple(Variation(tasks.deployed(t), tasks.test_adversary(run, i, p, run.evaluate.prior)) for i, t in enumerate(test))
+
+
+def in_context(run: Run, model: PretrainedTransformer) -> MakePolicy:
+    """T_theta, deployed by Algorithm 1."""
+    return lambda rows: InContextPolicy(model, len(rows), run.context)
+
+
+def random(rows: Sequence[Variation]) -> Policy:
+    """The uniform policy."""
+    return RandomPolicy(ACTIONS)
+
+
+def optimal(run: Run) -> MakePolicy:
+    """The oracle, which follows pi*_{tau,phi} of every row."""
+
+    def make(rows: Sequence[Variation]) -> Policy:
+        hypotheses = Hypotheses.of(rows)
+        return OptimalAgent(soft_labels(hypotheses, run.darkroom.gamma, slack=0.0), hypotheses.size)
+
+    return make
+
+
+def online(
+    run: Run,
+    agents: Mapping[str, MakePolicy],
+    progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
+) -> list[Result]:
+    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, same chance for all."""
+    results = []
+    for level, p in enumerate(run.evaluate.p):
+        chosen = variations(run, p)
+        optimum = optimal_returns(Hypotheses.of(chosen))
+        rows, ids = _rows(run, chosen, level)
+        for name, make in agents.items():
+            env = envs.batch(rows)
+            trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
+            returns = []
+            for ran in deploy_online(env, make(rows), trials):
+                returns.append(ran.returns)
+                progress(name, p, len(returns))
+            shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
+            results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum))
+    return results
+
+
+def offline(run: Run, agents: Mapping[str, PretrainedTransformer]) -> list[Result]:
+    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off."""
+    results = []
+    for level, p in enumerate(run.evaluate.p):
+        chosen = variations(run, p)
+        optimum = optimal_returns(Hypotheses.of(chosen))
+        rows, ids = _rows(run, chosen, level)
+        env = envs.batch(rows)
+        for source, behaviour in (("random", random), ("expert", optimal(run))):
+            data = episode(env, behaviour(rows), [i.rng(run.seed) for i in ids])
+            shape = (len(chosen), run.evaluate.seeds, 1)
+            results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
+            for name, model in agents.items():
+                policy = InContextPolicy(model, len(rows), run.context)
+                ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
+                results.append(Result(f"{name}, {source} data", p, ran.returns.reshape(shape), optimum))
+    return results
+
+
+def _rows(run: Run, chosen: Sequence[Variation], level: int) -> tuple[list[Variation], list[Identity]]:
+    """Every variation ``evaluate.seeds`` times, and the identity of each row's first episode."""
+    pairs = [(i, seed) for i in range(len(chosen)) for seed in range(run.evaluate.seeds)]
+    return [chosen[i] for i, _ in pairs], [Identity("evaluate", level, i, seed, 0) for i, seed in pairs]
+
+
+def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
+    """How good a round's own labels are, against the exact answer (Theorem E.5, measured).
+
+    ``agreement``: share of labels that the optimal policy would also take; the mean return of
+    the trials that became contexts and of those that gave labels; the optimum beside them.
+    Empty for a phase whose labels are not the model's own.
+    """
+    if phase.stage != "adapt":
+        return {}
+    agreement, early, late, best = [], [], [], []
+    for trials in by_variation(data.select(phase.stage, phase.round)):
+        hypotheses = Hypotheses.of([trials[0].variation])
+        truth = soft_labels(hypotheses, run.darkroom.gamma, run.darkroom.label_slack)[0]
+        own = self_labelled(run, trials)
+        good = truth[cell_numbers(own.queries, hypotheses.size), own.labels.argmax(axis=1)] > 0
+        agreement.append(good.mean())
+        cut = run.icaa.context_trials + 1
+        early.append(np.mean([t.episode_return for t in trials[:cut]]))
+        late.append(np.mean([t.episode_return for t in trials[cut:]]))
+        best.append(optimal_returns(hypotheses)[0])
+    return {
+        "agreement": float(np.mean(agreement)),
+        "context_return": float(np.mean(early)),
+        "label_return": float(np.mean(late)),
+        "optimum": float(np.mean(best)),
+    }

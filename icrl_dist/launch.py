@@ -1,0 +1,246 @@
+"""Running both programs for one run: the learner as a child process, the workers through Ray.
+
+``inline`` runs the same learner and worker in this process over a MemoryLink instead, with
+neither Ray nor Zenoh.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from icrl_dist.config import ConfigError, Run, dumps, load
+from icrl_dist.stream.link import Keys
+
+Report = Callable[[dict[str, Any]], None]
+
+
+class TrainFailed(RuntimeError):  # noqa: N818
+    """The run failed; one line for the user."""
+
+
+class TrainInterrupted(Exception):  # noqa: N818
+    """The run was interrupted; a checkpoint has been written."""
+
+
+def prepare(run: Run, folder: Path, resume: bool, overwrite: bool) -> None:
+    """Make the run folder: ``run.toml`` and ``env.json``.
+
+    Raises ConfigError if the folder exists and is neither to be resumed nor overwritten, or
+    is to be resumed with other numbers.
+    """
+    try:
+        Keys(folder.name)
+    except ValueError as error:
+        raise ConfigError(f"--out {folder}: {error}") from None
+    file = folder / "run.toml"
+    if overwrite and file.exists():
+        shutil.rmtree(folder)
+    if folder.exists() and not resume and any(folder.iterdir()):
+        raise ConfigError(f"{folder} exists: use --resume to go on with it, --overwrite to begin anew, or another --out")
+    if resume and not file.exists():
+        raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to begin one")
+    if resume and load(str(file)) != run:
+        raise ConfigError(f"--resume: {file} has other numbers than asked for; resume with the run's own, or use another --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(dumps(run))
+        (folder / "env.json").write_text(json.dumps(environment(), indent=1) + "\n")
+    except OSError as error:
+        raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+def environment() -> dict[str, Any]:
+    """Versions and machine, as kept in every run folder."""
+    names = ("icrl-dist", "numpy", "torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "scipy")
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": len(os.sched_getaffinity(0)),
+        "versions": {name: metadata.version(name) for name in names},
+    }
+
+
+def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
+    """The whole run in this process, one worker on a thread; returns the learner's result."""
+    import torch
+
+    from actors.worker import Worker
+    from icrl_dist.stream.link import MemoryHub
+    from learner.service import Interrupted, RunFailed, Service
+
+    hub = MemoryHub()
+    with hub.link() as ours, hub.link() as theirs:
+        service = Service(run, folder, ours, report)
+        worker = Worker(theirs, folder.name, "w0")
+
+        def work() -> None:
+            torch.set_num_threads(1)
+            try:
+                worker.run()
+            except Exception as error:
+                service.fail(RunFailed(f"the worker failed: {error}"))
+
+        thread = threading.Thread(target=work, name="worker", daemon=True)
+        with _on_signals(service.stop):
+            thread.start()
+            try:
+                return service.run()
+            except Interrupted:
+                raise TrainInterrupted from None
+            except RunFailed as error:
+                raise TrainFailed(str(error)) from None
+            finally:
+                worker.stop()
+                thread.join(timeout=30)
+                service.close()
+
+
+def train_ray(run: Run, folder: Path, actors: int, address: str | None, report: Report) -> dict[str, Any]:
+    """The whole run with a learner process and Ray workers; returns the learner's result.
+
+    Raises ConfigError, TrainFailed or TrainInterrupted; no process is left behind.
+    """
+    from actors.fleet import Fleet, FleetFailed
+
+    interrupted = threading.Event()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_on_signals(interrupted.set))
+        learner = _Learner(folder, run.stream.endpoint, run.learner.restarts)
+        stack.callback(learner.end)
+        fleet = Fleet(actors, run.learner.restarts, address)
+        stack.callback(fleet.close)
+        result: dict[str, Any] | None = None
+        started = False
+        while True:
+            for event in learner.events():
+                report(event)
+                if event["event"] == "listening" and not started:
+                    fleet.start(learner.endpoint, folder.name)
+                    started = True
+                elif event["event"] == "finished":
+                    result = event
+            if interrupted.is_set():
+                learner.interrupt(report)
+                raise TrainInterrupted
+            if result is not None:
+                return result
+            learner.watch(report)
+            if started:
+                try:
+                    working = fleet.watch(lambda text: report({"event": "note", "text": text}))
+                except FleetFailed as error:
+                    raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
+                if not working:
+                    raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
+
+
+class _Learner:
+    """The learner process: its events, its restarts, its end."""
+
+    def __init__(self, folder: Path, endpoint: str, restarts: int) -> None:
+        self._folder, self.endpoint, self._budget = folder, endpoint, restarts
+        self._queue: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._error = ""
+        self._finished = False
+        self._start()
+
+    def _start(self) -> None:
+        command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
+        self._log = (self._folder / "learner.err").open("ab")
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, start_new_session=True)
+        threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
+
+    def _read(self, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdout is not None
+        with process.stdout:
+            for line in process.stdout:
+                self._queue.put(json.loads(line))
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """What happened since the last call; waits a tenth of a second at most for the first."""
+        wait = 0.1
+        while True:
+            try:
+                event = self._queue.get(timeout=wait)
+            except queue.Empty:
+                return
+            wait = 0.001
+            if event["event"] == "listening":
+                self.endpoint = event["endpoint"]
+            elif event["event"] == "error":
+                self._error = event["text"]
+            elif event["event"] == "finished":
+                self._finished = True
+            yield event
+
+    def watch(self, report: Report) -> None:
+        """Start the learner again from its checkpoint if it was killed.
+
+        Raises ConfigError or TrainFailed with its own words if it gave up, TrainFailed if it
+        was killed more often than the budget allows.
+        """
+        code = self._process.poll()
+        if code is None or self._finished:
+            return
+        time.sleep(0.1)
+        for event in self.events():
+            report(event)
+        if self._finished:
+            return
+        if self._error:
+            raise (ConfigError if code == 2 else TrainFailed)(self._error)
+        if self._budget == 0:
+            raise TrainFailed(f"the learner died too often (exit code {code}); its last words are in {self._log.name}")
+        self._budget -= 1
+        report({"event": "note", "text": f"the learner died (exit code {code}); starting it again from its checkpoint"})
+        self._log.close()
+        self._start()
+
+    def interrupt(self, report: Report) -> None:
+        """Ask it to write a checkpoint and end."""
+        self._process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=60)
+        for event in self.events():
+            report(event)
+
+    def end(self) -> None:
+        """Wait for a finished learner, end any other, and leave nothing behind."""
+        try:
+            if not self._finished:
+                self._process.terminate()
+            self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._log.close()
+
+
+@contextlib.contextmanager
+def _on_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Call ``stop`` instead of dying on Ctrl-C or a polite kill."""
+    names = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(name, lambda *_: stop()) for name in names] if _in_main_thread() else []
+    try:
+        yield
+    finally:
+        for name, handler in zip(names, before, strict=False):
+            signal.signal(name, handler)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()

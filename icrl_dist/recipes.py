@@ -1,0 +1,170 @@
+"""The in-context methods side by side: what each asks for, and what it learns from.
+
+They share the model and the loss of eq. (1).  A run goes through phases; in each, the
+learner hands out the jobs that ``ask`` names, and fits the model to what ``learn`` makes of
+the trajectories.  The phase after which T^j exists produces weights version j.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Protocol
+
+import numpy as np
+
+from icrl_dist.config import Run
+from icrl_dist.context import Examples, Pool
+from icrl_dist.envs import tasks
+from icrl_dist.types import Job, Params, Task, Trajectory, Variation
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Collect, then fit: one pass through the loop that all methods share."""
+
+    stage: str
+    round: int
+    steps: int
+    """Optimiser steps of the fit."""
+
+    @property
+    def acting(self) -> int:
+        """Version of the weights that act: T^j in round j of ``adapt``, none in ``pretrain``."""
+        return self.round if self.stage == "adapt" else -1
+
+    @property
+    def produces(self) -> int:
+        """Version of the weights after the fit: 0 after ``pretrain``, j + 1 after round j."""
+        return self.acting + 1
+
+
+class Dataset(Protocol):
+    """The trajectories collected so far."""
+
+    def select(self, stage: str, round: int) -> Iterator[Trajectory]:
+        """One stage and round, in canonical order."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """A pair of functions, and the phases they are called for."""
+
+    phases: Callable[[Run], tuple[Phase, ...]]
+    ask: Callable[[Run, Phase], tuple[Job, ...]]
+    learn: Callable[[Run, Phase, Dataset], tuple[Pool, ...]]
+
+
+def _pretrain_only(run: Run) -> tuple[Phase, ...]:
+    return (Phase("pretrain", 0, run.pretrain.steps),)
+
+
+def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
+    """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
+
+    All methods and all K share out the same ``pretrain.contexts`` episodes.
+    """
+    room = run.darkroom
+    settings: Params = (
+        ("gamma", room.gamma),
+        ("labels", room.labels),
+        ("queries", run.pretrain.queries),
+        ("slack", room.label_slack),
+    )
+    train = tasks.split(run).train
+    jobs = []
+    for i, task in enumerate(train):
+        chosen = variations(i, task)
+        trials = max(1, run.pretrain.contexts // (len(train) * len(chosen)))
+        jobs.append(Job("random_context", "pretrain", 0, i, chosen, trials, phase.acting, run.seed, settings))
+    return tuple(jobs)
+
+
+def _labelled(trajectories: Iterable[Trajectory]) -> tuple[Examples, ...]:
+    """One Examples a variation: all its episodes, all its labelled queries."""
+    made = []
+    for episodes in by_variation(trajectories):
+        queries, labels = (np.concatenate([getattr(t, name) for t in episodes]) for name in ("queries", "labels"))
+        made.append(Examples.of(episodes, queries, labels))
+    return tuple(made)
+
+
+def by_variation(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
+    """The trajectories of each variation, in order of trial."""
+    for _, group in groupby(trajectories, key=lambda t: t.identity[:4]):
+        yield list(group)
+
+
+# DPT (section 2): tasks without disturbance, labels from each task's optimal policy.
+
+
+def _dpt_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
+    return _random_contexts(run, phase, lambda i, task: (Variation(task),))
+
+
+def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
+    return (Pool(1.0, _labelled(data.select("pretrain", 0))),)
+
+
+# ICAG (section 4.1, Algorithm 2): K variations of every task, labels from each variation's
+# own optimal policy (eq. 5).
+
+
+def _icag_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
+    return _random_contexts(run, phase, lambda i, task: tasks.variations(run, i, task))
+
+
+# ICAA (section 4.2, Algorithm 3): D^0 is DPT's dataset; then, round by round, the model
+# labels its own rollouts.
+
+
+def _icaa_phases(run: Run) -> tuple[Phase, ...]:
+    """Lines 3 and 5: T^0 from D^0, then rounds j = 0..J."""
+    rounds = (Phase("adapt", j, run.icaa.steps) for j in range(run.icaa.rounds + 1))
+    return (*_pretrain_only(run), *rounds)
+
+
+def _icaa_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
+    """Lines 8 to 12: T^j is deployed in every variation for N + 1 trials."""
+    if phase.stage == "pretrain":
+        return _dpt_ask(run, phase)
+    settings: Params = (("context_max", run.context.max),)
+    jobs = []
+    for i, task in enumerate(tasks.split(run).train):
+        variations = tasks.variations(run, i, tasks.deployed(task))
+        jobs.append(Job("adapt", "adapt", phase.round, i, variations, run.icaa.trials + 1, phase.acting, run.seed, settings))
+    return tuple(jobs)
+
+
+def _icaa_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
+    """Lines 13 to 19: contexts from the first trials, labels from later ones, D_pre the union."""
+    pretrain = _pretrain_learn(run, phase, data)
+    if phase.stage == "pretrain":
+        return pretrain
+    own = [self_labelled(run, group) for j in range(phase.round + 1) for group in by_variation(data.select("adapt", j))]
+    share = run.icaa.new_fraction
+    return (Pool(1 - share, pretrain[0].examples), Pool(share, own))
+
+
+def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
+    """One variation's trials as examples (lines 13 and 14).
+
+    The first N_ + 1 trials are contexts; query states and labels are the states and actions
+    of strictly later trials: all of them, or the better half by return.
+    """
+    contexts, later = trials[: run.icaa.context_trials + 1], list(trials[run.icaa.context_trials + 1 :])
+    if run.icaa.label_trials == "top_return":
+        later = sorted(later, key=lambda t: -t.episode_return)[: (len(later) + 1) // 2]
+    queries = np.concatenate([t.observations[:-1] for t in later])
+    actions = np.concatenate([t.actions for t in later])
+    labels = np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
+    return Examples.of(contexts, queries, labels, run.icaa.context == "history")
+
+
+METHODS: dict[str, Method] = {
+    "dpt": Method(_pretrain_only, _dpt_ask, _pretrain_learn),
+    "icag": Method(_pretrain_only, _icag_ask, _pretrain_learn),
+    "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn),
+}

@@ -1,0 +1,287 @@
+"""A link between machines: the one file that knows Zenoh.
+
+The learner listens; workers and taps are clients of it and come back by themselves when it
+does.  No discovery, no shared memory: who talks to whom is what was configured.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator, Mapping
+
+import zenoh
+from zenoh import CongestionControl, ConsolidationMode, Priority
+from zenoh.handlers import Callback
+
+from icrl_dist.stream.link import (
+    Dispatcher,
+    Done,
+    Link,
+    LinkError,
+    Mailbox,
+    Outcome,
+    Pending,
+    Query,
+    Refused,
+    Unanswered,
+    handle,
+)
+
+_REFUSED = b"refused: "
+"""Before a reason of ours: Zenoh answers for itself with error replies too (``Timeout``)."""
+
+
+class ZenohLink(Link):
+    """A Zenoh session as a link; open one with :meth:`listen` or :meth:`connect`.
+
+    Handlers of requests and ``done`` run on Zenoh's own threads.
+    """
+
+    def __init__(self, session: zenoh.Session, endpoint: str) -> None:
+        self._session = session
+        self._endpoint = endpoint
+        self._lock = threading.Lock()
+        self._closed = False
+        self._pending: set[Pending] = set()
+        self._publishing = threading.Lock()
+        self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
+        self._mailboxes: list[Mailbox] = []
+        self._declared: list[object] = []
+        self._dispatcher = Dispatcher("zenoh-link")
+        atexit.register(self.close)
+
+    @classmethod
+    def listen(cls, endpoint: str, config: Mapping[str, object] | None = None) -> ZenohLink:
+        """Listen on ``endpoint``, such as ``tcp/127.0.0.1:7447``; port 0 takes a free one.
+
+        ``config`` sets further Zenoh keys (TLS, users).  Raises LinkError if it cannot listen there.
+        """
+        settings = {"mode": "peer", "connect/endpoints": [], **(config or {})}
+        for left in range(9, -1, -1):
+            bound = _with_port(endpoint)
+            try:
+                return cls(_open({**settings, "listen/endpoints": [bound]}), bound)
+            except LinkError as error:
+                if bound == endpoint or not left:
+                    raise LinkError(f"cannot listen on {endpoint}: {error}; free that port or name another") from error
+        raise AssertionError
+
+    @classmethod
+    def connect(cls, endpoint: str, timeout_s: float, config: Mapping[str, object] | None = None) -> ZenohLink:
+        """Connect to a link that listens on ``endpoint``, and again by itself whenever that is lost.
+
+        ``config`` as in :meth:`listen`.  Raises LinkError if nobody answers within ``timeout_s``.
+        """
+        settings = {
+            "mode": "client",
+            "listen/endpoints": [],
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": int(timeout_s * 1000),
+            "connect/exit_on_failure": True,
+            "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+            **(config or {}),
+        }
+        try:
+            return cls(_open(settings), endpoint)
+        except LinkError as error:
+            raise LinkError(
+                f"cannot connect to {endpoint} within {timeout_s:g} s: {error}; check that the learner runs and listens there"
+            ) from error
+
+    def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
+        pending = Pending(done)
+        with self._lock:
+            self._check_open()
+            self._pending.add(pending)
+        caller: int | None = threading.get_ident()
+
+        def settle(outcome: Outcome) -> None:
+            with self._lock:
+                self._pending.discard(pending)
+            if threading.get_ident() == caller:
+                self._dispatcher.post(lambda: pending.settle(outcome))
+            else:
+                pending.settle(outcome)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            settle(_outcome(reply))
+
+        def on_end() -> None:
+            settle(Unanswered(f"nobody answered on {key}"))
+
+        try:
+            with self._errors():
+                self._session.get(
+                    key,
+                    Callback(on_reply, on_end, indirect=False),
+                    payload=payload,
+                    timeout=timeout_s,
+                    consolidation=ConsolidationMode.NONE,
+                    congestion_control=CongestionControl.BLOCK,
+                )
+        except LinkError as error:
+            settle(Unanswered(str(error)))
+        finally:
+            caller = None
+
+    def serve(self, key: str, handler: Callable[[Query], None]) -> None:
+        def answer(query: zenoh.Query) -> None:
+            handle(handler, _ZenohQuery(query))
+
+        with self._errors():
+            self._declared.append(self._session.declare_queryable(key, Callback(answer, indirect=False), complete=True))
+
+    def publish(self, key: str, payload: bytes, droppable: bool) -> None:
+        with self._errors():
+            with self._publishing:
+                publisher = self._publishers.get((key, droppable))
+                if publisher is None:
+                    publisher = self._publishers[key, droppable] = self._session.declare_publisher(
+                        key,
+                        congestion_control=CongestionControl.DROP if droppable else CongestionControl.BLOCK,
+                        priority=Priority.BACKGROUND if droppable else Priority.DATA,
+                    )
+            publisher.put(payload)
+
+    def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
+        mailbox = self._mailbox(handler)
+
+        def hear(sample: zenoh.Sample) -> None:
+            droppable = sample.congestion_control == CongestionControl.DROP
+            mailbox.put(str(sample.key_expr), sample.payload.to_bytes(), droppable=droppable)
+
+        with self._errors():
+            self._declared.append(self._session.declare_subscriber(key_expr, Callback(hear, indirect=False)))
+
+    def announce(self, key: str) -> None:
+        with self._errors():
+            self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch(self, key_expr: str, handler: Callable[[str, bool], None]) -> None:
+        mailbox = self._mailbox(handler)
+
+        def hear(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            mailbox.put(str(sample.key_expr).rpartition("/")[2], alive, droppable=False)
+
+        with self._errors():
+            liveliness = self._session.liveliness()
+            self._declared.append(liveliness.declare_subscriber(key_expr, Callback(hear, indirect=False), history=True))
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        return (self._endpoint,)
+
+    def close(self) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            pending, self._pending = self._pending, set()
+        atexit.unregister(self.close)
+        self._session.close()  # type: ignore[no-untyped-call]
+        for one in pending:
+            self._dispatcher.post(lambda one=one: one.settle(Unanswered("the link was closed")))  # type: ignore[misc]
+        for mailbox in self._mailboxes:
+            mailbox.close()
+        self._dispatcher.close()
+
+    def _mailbox(self, handler: Callable[..., None]) -> Mailbox:
+        mailbox = Mailbox(handler)
+        with self._lock:
+            self._mailboxes.append(mailbox)
+        return mailbox
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise LinkError(f"the link to {self._endpoint} is closed: open another")
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        self._check_open()
+        try:
+            yield
+        except zenoh.ZError as error:
+            self._check_open()
+            raise LinkError(f"{self._endpoint}: {_brief(error)}") from error
+
+
+class _ZenohQuery:
+    def __init__(self, query: zenoh.Query) -> None:
+        self.key = str(query.key_expr)
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self._lock = threading.Lock()
+        self._query: zenoh.Query | None = query
+
+    def reply(self, payload: bytes) -> None:
+        query = self._take()
+        with contextlib.suppress(zenoh.ZError):
+            query.reply(self.key, payload)
+        query.drop()  # type: ignore[no-untyped-call]
+
+    def refuse(self, reason: str) -> None:
+        query = self._take()
+        with contextlib.suppress(zenoh.ZError):
+            query.reply_err(_REFUSED + reason.encode("utf-8", "replace"))
+        query.drop()  # type: ignore[no-untyped-call]
+
+    def _take(self) -> zenoh.Query:
+        with self._lock:
+            query, self._query = self._query, None
+        if query is None:
+            raise RuntimeError(f"this query on {self.key} has been answered already")
+        return query
+
+
+def _outcome(reply: zenoh.Reply) -> Outcome:
+    if reply.ok is not None:
+        return reply.ok.payload.to_bytes()
+    error = reply.err.payload.to_bytes() if reply.err is not None else b""
+    if error.startswith(_REFUSED):
+        return Refused(error[len(_REFUSED) :].decode("utf-8", "replace"))
+    return Unanswered(error.decode("utf-8", "replace"))
+
+
+def _open(settings: Mapping[str, object]) -> zenoh.Session:
+    everywhere: dict[str, object] = {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }
+    config = zenoh.Config()
+    try:
+        for key, value in {**everywhere, **settings}.items():
+            config.insert_json5(key, json.dumps(value))
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise LinkError(_brief(error)) from error
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":
+            raise
+        raise LinkError(f"Zenoh panicked: {_brief(error)}") from error
+
+
+def _with_port(endpoint: str) -> str:
+    """The endpoint with a free port in place of port 0: Zenoh does not tell which one it took."""
+    found = re.fullmatch(r"([a-z]+/)(.*):0([?#].*)?", endpoint)
+    if found is None:
+        return endpoint
+    protocol, host, rest = found.groups()
+    try:
+        family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
+        kind = socket.SOCK_DGRAM if protocol in ("udp/", "quic/") else socket.SOCK_STREAM
+        with socket.socket(family, kind) as probe:
+            probe.bind((host.strip("[]"), 0))
+            return f"{protocol}{host}:{probe.getsockname()[1]}{rest or ''}"
+    except OSError as error:
+        raise LinkError(f"cannot listen on {endpoint}: {error}; name an address of this machine") from error
+
+
+def _brief(error: BaseException) -> str:
+    """Zenoh's message without the places in its source that it came through."""
+    return re.sub(r" at /\S+", "", str(error)).strip()

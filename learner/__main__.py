@@ -1,0 +1,89 @@
+"""The learner process: ``python -m learner RUN_DIR``.  Events go to stdout, a JSON line each.
+
+Started and supervised by ``icrl-dist train``; ends by itself if that parent dies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from icrl_dist.config import ConfigError, load
+from icrl_dist.store import StoreError
+from icrl_dist.stream.link import LinkError
+from icrl_dist.stream.zenoh_link import ZenohLink
+from learner.service import Interrupted, RunFailed, Service
+
+DONE, FAILED, BAD_CONFIG, INTERRUPTED = 0, 1, 2, 130
+
+
+def main() -> int:
+    """Run the learner to its end; the exit code is the command line's."""
+    parser = argparse.ArgumentParser(prog="python -m learner", description=__doc__)
+    parser.add_argument("folder", type=Path, help="run folder with a run.toml")
+    parser.add_argument(
+        "--endpoint", required=True, help="where to listen, such as tcp/127.0.0.1:7447; port 0 takes a free one"
+    )
+    arguments = parser.parse_args()
+    logging.basicConfig(filename=arguments.folder / "learner.log", level=logging.INFO, format="%(asctime)s %(message)s")
+    lock = threading.Lock()
+
+    def report(event: dict[str, Any]) -> None:
+        with lock:
+            sys.stdout.write(json.dumps(event) + "\n")
+            sys.stdout.flush()
+
+    try:
+        return _serve(arguments.folder, arguments.endpoint, report)
+    except (ConfigError, LinkError) as error:
+        report({"event": "error", "text": str(error)})
+        return BAD_CONFIG
+    except (RunFailed, StoreError, FloatingPointError) as error:
+        report({"event": "error", "text": str(error)})
+        return FAILED
+
+
+def _serve(folder: Path, endpoint: str, report: Any) -> int:
+    run = load(str(folder / "run.toml"))
+    with ZenohLink.listen(endpoint) as link:
+        service = Service(run, folder, link, report)
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, lambda *_: service.stop())
+        _end_with_parent(service)
+        where = folder / "endpoint"
+        where.write_text(link.endpoints[0] + "\n")
+        report({"event": "listening", "endpoint": link.endpoints[0], "version": service.version})
+        try:
+            result = service.run()
+        except Interrupted:
+            report({"event": "interrupted", "text": f"a checkpoint is in {folder / 'checkpoints'}"})
+            return INTERRUPTED
+        finally:
+            where.unlink(missing_ok=True)
+            service.close()
+        report({"event": "finished", **result})
+        service.dismiss()
+    return DONE
+
+
+def _end_with_parent(service: Service) -> None:
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        service.stop()
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

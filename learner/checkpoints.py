@@ -1,0 +1,87 @@
+"""What the learner must remember to go on: weights, optimiser, and where it stood."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from icrl_dist.agent import spec_from
+from icrl_dist.config import ConfigError, Run, dumps
+from icrl_dist.envs import tasks
+from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
+from icrl_dist.store import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.stream.wire import weights_digest
+from icrl_dist.types import Spec
+
+PARTIAL = "partial.npz"
+
+
+def version_file(folder: Path, version: int) -> Path:
+    """Where T^version lies."""
+    return folder / "checkpoints" / f"version-{version:04d}.npz"
+
+
+def newest_version(folder: Path) -> int:
+    """The newest complete version in a run folder; -1 if there is none."""
+    names = sorted((folder / "checkpoints").glob("version-*.npz"))
+    return int(names[-1].stem.removeprefix("version-")) if names else -1
+
+
+def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]:
+    """What a checkpoint says of itself: enough to deploy it, and to know where it comes from."""
+    split = tasks.split(run)
+    room = run.darkroom
+    return {
+        "method": run.method,
+        "version": version,
+        "run": dumps(run),
+        "spec": dataclasses.asdict(spec),
+        "seed": run.seed,
+        "split_seed": room.split_seed,
+        "size": room.size,
+        "horizon": room.horizon,
+        "test_goals": [[int(c) for c in task.vector("goal")] for task in split.test],
+        "threads": threads,
+        "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},
+    }
+
+
+def save(path: Path, model: PretrainedTransformer, opt: torch.optim.Optimizer, about: Mapping[str, Any]) -> None:
+    """Weights, the optimiser's moments, and the manifest, atomically."""
+    weights = weights_of(model)
+    arrays = {f"model/{name}": value for name, value in weights.items()}
+    for index, state in opt.state_dict()["state"].items():
+        arrays |= {f"optimiser/{index}/{name}": value.cpu().numpy() for name, value in state.items()}
+    save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights_digest(weights)}))
+
+
+def read_manifest(path: Path) -> Mapping[str, Any]:
+    """A checkpoint's manifest alone."""
+    return load_checkpoint(path).manifest
+
+
+def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: torch.optim.Optimizer) -> Mapping[str, Any]:
+    """Load what ``save`` wrote into model and optimiser; returns the manifest.
+
+    Raises ConfigError for a checkpoint of another spec or another model size.
+    """
+    checkpoint = load_checkpoint(path)
+    theirs = spec_from(checkpoint.manifest["spec"])
+    if theirs != spec:
+        raise ConfigError(f"{path}: a checkpoint of another spec ({theirs}), this run needs {spec}: use another --out")
+    try:
+        load_weights(model, checkpoint.part("model"))
+    except RuntimeError as error:
+        raise ConfigError(f"{path}: a checkpoint of another model ({' '.join(str(error).split())})") from None
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in checkpoint.part("optimiser").items():
+        index, _, key = name.partition("/")
+        state.setdefault(int(index), {})[key] = torch.from_numpy(np.array(value))
+    opt.load_state_dict({"state": state, "param_groups": opt.state_dict()["param_groups"]})
+    return checkpoint.manifest

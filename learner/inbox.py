@@ -1,0 +1,140 @@
+"""The inbox: from untrusted bytes to stored trajectories, every drop counted by reason.
+
+Zenoh's thread only puts a query into a bounded queue.  One thread takes whole groups out,
+checks them, appends them with one fsync, and only then replies: a reply is the promise that
+the trajectory will be there after any crash.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+from icrl_dist.store import Store, StoreError
+from icrl_dist.stream import wire
+from icrl_dist.stream.link import Query
+from icrl_dist.types import Identity, Job, Spec, Trajectory
+
+_log = logging.getLogger(__name__)
+
+REASONS = (*wire.REASONS, "spec", "not-finite", "unexpected", "stale-weights", "duplicate", "busy")
+"""Why a message was not stored.  ``duplicate`` is acknowledged, the others are refused."""
+
+
+class Rejected(Exception):  # noqa: N818
+    """A well-formed trajectory that this run cannot use."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f"{reason}: {detail}")
+        self.reason = reason
+
+
+def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
+    """Raises Rejected unless the trajectory is what its job asked for."""
+    identity, size = trajectory.identity, (spec.horizon + 1, spec.observation)
+    if trajectory.observations.shape != size:
+        raise Rejected("spec", f"{identity}: observations {trajectory.observations.shape}, this run needs {size}")
+    if trajectory.queries.shape[1] != spec.observation or trajectory.labels.shape[1] != spec.actions:
+        raise Rejected("spec", f"{identity}: queries {trajectory.queries.shape}, labels {trajectory.labels.shape}")
+    if trajectory.actions.min() < 0 or trajectory.actions.max() >= spec.actions:
+        raise Rejected("spec", f"{identity}: an action lies outside 0..{spec.actions - 1}")
+    if not all(np.isfinite(a).all() for a in trajectory.arrays().values()):
+        raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
+    if trajectory.variation != job.variations[identity.variation]:
+        raise Rejected("unexpected", f"{identity}: comes from another variation than its job's")
+    if (trajectory.weights, trajectory.digest) != (job.weights, digest):
+        raise Rejected("stale-weights", f"{identity}: weights {trajectory.weights} acted, the job names {job.weights}")
+
+
+class Inbox:
+    """Takes trajectories in on its own thread; ``wants`` and ``stored`` are the Board's."""
+
+    def __init__(
+        self,
+        store: Store,
+        spec: Spec,
+        limit: int,
+        wants: Callable[[Identity], Job | None],
+        digest_of: Callable[[int], str],
+        stored: Callable[[Trajectory], None],
+        failed: Callable[[BaseException], None],
+        capacity: int = 256,
+    ) -> None:
+        self.drops: Counter[str] = Counter()
+        self._store, self._spec, self._limit = store, spec, limit
+        self._wants, self._digest_of, self._stored, self._failed = wants, digest_of, stored, failed
+        self._queue: queue.Queue[Query | None] = queue.Queue(capacity)
+        self._thread = threading.Thread(target=self._run, name="inbox", daemon=True)
+        self._thread.start()
+
+    def put(self, query: Query) -> None:
+        """Accept a query without ever blocking; a full queue answers ``busy``: send it again."""
+        try:
+            self._queue.put_nowait(query)
+        except queue.Full:
+            self.drops["busy"] += 1
+            query.refuse("busy")
+
+    def close(self) -> None:
+        """Take in what is queued, then stop."""
+        self._queue.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (first := self._queue.get()) is not None:
+            group: list[Query] = [first]
+            stop = False
+            while not self._queue.empty():
+                following = self._queue.get()
+                if following is None:
+                    stop = True
+                    break
+                group.append(following)
+            try:
+                self.take(group)
+            except StoreError as error:
+                for query in group:
+                    query.refuse(f"busy: {error}")
+                self._failed(error)
+                return
+            if stop:
+                return
+
+    def take(self, group: list[Query]) -> None:
+        """Check a group of messages, store the good ones durably, then answer all of them.
+
+        Raises StoreError if they could not be stored; none of them is answered then.
+        """
+        good: dict[Identity, tuple[Trajectory, bytes]] = {}
+        answers: list[tuple[Query, str]] = []
+        for query in group:
+            reason = ""
+            try:
+                trajectory = wire.decode_trajectory(query.payload, self._limit)
+                identity = trajectory.identity
+                job = self._wants(identity)
+                if identity in self._store or identity in good:
+                    self.drops["duplicate"] += 1
+                elif job is None:
+                    raise Rejected("unexpected", f"{identity}: nobody asked for it")
+                else:
+                    check(trajectory, job, self._spec, self._digest_of(job.weights))
+                    good[identity] = (trajectory, query.payload)
+            except (wire.WireError, Rejected) as error:
+                self.drops[error.reason] += 1
+                reason = str(error)
+                _log.warning("refused a message: %s", reason)
+            answers.append((query, reason))
+        self._store.append(list(good.values()))
+        for trajectory, _ in good.values():
+            self._stored(trajectory)
+        for query, reason in answers:
+            if reason:
+                query.refuse(reason)
+            else:
+                query.reply(b"stored")

@@ -1,0 +1,296 @@
+"""The learner: hand out a phase's work, take it in, fine-tune, broadcast, and so on."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import icrl_dist
+from icrl_dist import context, pretrain
+from icrl_dist.config import Run, dumps
+from icrl_dist.envs import spec as spec_of
+from icrl_dist.envs import tasks
+from icrl_dist.evaluate import label_quality
+from icrl_dist.metrics import Metrics
+from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.recipes import METHODS, Phase
+from icrl_dist.store import Store
+from icrl_dist.stream import wire
+from icrl_dist.stream.link import Keys, Link, Query
+from icrl_dist.types import Identity, Job, Trajectory, Weights
+from learner import checkpoints
+from learner.broadcast import Broadcast
+from learner.inbox import Inbox
+from learner.work import Board
+
+Report = Callable[[dict[str, Any]], None]
+
+_FIT_DRAWS = 104
+"""Spawn key of a fit's draws, apart from every trajectory's (those begin with a stage)."""
+
+
+class RunFailed(RuntimeError):  # noqa: N818
+    """The run cannot go on; the message is one line for the user."""
+
+
+class Interrupted(Exception):  # noqa: N818
+    """The run was asked to stop; a checkpoint has been written."""
+
+
+class Service:
+    """One run's learner.  ``report`` receives what happens as plain dicts, for a terminal."""
+
+    def __init__(self, run: Run, folder: Path, link: Link, report: Report) -> None:
+        """Opens the run folder and takes up where its checkpoints and dataset end."""
+        self._run, self._folder, self._link, self._report = run, folder, link, report
+        self._method = METHODS[run.method]
+        self._keys = Keys(folder.name)
+        self._spec = spec_of(tasks.split(run).train[0])
+        self._threads = run.learner.threads or len(os.sched_getaffinity(0))
+        torch.manual_seed(run.seed)
+        torch.use_deterministic_algorithms(True)
+        self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
+        self._opt = pretrain.optimiser(self.model, run.optim)
+        self.version = checkpoints.newest_version(folder)
+        self._partial = 0
+        self._metrics = Metrics(folder)
+        self._lock = threading.Lock()
+        self._board = Board(run.stream.lease_s)
+        self._stop = threading.Event()
+        self._finished = threading.Event()
+        self._changed = threading.Event()
+        self._error: BaseException | None = None
+        self.workers: dict[str, bool] = {}
+        self._shown = -np.inf
+        self._lag = 0
+        self.store = Store(folder / "dataset")
+        for note in self.store.repaired:
+            report({"event": "note", "text": note})
+        self._broadcast = Broadcast(link, self._keys)
+        self.inbox = Inbox(
+            self.store,
+            self._spec,
+            run.stream.max_message_bytes,
+            self._wants,
+            self._broadcast.digest_of,
+            self._stored,
+            self.fail,
+        )
+        link.serve(self._keys.work, self._work)
+        link.serve(self._keys.data, self.inbox.put)
+        link.watch(self._keys.alive_all, self._watch)
+        self._take_up()
+
+    # What other threads call.
+
+    def stop(self) -> None:
+        """Ask the run to end soon, with a checkpoint."""
+        self._stop.set()
+        self._changed.set()
+
+    def _wants(self, identity: Identity) -> Job | None:
+        with self._lock:
+            return self._board.wants(identity)
+
+    def _stored(self, trajectory: Trajectory) -> None:
+        with self._lock:
+            self._board.received(trajectory.identity, time.monotonic())
+            self._lag = self.version - trajectory.weights
+            done = self._board.done
+        if done:
+            self._changed.set()
+
+    def fail(self, error: BaseException) -> None:
+        """End the run with this error."""
+        self._error = error
+        self._changed.set()
+
+    def _watch(self, worker: str, alive: bool) -> None:
+        with self._lock:
+            self.workers[worker] = alive
+            freed = [] if alive else self._board.lost(worker)
+        text = f"worker {worker} joined" if alive else f"worker {worker} is gone"
+        if freed:
+            text += "; its job goes to another: " + ", ".join("/".join(map(str, job.name)) for job in freed)
+        self._report({"event": "worker", "worker": worker, "alive": alive, "text": text})
+
+    def _work(self, query: Query) -> None:
+        try:
+            kind, fields = wire.decode_message(query.payload, self._run.stream.max_message_bytes)
+            query.reply(self._answer(kind, fields))
+        except (wire.WireError, KeyError, TypeError, ValueError) as error:
+            query.refuse(f"schema: {error}")
+
+    def _answer(self, kind: str, fields: dict[str, Any]) -> bytes:
+        worker = str(fields["worker"])
+        if kind == "hello":
+            if fields["version"] != icrl_dist.__version__:
+                raise ValueError(f"worker {worker} runs icrl-dist {fields['version']}, the learner {icrl_dist.__version__}")
+            return wire.encode_message("hello", run=dumps(self._run))
+        if kind == "ask":
+            if self._finished.is_set():
+                return wire.encode_message("stop")
+            with self._lock:
+                job = self._board.lease(worker, time.monotonic())
+            return (
+                wire.encode_message("wait", seconds=0.1)
+                if job is None
+                else wire.encode_message("job", job=wire.encode_job(job))
+            )
+        if kind == "failed":
+            stage, round_, task = fields["job"]
+            self._report({"event": "note", "text": f"worker {worker}: job {stage}/{round_}/{task} failed: {fields['error']}"})
+            with self._lock:
+                final = self._board.failed((stage, round_, task), str(fields["error"]))
+            if final:
+                self.fail(RunFailed(final))
+            return wire.encode_message("noted")
+        raise ValueError(f"message kind {kind!r}: expected hello, ask or failed")
+
+    # The run, on the caller's thread.
+
+    def run(self) -> dict[str, Any]:
+        """Go through the method's phases to the end; returns the result that was stored.
+
+        Raises Interrupted after ``stop`` (a checkpoint has been written), RunFailed or
+        StoreError if the run cannot go on.
+        """
+        try:
+            for phase in self._method.phases(self._run):
+                if phase.produces > self.version:
+                    self._collect(phase)
+                    self._fit(phase)
+            result = {
+                "dataset_digest": self.store.digest(),
+                "weights_digest": self._broadcast.digest_of(self.version),
+                "version": self.version,
+                "trajectories": len(self.store),
+                "drops": dict(self.inbox.drops),
+                "threads": self._threads,
+                "instruction_set": torch.backends.cpu.get_cpu_capability(),
+            }
+            self._finished.set()
+            return result
+        finally:
+            self._metrics.close()
+
+    def dismiss(self, timeout_s: float = 3.0) -> None:
+        """After the end: tell the workers that ask to stop, until none is left or time is up."""
+        deadline = time.monotonic() + timeout_s
+        while any(self.workers.values()) and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+    def close(self) -> None:
+        """Stop taking in and let go of the files."""
+        self.inbox.close()
+        self.store.close()
+
+    def _collect(self, phase: Phase) -> None:
+        jobs = self._method.ask(self._run, phase)
+        with self._lock:
+            self._board.open(jobs, self.store.index)
+            already = self._board.arrived
+        began = time.monotonic()
+        while True:
+            with self._lock:
+                arrived, expected, done = self._board.arrived, self._board.expected, self._board.done
+            per_s = (arrived - already) / max(1e-3, time.monotonic() - began)
+            self._progress("collect", phase, arrived, expected, per_s=per_s, force=done)
+            if done:
+                break
+            self._check()
+            self._changed.wait(0.2)
+            self._changed.clear()
+        self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=self._board.leases)
+        quality = label_quality(self._run, phase, self.store)
+        if quality:
+            self._metrics.write(phase.round, "labels", **quality)
+            self._report({"event": "labels", "round": phase.round, **quality})
+
+    def _fit(self, phase: Phase) -> None:
+        pools = self._method.learn(self._run, phase, self.store)
+        optim, torch_threads = self._run.optim, torch.get_num_threads()
+        torch.set_num_threads(self._threads)
+        began = time.monotonic()
+        partial = self._folder / "checkpoints" / checkpoints.PARTIAL
+
+        def batch(step: int) -> context.Batch:
+            key = (_FIT_DRAWS, phase.produces, step)
+            rng = np.random.default_rng(np.random.SeedSequence(self._run.seed, spawn_key=key))
+            torch.manual_seed(int(rng.integers(2**31)))
+            return context.draw(rng, pools, optim.batch, optim.queries, optim.episodes)
+
+        def progress(step: int, loss: float) -> None:
+            self._progress("fit", phase, step, phase.steps, loss=loss, force=step == phase.steps)
+            if step % 50 == 0 or step == phase.steps:
+                self._metrics.write(step, f"fit/{phase.produces}", loss=loss)
+            if self._stop.is_set() or step % 1000 == 0:
+                self._save(partial, produces=phase.produces, step=step)
+            self._check()
+
+        loss = pretrain.fit(self.model, self._opt, optim, phase.steps, batch, progress, self._partial)
+        torch.set_num_threads(torch_threads)
+        self._partial = 0
+        self.version = phase.produces
+        self._save(checkpoints.version_file(self._folder, self.version), loss=loss, dataset_digest=self.store.digest())
+        partial.unlink(missing_ok=True)
+        self._publish()
+        self._metrics.write(self.version, "version", loss=loss, seconds=time.monotonic() - began)
+
+    def _save(self, path: Path, **where: object) -> None:
+        about = checkpoints.manifest(self._run, self._spec, self.version, self._threads)
+        checkpoints.save(path, self.model, self._opt, {**about, **where})
+
+    def _publish(self) -> None:
+        arrays = weights_of(self.model)
+        self._broadcast.publish(Weights(self.version, arrays, wire.weights_digest(arrays)))
+
+    def _take_up(self) -> None:
+        """Go on from the newest version, and from the fit that was under way, if there are any."""
+        if self.version >= 0:
+            checkpoints.restore(checkpoints.version_file(self._folder, self.version), self._spec, self.model, self._opt)
+            self._publish()
+        partial = self._folder / "checkpoints" / checkpoints.PARTIAL
+        if partial.exists() and checkpoints.read_manifest(partial)["produces"] == self.version + 1:
+            self._partial = checkpoints.restore(partial, self._spec, self.model, self._opt)["step"]
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+        if self._stop.is_set():
+            raise Interrupted
+
+    def _progress(self, what: str, phase: Phase, done: int, total: int, force: bool, **values: float) -> None:
+        if not force and time.monotonic() - self._shown < 0.25:
+            return
+        self._shown = time.monotonic()
+        fields: dict[str, Any] = {
+            "stage": what,
+            "round": phase.round,
+            "phase": phase.stage,
+            "step": done,
+            "steps": total,
+            "version": self.version,
+            "trajectories": len(self.store),
+            "workers": sum(self.workers.values()),
+            "lag": self._lag,
+            "drops": dict(self.inbox.drops),
+            **values,
+        }
+        self._report({"event": "progress", **fields})
+        self._link.publish(
+            self._keys.monitor("learner"), wire.encode_message("learner", time=time.time(), **fields), droppable=True
+        )
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise RunFailed("learner.device = 'cuda': no GPU is seen by torch; use auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -1,0 +1,59 @@
+"""What every test shares: shapes checked at every call, one torch thread, small rooms."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import jaxtyping
+import pytest
+import torch
+
+import tests.typecheck
+
+pytest.register_assert_rewrite("tests.contracts")
+
+imported = [name for name in sys.modules if name.split(".")[0] == "icrl_dist"]
+assert not imported, f"{imported} were imported before the import hook: their shapes would go unchecked"
+jaxtyping.install_import_hook("icrl_dist", f"{tests.typecheck.__name__}.check")
+torch.set_num_threads(1)
+
+from icrl_dist.config import (  # noqa: E402
+    AdversaryConfig,
+    ContextConfig,
+    DarkRoomConfig,
+    EvaluateConfig,
+    ICAAConfig,
+    ModelConfig,
+    OptimConfig,
+    PretrainConfig,
+    Run,
+)
+from icrl_dist.envs import darkroom  # noqa: E402
+from icrl_dist.types import Task  # noqa: E402
+
+
+@pytest.fixture
+def room() -> Callable[[int, int], tuple[Task, ...]]:
+    """``room(size, horizon)``: the tasks of one room, a goal in every cell, in cell order."""
+
+    def tasks(size: int, horizon: int) -> tuple[Task, ...]:
+        return tuple(darkroom.task(divmod(cell, size), size, horizon) for cell in range(size * size))
+
+    return tasks
+
+
+@pytest.fixture
+def small_run() -> Run:
+    """A whole run in a 3x3 room, every part of it small enough for a test."""
+    return Run(
+        method="icaa",
+        darkroom=DarkRoomConfig(size=3, horizon=8),
+        adversary=AdversaryConfig(count=3),
+        pretrain=PretrainConfig(contexts=42, queries=4, steps=10),
+        icaa=ICAAConfig(rounds=1, trials=4, context_trials=1, steps=5),
+        model=ModelConfig(layers=2, width=16),
+        optim=OptimConfig(batch=8, queries=4, episodes=2, warmup=2),
+        context=ContextConfig(max=40),
+        evaluate=EvaluateConfig(episodes=3, seeds=2),
+    )

@@ -1,0 +1,52 @@
+"""Every game against the contract battery, and the registry of games."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from icrl_dist import envs
+from icrl_dist.envs import darkroom
+from icrl_dist.types import Adversary, Task, Variation
+from tests.contracts.game_battery import BATTERY, MakeVariation
+
+
+def disturbed_room() -> Variation:
+    return Variation(darkroom.task((1, 2), 4, 20), Adversary.of("dirichlet", p=0.3, alpha=[0.1, 1.0, 0.5, 2.0, 0.3]))
+
+
+def quiet_room() -> Variation:
+    return Variation(darkroom.task((3, 0), 4, 6))
+
+
+@pytest.mark.parametrize("make_variation", [disturbed_room, quiet_room])
+@pytest.mark.parametrize("law", BATTERY)
+def test_contract(law: Callable[[MakeVariation], None], make_variation: MakeVariation) -> None:
+    law(make_variation)
+
+
+def test_make_shows_the_override_in_info_only() -> None:
+    variation = Variation(darkroom.task((0, 0), 3, 50), Adversary.of("dirichlet", p=0.5, alpha=[1.0] * 5))
+    env, batch = envs.make(variation), envs.batch([variation])
+    env.reset(seed=0)
+    logged = [env.step(np.int64(4))[4]["adversary"] for _ in range(50)]
+    batch.reset([np.random.default_rng(np.random.SeedSequence(0))])
+    assert logged == [int(batch.step(np.array([4])).adversary[0]) for _ in range(50)]
+    assert set(logged) == {-1, 0, 1, 2, 3, 4}
+
+
+def test_unknown_problem_is_refused_with_the_known_ones() -> None:
+    strange = Task.of("lightroom", size=3)
+    with pytest.raises(ValueError, match="'lightroom'.*darkroom"):
+        envs.spec(strange)
+    with pytest.raises(ValueError, match="'lightroom'.*darkroom"):
+        envs.batch([Variation(strange)])
+
+
+def test_a_batch_of_two_problems_is_refused() -> None:
+    with pytest.raises(ValueError, match="darkroom.*lightroom"):
+        envs.batch([quiet_room(), Variation(Task.of("lightroom", size=3))])
+    with pytest.raises(ValueError, match="one problem"):
+        envs.batch([])
