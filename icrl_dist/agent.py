@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
+from numpy.typing import ArrayLike
 
 from icrl_dist.config import ConfigError, ContextConfig, parse
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
@@ -37,39 +38,37 @@ class InContextAgent:
         """Forget everything and begin anew in ``batch`` environments."""
         self._policy = InContextPolicy(self.model, batch, self._context)
 
-    def act(self, obs: Float[np.ndarray, "B S"]) -> Int[np.ndarray, " B"]:
-        """One action for each observation.  Raises ValueError for a batch of another shape."""
-        obs = np.asarray(obs, np.float32)
-        self._check("obs", obs, (self._policy.batch, self.model.spec.observation))
-        return sample(self._policy.probabilities(obs), self._rng.random(len(obs)))
+    def act(self, obs: ArrayLike) -> Int[np.ndarray, " B"]:
+        """One action for each observation of ``obs (B, S)``.
 
-    def observe(
-        self,
-        obs: Float[np.ndarray, "B S"],
-        action: Int[np.ndarray, " B"],
-        reward: Float[np.ndarray, " B"],
-        next_obs: Float[np.ndarray, "B S"],
-        done: Bool[np.ndarray, " B"],
-    ) -> None:
-        """One transition of each environment; ``done`` where the episode ended.
-
-        Raises ValueError for another shape, or if only some of the episodes ended: a batch
-        shares one horizon.
+        Raises ValueError for a batch of another shape.
         """
-        batch, size = self._policy.batch, self.model.spec.observation
-        columns = [np.asarray(obs, np.float32), np.asarray(action), np.asarray(reward, np.float32)]
-        columns += [np.asarray(next_obs, np.float32), np.broadcast_to(np.asarray(done, bool), (batch,))]
-        for name, column, shape in zip(
-            ("obs", "action", "reward", "next_obs"), columns, ((batch, size), (batch,), (batch,), (batch, size)), strict=False
-        ):
-            self._check(name, column, shape)
-        if columns[4].any() != columns[4].all():
-            raise ValueError("done: the episodes of a batch end together; deploy unlike horizons in separate agents")
-        self._policy.observe(columns[0], columns[1].astype(np.int64), columns[2], columns[3], bool(columns[4].all()))
+        states = self._shaped("obs", obs, np.float32, self.model.spec.observation)
+        return sample(self._policy.probabilities(states), self._rng.random(len(states)))
 
-    def _check(self, name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
+        """One transition of each environment: ``obs`` and ``next_obs (B, S)``, the others ``(B,)``.
+
+        ``done`` says where the episode ended.  Raises ValueError for another shape, or if only
+        some of the episodes ended: a batch shares one horizon.
+        """
+        size = self.model.spec.observation
+        ended = self._shaped("done", done, np.bool_)
+        if ended.any() != ended.all():
+            raise ValueError("done: the episodes of a batch end together; deploy unlike horizons in separate agents")
+        self._policy.observe(
+            self._shaped("obs", obs, np.float32, size),
+            self._shaped("action", action, np.int64),
+            self._shaped("reward", reward, np.float32),
+            self._shaped("next_obs", next_obs, np.float32, size),
+            bool(ended.all()),
+        )
+
+    def _shaped(self, name: str, value: ArrayLike, dtype: type, *rest: int) -> np.ndarray:
+        array, shape = np.asarray(value, dtype), (self._policy.batch, *rest)
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}; reset_context(batch=B) sets B")
+        return array
 
 
 def load_agent(what: str | Path, seed: int | None = None) -> InContextAgent:

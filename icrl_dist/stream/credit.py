@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Callable
 
@@ -36,9 +37,12 @@ class CreditSender:
         """Times that an item was sent again."""
         self.acknowledged = 0
         """Items answered positively."""
-        self._link, self._key, self._credits, self._timeout_s = link, key, credits, timeout_s
+        self._link, self._key, self._timeout_s = link, key, timeout_s
         self._on_event = on_event
         self._changed = threading.Condition()
+        self._credit: queue.SimpleQueue[None] = queue.SimpleQueue()
+        for _ in range(credits):
+            self._credit.put(None)
         self._outstanding = 0
         self._failure: Refused | LinkError | None = None
         self._closed = False
@@ -51,9 +55,13 @@ class CreditSender:
 
     def send(self, payload: bytes) -> None:
         """Take an item, waiting for a credit.  Raises Refused for an earlier item, LinkError if closed."""
+        self._credit.get()
         with self._changed:
-            self._changed.wait_for(lambda: self._failure or self._closed or self._outstanding < self._credits)
-            self._raise()
+            try:
+                self._raise()
+            except BaseException:
+                self._credit.put(None)
+                raise
             self._outstanding += 1
             self.sent += 1
         self._attempt(payload, 0)
@@ -71,6 +79,7 @@ class CreditSender:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+        self._credit.put(None)
         self._resends.close()
 
     def _raise(self) -> None:
@@ -92,8 +101,7 @@ class CreditSender:
         if isinstance(outcome, bytes):
             with self._changed:
                 self.acknowledged += 1
-                self._outstanding -= 1
-                self._changed.notify_all()
+                self._release()
         elif isinstance(outcome, Unanswered) or outcome.reason.startswith("busy"):
             with self._changed:
                 self.resent += 1
@@ -106,8 +114,13 @@ class CreditSender:
 
     def _give_up(self, failure: Refused | LinkError) -> None:
         with self._changed:
-            self._outstanding -= 1
             self._failure = self._failure or failure
+            self._release()
+
+    def _release(self) -> None:
+        self._outstanding -= 1
+        self._credit.put(None)
+        if self._failure or not self._outstanding:
             self._changed.notify_all()
 
     def _tell(self, event: str, reason: str) -> None:

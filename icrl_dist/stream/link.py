@@ -250,22 +250,6 @@ class Mailbox:
             self._handler(*message)
 
 
-class Pending:
-    """A request under way; of all outcomes that arrive, the first one counts."""
-
-    def __init__(self, done: Done) -> None:
-        self._done = done
-        self._lock = threading.Lock()
-        self._settled = False
-
-    def settle(self, outcome: Outcome) -> None:
-        """Call ``done`` if nothing has before."""
-        with self._lock:
-            settled, self._settled = self._settled, True
-        if not settled:
-            self._done(outcome)
-
-
 class MemoryHub:
     """The network within one process: every link of a hub reaches every other."""
 
@@ -322,7 +306,7 @@ class MemoryLink(Link):
                 dispatcher.post(lambda: done(Unanswered(f"nobody serves {key}")))
                 return
             server, handler = found[0]
-            query = _MemoryQuery(self, server, key, payload, Pending(done), time.monotonic() + timeout_s)
+            query = _MemoryQuery(self, server, key, payload, done, time.monotonic() + timeout_s)
             self._hub._under_way.add(query)
             dispatcher.post(lambda: handle(handler, query))
             self._hub._expire_soon()
@@ -398,12 +382,10 @@ class MemoryLink(Link):
 
 
 class _MemoryQuery:
-    def __init__(
-        self, asker: MemoryLink, server: MemoryLink, key: str, payload: bytes, pending: Pending, deadline: float
-    ) -> None:
+    def __init__(self, asker: MemoryLink, server: MemoryLink, key: str, payload: bytes, done: Done, deadline: float) -> None:
         self.asker, self.server = asker, server
         self.key, self.payload, self.deadline = key, payload, deadline
-        self._pending = pending
+        self._done = done
         self._answered = False
 
     def reply(self, payload: bytes) -> None:
@@ -413,10 +395,12 @@ class _MemoryQuery:
         self._answer(Refused(reason))
 
     def end(self, outcome: Outcome) -> None:
-        """The outcome as the asker sees it, on the hub's thread."""
+        """Tell the asker, on the hub's thread; of all outcomes the first one counts."""
         with self.asker._hub._lock:
-            self.asker._hub._under_way.discard(self)
-        self._pending.settle(outcome)
+            if self not in self.asker._hub._under_way:
+                return
+            self.asker._hub._under_way.remove(self)
+        self._done(outcome)
 
     def _answer(self, outcome: Outcome) -> None:
         with self.asker._hub._lock:

@@ -7,8 +7,7 @@ raises :class:`WireError` with one of the reasons in ``REASONS``; nothing else i
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from typing import Any, NoReturn, TypeVar
 
 import msgpack
@@ -79,10 +78,10 @@ def decode_trajectory(data: bytes, limit: int) -> Trajectory:
     What the arrays hold (finiteness, the environment's bounds) is not the wire's to judge.
     """
     fields = _fields(data, limit, "trajectory", _TRAJECTORY)
-    raw = _exactly(fields["arrays"], "arrays", ARRAYS)
+    raw = _exactly(fields["arrays"], "arrays", ARRAYS.keys())
     arrays = {}
     for name, (dtype, ndim) in ARRAYS.items():
-        arrays[name] = _to_array(name, raw[name], frozenset({dtype}), ndim)
+        arrays[name] = _to_array(name, raw[name], (dtype,), ndim)
     _check_lengths(arrays)
     return Trajectory(
         identity=_to_identity(fields["identity"]),
@@ -130,7 +129,7 @@ def encode_weights(weights: Weights) -> bytes:
 
 def decode_weights(data: bytes, limit: int) -> Weights:
     """The weights in ``data``, of at most ``limit`` bytes, if they hash to the digest they came with."""
-    fields = _fields(data, limit, "weights", ("version", "digest", "arrays"))
+    fields = _fields(data, limit, "weights", _WEIGHTS)
     arrays = {_text(n, "arrays"): _to_array(n, a, WEIGHT_DTYPES, None) for n, a in _map(fields["arrays"], "arrays").items()}
     digest = _text(fields["digest"], "digest")
     _check_digest(digest, arrays)
@@ -205,8 +204,11 @@ def monitor_trajectory(trajectory: Trajectory, time: float) -> bytes:
     )
 
 
-_TRAJECTORY = ("identity", "variation", "weights", "digest", "worker", "origin", "arrays")
-_JOB = ("job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings")
+_ALWAYS = {"v", "kind"}
+_TRAJECTORY = _ALWAYS | {"identity", "variation", "weights", "digest", "worker", "origin", "arrays"}
+_WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}
+_JOB = _ALWAYS | {"job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings"}
+_DTYPES = {name: np.dtype(name) for name in WEIGHT_DTYPES | {dtype for dtype, _ in ARRAYS.values()}}
 
 
 def _pack(kind: str, fields: Mapping[str, object]) -> bytes:
@@ -245,17 +247,17 @@ def _no_extension(code: int, data: bytes) -> NoReturn:
     raise ValueError(f"extension type {code}")
 
 
-def _fields(data: bytes, limit: int, kind: str, names: Iterable[str]) -> dict[str, Any]:
+def _fields(data: bytes, limit: int, kind: str, names: Set[str]) -> dict[str, Any]:
     message = _unpack(data, limit)
     if message.get("kind") != kind:
         raise WireError("schema", f"kind {_show(message.get('kind'))}, expected {kind!r}")
-    return _exactly(message, kind, ("v", "kind", *names))
+    return _exactly(message, kind, names)
 
 
-def _exactly(value: object, what: str, names: Iterable[str]) -> dict[str, Any]:
+def _exactly(value: object, what: str, names: Set[str]) -> dict[str, Any]:
     found = _map(value, what)
-    odd = set(names) ^ set(found)
-    if odd:
+    if found.keys() != names:
+        odd = names ^ found.keys()
         raise WireError("schema", f"{what}: missing or unknown {_show(sorted(map(str, odd)))}")
     return found
 
@@ -274,15 +276,17 @@ def _typed(value: object, kind: type[_T], what: str) -> _T:
 def _map(value: object, what: str) -> dict[str, Any]:
     found: dict[str, Any] = _typed(value, dict, what)
     for name in found:
-        _text(name, f"a name in {what}")
+        if type(name) is not str:
+            raise WireError("schema", f"{what} has the key {_show(name)}, expected text")
     return found
 
 
 def _list(value: object, what: str, length: int | None = None) -> list[Any]:
-    found: list[Any] = _typed(value, list, what)
-    if length is not None and len(found) != length:
-        raise WireError("schema", f"{what} has {len(found)} entries, expected {length}")
-    return found
+    if type(value) is not list:
+        raise WireError("schema", f"{what} is {_show(value)}, expected list")
+    if length is not None and len(value) != length:
+        raise WireError("schema", f"{what} has {len(value)} entries, expected {length}")
+    return value
 
 
 def _text(value: object, what: str) -> str:
@@ -317,7 +321,7 @@ def _plain(params: Params) -> dict[str, object]:
 
 def _to_params(value: object, what: str) -> Params:
     pairs = (_list(pair, what, 2) for pair in _list(value, what))
-    return tuple((_text(name, what), _to_value(v, f"{what} {_show(name)}")) for name, v in pairs)
+    return tuple((_text(name, what), _to_value(v, what)) for name, v in pairs)
 
 
 def _to_value(value: object, what: str) -> Value:
@@ -346,17 +350,24 @@ def _from_array(array: np.ndarray) -> list[object]:
     return [array.dtype.str, list(array.shape), array.tobytes()]
 
 
-def _to_array(name: str, value: object, dtypes: frozenset[str], ndim: int | None) -> np.ndarray:
-    dtype, shape, data = _list(value, name, 3)
-    if _text(dtype, f"{name}'s dtype") not in dtypes:
+def _to_array(name: str, value: object, dtypes: Iterable[str], ndim: int | None) -> np.ndarray:
+    dtype, shape, content = _list(value, name, 3)
+    if type(dtype) is not str or dtype not in dtypes:
         raise WireError("dtype", f"{name} is {_show(dtype)}, expected one of {sorted(dtypes)}")
-    shape = [_integer(n, f"{name}'s shape", 0) for n in _list(shape, f"{name}'s shape")]
-    content = _typed(data, bytes, f"{name}'s bytes")
-    if len(shape) > _DEPTH or (ndim is not None and len(shape) != ndim) or math.prod(n or 1 for n in shape) > _CELLS:
+    if type(content) is not bytes:
+        raise WireError("schema", f"{name}'s content is {_show(content)}, expected bytes")
+    cells = extent = 1
+    for size in _list(shape, name):
+        if type(size) is not int or size < 0:
+            raise WireError("schema", f"{name} has shape {_show(shape)}, expected whole numbers")
+        cells *= size
+        extent *= size or 1
+    if len(shape) > _DEPTH or extent > _CELLS or (ndim is not None and len(shape) != ndim):
         raise WireError("shape", f"{name} has shape {_show(shape)}, expected {ndim or 'few'} dimensions")
-    if math.prod(shape) * np.dtype(dtype).itemsize != len(content):
+    kind = _DTYPES[dtype]
+    if cells * kind.itemsize != len(content):
         raise WireError("shape", f"{name} has shape {shape} of {dtype} but {len(content)} bytes")
-    return np.frombuffer(content, dtype).reshape(shape)
+    return np.frombuffer(content, kind).reshape(shape)
 
 
 def _check_kind(name: str, dtype: str, ndim: int) -> None:

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
+import itertools
 import json
+import os
 import re
 import socket
 import threading
@@ -25,7 +28,6 @@ from icrl_dist.stream.link import (
     LinkError,
     Mailbox,
     Outcome,
-    Pending,
     Query,
     Refused,
     Unanswered,
@@ -47,8 +49,10 @@ class ZenohLink(Link):
         self._endpoint = endpoint
         self._lock = threading.Lock()
         self._closed = False
-        self._pending: set[Pending] = set()
-        self._publishing = threading.Lock()
+        self._numbers = itertools.count()
+        self._under_way: dict[int, Done] = {}
+        self._declaring = threading.Lock()
+        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
         self._mailboxes: list[Mailbox] = []
         self._declared: list[object] = []
@@ -94,40 +98,33 @@ class ZenohLink(Link):
             ) from error
 
     def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
-        pending = Pending(done)
-        with self._lock:
-            self._check_open()
-            self._pending.add(pending)
-        caller: int | None = threading.get_ident()
+        number, caller = next(self._numbers), threading.get_ident()
+        under_way = self._under_way
+        under_way[number] = done  # whoever takes it out again calls it
 
         def settle(outcome: Outcome) -> None:
-            with self._lock:
-                self._pending.discard(pending)
+            waiting = under_way.pop(number, None)
+            if waiting is None:
+                return
             if threading.get_ident() == caller:
-                self._dispatcher.post(lambda: pending.settle(outcome))
+                self._dispatcher.post(lambda: waiting(outcome))
             else:
-                pending.settle(outcome)
+                waiting(outcome)
 
         def on_reply(reply: zenoh.Reply) -> None:
             settle(_outcome(reply))
 
         def on_end() -> None:
-            settle(Unanswered(f"nobody answered on {key}"))
+            if number in under_way:
+                settle(Unanswered(f"nobody answered on {key}"))
 
         try:
             with self._errors():
-                self._session.get(
-                    key,
-                    Callback(on_reply, on_end, indirect=False),
-                    payload=payload,
-                    timeout=timeout_s,
-                    consolidation=ConsolidationMode.NONE,
-                    congestion_control=CongestionControl.BLOCK,
-                )
-        except LinkError as error:
-            settle(Unanswered(str(error)))
-        finally:
-            caller = None
+                self._querier(key, timeout_s).get(Callback(on_reply, on_end, indirect=False), payload=payload)
+        except LinkError:
+            if self._closed and under_way.pop(number, None) is not None:
+                raise
+            settle(Unanswered(f"{key} could not be asked"))
 
     def serve(self, key: str, handler: Callable[[Query], None]) -> None:
         def answer(query: zenoh.Query) -> None:
@@ -138,7 +135,7 @@ class ZenohLink(Link):
 
     def publish(self, key: str, payload: bytes, droppable: bool) -> None:
         with self._errors():
-            with self._publishing:
+            with self._declaring:
                 publisher = self._publishers.get((key, droppable))
                 if publisher is None:
                     publisher = self._publishers[key, droppable] = self._session.declare_publisher(
@@ -182,14 +179,28 @@ class ZenohLink(Link):
             if self._closed:
                 return
             self._closed = True
-            pending, self._pending = self._pending, set()
         atexit.unregister(self.close)
         self._session.close()  # type: ignore[no-untyped-call]
-        for one in pending:
-            self._dispatcher.post(lambda one=one: one.settle(Unanswered("the link was closed")))  # type: ignore[misc]
+        for number in list(self._under_way):
+            if (done := self._under_way.pop(number, None)) is not None:
+                self._dispatcher.post(functools.partial(done, Unanswered("the link was closed")))
         for mailbox in self._mailboxes:
             mailbox.close()
         self._dispatcher.close()
+
+    def _querier(self, key: str, timeout_s: float) -> zenoh.Querier:
+        querier = self._queriers.get((key, timeout_s))
+        if querier is None:
+            with self._declaring:
+                querier = self._queriers.get((key, timeout_s))
+                if querier is None:
+                    querier = self._queriers[key, timeout_s] = self._session.declare_querier(
+                        key,
+                        timeout=timeout_s,
+                        consolidation=ConsolidationMode.NONE,
+                        congestion_control=CongestionControl.BLOCK,
+                    )
+        return querier
 
     def _mailbox(self, handler: Callable[..., None]) -> Mailbox:
         mailbox = Mailbox(handler)
@@ -247,7 +258,14 @@ def _outcome(reply: zenoh.Reply) -> Outcome:
     return Unanswered(error.decode("utf-8", "replace"))
 
 
+_RUNTIME = "(rx: (worker_threads: 1), {rest}, app: (worker_threads: 1))".format(
+    rest=", ".join(f"{name}: (handover: app)" for name in ("acc", "tx", "net"))
+)
+"""Zenoh's threads: one to receive, one for the rest; its default of six costs a third more CPU a message."""
+
+
 def _open(settings: Mapping[str, object]) -> zenoh.Session:
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read once, when the process opens its first session
     everywhere: dict[str, object] = {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,

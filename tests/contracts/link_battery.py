@@ -244,7 +244,7 @@ class LinkBattery:
         worker = links.worker()
         links.settle()
         sender = CreditSender(worker, KEYS.data, credits=3, timeout_s=10.0)
-        feeder = threading.Thread(target=lambda: [sender.send(b"%d" % i) for i in range(10)])
+        feeder = threading.Thread(target=lambda: list(map(sender.send, [b"%d" % i for i in range(10)])))
         feeder.start()
         for answered in range(10):
             eventually(lambda n=answered: len(held) == min(10, n + 3))

@@ -164,14 +164,18 @@ def test_load_of_a_missing_file(name: str, tmp_path: Path, monkeypatch: pytest.M
 PACKAGED = sorted(f.name.removesuffix(".toml") for f in (resources.files("icrl_dist") / "runs").iterdir() if ".toml" in f.name)
 
 
-def test_an_unknown_packaged_run_names_the_nearest() -> None:
-    assert "darkroom" in PACKAGED
+@pytest.mark.parametrize("name", PACKAGED)
+def test_an_unknown_packaged_run_names_the_nearest(name: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        config.load("darkrom")
+        config.load(name + "x")
     message = str(caught.value)
-    assert message.startswith("run 'darkrom': no packaged run of that name; did you mean 'darkroom'")
-    assert all(name in message for name in PACKAGED)
+    assert message.startswith(f"run '{name}x': no packaged run of that name; did you mean '{name}'")
+    assert all(known in message for known in PACKAGED)
     assert "\n" not in message
+
+
+def test_there_are_packaged_runs() -> None:
+    assert PACKAGED
 
 
 @pytest.mark.parametrize("name", PACKAGED)

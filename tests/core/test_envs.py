@@ -39,14 +39,14 @@ def test_make_shows_the_override_in_info_only() -> None:
 
 def test_unknown_problem_is_refused_with_the_known_ones() -> None:
     strange = Task.of("lightroom", size=3)
-    with pytest.raises(ValueError, match="'lightroom'.*darkroom"):
+    with pytest.raises(ValueError, match=r"'lightroom'.*darkroom"):
         envs.spec(strange)
-    with pytest.raises(ValueError, match="'lightroom'.*darkroom"):
+    with pytest.raises(ValueError, match=r"'lightroom'.*darkroom"):
         envs.batch([Variation(strange)])
 
 
 def test_a_batch_of_two_problems_is_refused() -> None:
-    with pytest.raises(ValueError, match="darkroom.*lightroom"):
+    with pytest.raises(ValueError, match=r"darkroom.*lightroom"):
         envs.batch([quiet_room(), Variation(Task.of("lightroom", size=3))])
     with pytest.raises(ValueError, match="one problem"):
         envs.batch([])

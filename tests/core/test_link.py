@@ -100,7 +100,7 @@ def test_names_that_cannot_be_keys_are_refused() -> None:
 def test_a_dispatcher_outlives_what_it_runs(caplog: pytest.LogCaptureFixture) -> None:
     dispatcher, ran = Dispatcher("test"), list[str]()
     dispatcher.post(lambda: ran.append("later"), 0.05)
-    dispatcher.post(lambda: 1 / 0)  # type: ignore[arg-type,return-value]
+    dispatcher.post(lambda: 1 / 0)  # type: ignore[arg-type]
     dispatcher.post(lambda: ran.append("now"))
     dispatcher.post(lambda: ran.append("never"), 60.0)
     eventually(lambda: ran == ["now", "later"])
@@ -199,8 +199,8 @@ def test_a_killed_and_restarted_learner_loses_nothing(tmp_path: Path) -> None:
     learner = run(LEARNER, endpoint, stored)
     try:
         with ZenohLink.connect(endpoint, 15.0) as worker:
-            sender = CreditSender(worker, KEYS.data, 8, 5.0)
-            feeder = threading.Thread(target=lambda: [sender.send(b"%d" % i) for i in range(800)])
+            sender, items = CreditSender(worker, KEYS.data, 8, 5.0), [b"%d" % i for i in range(800)]
+            feeder = threading.Thread(target=lambda: list(map(sender.send, items)))
             feeder.start()
             eventually(lambda: sender.acknowledged > 200, 10.0)
             kill(learner)
@@ -244,8 +244,9 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
         tap = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         try:
             lines: list[str] = []
-            assert tap.stdout is not None
-            reader = threading.Thread(target=lambda: lines.append(tap.stdout.readline()), daemon=True)
+            output = tap.stdout
+            assert output is not None
+            reader = threading.Thread(target=lambda: lines.append(output.readline()), daemon=True)
             reader.start()
             end = time.monotonic() + 15
             while not lines and time.monotonic() < end:

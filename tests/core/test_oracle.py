@@ -53,7 +53,9 @@ def outcomes(variation: Variation, cell: Cell, action: int) -> list[tuple[float,
     return [(1 - p, moved(cell, action, size)), *((p * q[b], moved(cell, b, size)) for b in range(ACTIONS))]
 
 
-def slow_q(variation: Variation, cell: Cell, steps: int, gamma: float, memo: dict[tuple[Cell, int], list[float]]) -> list[float]:
+def slow_q(
+    variation: Variation, cell: Cell, steps: int, gamma: float, memo: dict[tuple[Cell, int], list[float]]
+) -> list[float]:
     """Q of each action with ``steps`` to go, by recursion over everything that can happen."""
     if (cell, steps) not in memo:
         values = []
@@ -301,7 +303,9 @@ def test_optimal_agent_earns_what_optimal_returns_promises() -> None:
     """Theory against the simulator: p, q, walls, horizon and start must agree in both."""
     rows, horizon = 2000, 15
     adversaries = (NULL, Adversary.of("uniform", p=0.5), Adversary.of("dirichlet", p=0.4, alpha=ALPHA))
-    kinds = [Variation(darkroom.task(g, 4, horizon, (0, 0)), a) for g, a in zip([(3, 1), (2, 2), (1, 3)], adversaries, strict=True)]
+    kinds = [
+        Variation(darkroom.task(g, 4, horizon, (0, 0)), a) for g, a in zip([(3, 1), (2, 2), (1, 3)], adversaries, strict=True)
+    ]
     h = Hypotheses.of(kinds)
     promised = oracle.optimal_returns(h)
     labels = oracle.soft_labels(h, 1.0, 0.0)

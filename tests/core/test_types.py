@@ -61,7 +61,7 @@ def test_reading_params() -> None:
     task = Task.of("darkroom", size=3, goal=(1, 2), name="x", flag=True)
     assert (task["size"], task.number("size"), task.vector("goal")) == (3, 3, (1, 2))
     assert (task.get("size", 9), task.get("width", 9)) == (3, 9)
-    with pytest.raises(KeyError, match="'width'.*flag, goal, name, size"):
+    with pytest.raises(KeyError, match=r"'width'.*flag, goal, name, size"):
         task["width"]
     for name in ("goal", "name", "flag"):
         with pytest.raises(TypeError, match=f"{name}=.*not a number"):
@@ -129,7 +129,7 @@ def test_a_job_names_every_trajectory_it_will_deliver() -> None:
     assert names == [Identity("adapt", 2, 5, v, t) for v in range(3) for t in range(4)]
     assert job.setting("rate") == 0.5
     assert job.name == ("adapt", 2, 5)
-    with pytest.raises(KeyError, match="'speed'.*rate"):
+    with pytest.raises(KeyError, match=r"'speed'.*rate"):
         job.setting("speed")
 
 

@@ -1,0 +1,43 @@
+"""The environment benchmark: it counts what it says, and refuses what it does not know."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from icrl_dist.bench import env
+from icrl_dist.config import ConfigError
+
+
+def test_it_reports_its_rate() -> None:
+    result = env.run(batch=8, seconds=0.02)
+    assert (result["problem"], result["batch"], result["seconds"]) == ("darkroom", 8, 0.02)
+    # Checked shapes make it slow here: the number itself is the bench's business, its order is not.
+    assert 1e2 < result["seeded_steps_per_s"] < 1e7
+    assert 1e2 < result["steps_per_s"] < 1e7
+    assert json.loads(json.dumps(result)) == result
+    assert f"{result['steps_per_s'] / 1e6:.1f} million steps/s" in env.describe(result)
+
+
+def test_every_row_is_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    real = env.envs.batch
+    monkeypatch.setattr(env.envs, "batch", lambda variations: seen.extend(variations) or real(variations))
+    env.run(batch=32, seconds=0.001)
+    assert len(seen) == 32
+    assert all(v.adversary.kind == "dirichlet" and v.adversary.number("p") > 0 for v in seen)
+    assert len({v.adversary for v in seen}) == 32
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"problem": "lightroom"}, r"problem = 'lightroom': choose one of darkroom"),
+        ({"batch": 0}, r"batch = 0"),
+        ({"seconds": 0.0}, r"seconds = 0\.0"),
+    ],
+)
+def test_what_it_cannot_measure_is_refused(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        env.run(**wrong)

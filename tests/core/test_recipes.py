@@ -1,0 +1,180 @@
+"""The recipes against Algorithms 2 and 3, line by line."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from icrl_dist import jobs
+from icrl_dist.envs import tasks
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.oracle import Hypotheses, cell_numbers, soft_labels
+from icrl_dist.recipes import METHODS, by_variation, self_labelled
+from icrl_dist.types import NULL, Identity
+
+
+
+class Kept:
+    """A dataset in memory, given in any order."""
+
+    def __init__(self, trajectories):
+        self.trajectories = list(trajectories)
+
+    def select(self, stage, round_):
+        chosen = [t for t in self.trajectories if t.identity[:2] == (stage, round_)]
+        return iter(sorted(chosen, key=lambda t: t.identity.key()))
+
+
+class Fixed:
+    """One untrained model for every version."""
+
+    def __init__(self, spec, config):
+        self.model = PretrainedTransformer(spec, config).eval()
+        self.asked = []
+
+    def at(self, version):
+        self.asked.append(version)
+        return self.model, f"digest {version}"
+
+
+@pytest.fixture
+def collected(small_run):
+    method = METHODS["icaa"]
+    from icrl_dist.envs import spec
+
+    policies = Fixed(spec(tasks.split(small_run).train[0]), small_run.model)
+    trajectories = []
+    for phase in method.phases(small_run):
+        for job in method.ask(small_run, phase):
+            trajectories += jobs.do(job, policies, "w")
+    return trajectories, policies
+
+
+def test_every_method_shares_out_the_same_number_of_contexts(small_run):
+    for name in ("dpt", "icag", "icaa"):
+        phase = METHODS[name].phases(small_run)[0]
+        asked = METHODS[name].ask(small_run, phase)
+        assert len(asked) == len(tasks.split(small_run).train)
+        assert sum(len(job.variations) * job.trials for job in asked) == small_run.pretrain.contexts
+        assert all(job.weights == -1 for job in asked)
+
+
+def test_dpt_and_d0_of_icaa_have_no_disturbance_and_icag_has_k_adversaries(small_run):
+    adversaries = {}
+    for name in ("dpt", "icag", "icaa"):
+        phase = METHODS[name].phases(small_run)[0]
+        adversaries[name] = [[v.adversary for v in job.variations] for job in METHODS[name].ask(small_run, phase)]
+    assert adversaries["dpt"] == adversaries["icaa"] == [[NULL]] * len(adversaries["dpt"])
+    for chosen in adversaries["icag"]:
+        assert chosen[0] == NULL
+        assert len(set(chosen)) == small_run.adversary.count
+
+
+def test_icaa_rolls_out_version_j_in_round_j_and_produces_j_plus_1(small_run):
+    run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, rounds=2))
+    phases = METHODS["icaa"].phases(run)
+    assert [(p.stage, p.round, p.acting, p.produces) for p in phases] == [
+        ("pretrain", 0, -1, 0),
+        ("adapt", 0, 0, 1),
+        ("adapt", 1, 1, 2),
+        ("adapt", 2, 2, 3),
+    ]
+    for phase in phases[1:]:
+        for job in METHODS["icaa"].ask(run, phase):
+            assert job.weights == phase.round
+            assert job.trials == run.icaa.trials + 1
+            assert all(v.task.vector("start") == (0, 0) for v in job.variations)
+
+
+def test_a_job_delivers_exactly_its_identities_and_one_version_acts_in_all(small_run, collected):
+    trajectories, policies = collected
+    method = METHODS["icaa"]
+    wanted = [i for phase in method.phases(small_run) for job in method.ask(small_run, phase) for i in job.identities()]
+    assert sorted(t.identity for t in trajectories) == sorted(wanted)
+    assert {(t.identity.round, t.weights, t.digest) for t in trajectories if t.identity.stage == "adapt"} == {
+        (0, 0, "digest 0"),
+        (1, 1, "digest 1"),
+    }
+    count = len(tasks.split(small_run).train)
+    assert policies.asked == [0] * count + [1] * count
+
+
+def test_no_test_goal_is_ever_trained_on(small_run, collected):
+    held_out = {t.vector("goal") for t in tasks.split(small_run).test}
+    assert held_out
+    assert not held_out & {t.variation.task.vector("goal") for t in collected[0]}
+
+
+def test_the_same_job_repeats_itself_exactly(small_run, collected):
+    _, policies = collected
+    method = METHODS["icaa"]
+    for phase in method.phases(small_run)[:2]:
+        job = method.ask(small_run, phase)[1]
+        for one, two in zip(jobs.do(job, policies, "a"), jobs.do(job, policies, "b"), strict=True):
+            assert one.identity == two.identity
+            assert all((a == b).all() for a, b in zip(one.arrays().values(), two.arrays().values(), strict=True))
+
+
+def test_d0_labels_are_those_of_each_variations_optimal_policy(small_run, collected):
+    for t in collected[0]:
+        if t.identity.stage != "pretrain":
+            continue
+        truth = soft_labels(Hypotheses.of([t.variation]), small_run.darkroom.gamma, small_run.darkroom.label_slack)[0]
+        np.testing.assert_array_equal(t.labels, truth[cell_numbers(t.queries, 3)])
+        assert t.origin == "optimal"
+
+
+def test_sampled_labels_are_single_optimal_actions(small_run):
+    run = dataclasses.replace(small_run, darkroom=dataclasses.replace(small_run.darkroom, labels="sampled"))
+    phase = METHODS["dpt"].phases(run)[0]
+    for job in METHODS["dpt"].ask(run, phase):
+        for t in jobs.do(job, Fixed, "w"):
+            truth = soft_labels(Hypotheses.of([t.variation]), run.darkroom.gamma, run.darkroom.label_slack)[0]
+            assert (t.labels.sum(axis=1) == 1).all() and (t.labels.max(axis=1) == 1).all()
+            assert (truth[cell_numbers(t.queries, 3), t.labels.argmax(axis=1)] > 0).all()
+
+
+def test_labels_come_from_strictly_later_trials_than_contexts(small_run, collected):
+    adapt = [t for t in collected[0] if t.identity[:2] == ("adapt", 0)]
+    for trials in by_variation(sorted(adapt, key=lambda t: t.identity.key())):
+        made = self_labelled(small_run, trials)
+        cut = small_run.icaa.context_trials + 1
+        np.testing.assert_array_equal(made.actions, np.stack([t.actions for t in trials[:cut]]))
+        np.testing.assert_array_equal(made.queries, np.concatenate([t.observations[:-1] for t in trials[cut:]]))
+        np.testing.assert_array_equal(made.labels.argmax(axis=1), np.concatenate([t.actions for t in trials[cut:]]))
+
+
+def test_top_return_takes_the_better_half_of_the_later_trials(small_run, collected):
+    run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, label_trials="top_return"))
+    adapt = [t for t in collected[0] if t.identity[:2] == ("adapt", 0)]
+    trials = next(by_variation(sorted(adapt, key=lambda t: t.identity.key())))
+    better = []
+    for n, t in enumerate(trials):
+        rewards = np.full(8, float(n == 3), np.float32)
+        better.append(dataclasses.replace(t, rewards=rewards))
+    made = self_labelled(run, better)
+    assert len(made.queries) == 8 * 2
+    np.testing.assert_array_equal(made.queries[:8], better[3].observations[:-1])
+
+
+def test_each_round_learns_from_d0_and_all_rounds_so_far(small_run, collected):
+    method, data = METHODS["icaa"], Kept(collected[0])
+    first, second, third = (method.learn(small_run, phase, data) for phase in method.phases(small_run))
+    variations = len(tasks.split(small_run).train) * small_run.adversary.count
+    assert [len(pool.examples) for pool in first] == [len(tasks.split(small_run).train)]
+    assert [len(pool.examples) for pool in second] == [len(first[0].examples), variations]
+    assert [len(pool.examples) for pool in third] == [len(first[0].examples), 2 * variations]
+    assert [pool.share for pool in third] == [1 - small_run.icaa.new_fraction, small_run.icaa.new_fraction]
+
+
+def test_an_unknown_job_is_refused(small_run):
+    job = METHODS["dpt"].ask(small_run, METHODS["dpt"].phases(small_run)[0])[0]
+    with pytest.raises(ValueError, match="'dance'"):
+        jobs.do(dataclasses.replace(job, kind="dance"), Fixed, "w")
+
+
+def test_an_identity_names_its_draws():
+    one = Identity("adapt", 0, 1, 2, 3).rng(7).random(4)
+    np.testing.assert_array_equal(Identity("adapt", 0, 1, 2, 3).rng(7).random(4), one)
+    assert (Identity("adapt", 0, 1, 3, 2).rng(7).random(4) != one).any()
+    assert (Identity("adapt", 0, 1, 2, 3).rng(8).random(4) != one).any()

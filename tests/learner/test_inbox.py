@@ -1,0 +1,158 @@
+"""Untrusted bytes on the data key: counted by reason, refused, and harmless."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+
+from icrl_dist import envs, jobs
+from icrl_dist.recipes import METHODS
+from icrl_dist.store import Store, StoreError
+from icrl_dist.stream import wire
+from icrl_dist.types import Identity
+from learner.inbox import REASONS, Inbox
+
+
+class Asked:
+    """A query that remembers its answer."""
+
+    key = "data"
+
+    def __init__(self, payload):
+        self.payload = payload
+        self.answer = None
+        self.answered = threading.Event()
+
+    def reply(self, payload):
+        assert self.answer is None
+        self.answer = payload
+        self.answered.set()
+
+    def refuse(self, reason):
+        assert self.answer is None
+        self.answer = reason
+        self.answered.set()
+
+
+@pytest.fixture
+def job(small_run):
+    return METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
+
+
+@pytest.fixture
+def trajectories(job):
+    return list(jobs.do(job, None, "w"))
+
+
+@pytest.fixture
+def inbox(tmp_path, small_run, job):
+    store = Store(tmp_path)
+    wanted = set(job.identities())
+    failures = []
+    made = Inbox(
+        store,
+        envs.spec(job.variations[0].task),
+        1 << 20,
+        lambda identity: job if identity in wanted else None,
+        lambda version: "",
+        lambda t: wanted.discard(t.identity),
+        failures.append,
+    )
+    made.store, made.failures = store, failures
+    yield made
+    made.close()
+    store.close()
+
+
+def put(inbox, payload):
+    query = Asked(payload)
+    inbox.put(query)
+    assert query.answered.wait(5)
+    return query.answer
+
+
+def test_a_good_trajectory_is_on_disk_before_the_answer(inbox, trajectories, monkeypatch):
+    order = []
+    append = inbox.store.append
+    monkeypatch.setattr(inbox.store, "append", lambda items: (append(items), order.append("stored")))
+    monkeypatch.setattr(Asked, "reply", lambda self, payload: (order.append("answered"), self.answered.set()))
+    put(inbox, wire.encode_trajectory(trajectories[0]))
+    assert order == ["stored", "answered"]
+    assert trajectories[0].identity in inbox.store
+
+
+def test_a_duplicate_is_acknowledged_and_stored_once(inbox, trajectories):
+    payload = wire.encode_trajectory(trajectories[0])
+    assert put(inbox, payload) == put(inbox, payload) == b"stored"
+    assert len(inbox.store) == 1 and inbox.drops == {"duplicate": 1}
+    pair = [Asked(wire.encode_trajectory(trajectories[1])) for _ in range(2)]
+    inbox.take(pair)
+    assert len(inbox.store) == 2 and [q.answer for q in pair] == [b"stored"] * 2
+
+
+def broken(trajectory):
+    """Every way to be wrong, and the reason it must be counted under."""
+    good = wire.encode_trajectory(trajectory)
+    nan = trajectory.rewards.copy()
+    nan[0] = np.nan
+    far = trajectory.actions.copy()
+    far[0] = 5
+
+    def changed(**fields):
+        return wire.encode_trajectory(dataclasses.replace(trajectory, **fields))
+
+    short = {name: getattr(trajectory, name)[:4] for name in ("actions", "rewards", "adversary")}
+    return [
+        ("not-msgpack", b"\xc1garbage"),
+        ("not-msgpack", b""),
+        ("not-msgpack", good[:-1]),
+        ("oversized", good + b"\0" * (1 << 20)),
+        ("schema", wire.encode_message("trajectory")),
+        ("not-finite", changed(rewards=nan)),
+        ("spec", changed(observations=trajectory.observations[:5], **short)),
+        ("spec", changed(actions=far)),
+        ("spec", changed(labels=trajectory.labels[:, :4])),
+        ("unexpected", changed(identity=Identity("adapt", 7, 0, 0, 0))),
+        ("unexpected", changed(variation=dataclasses.replace(trajectory.variation, task=trajectory.variation.task.replace(goal=(0, 0), size=4)))),
+        ("stale-weights", changed(weights=3)),
+        ("stale-weights", changed(digest="f" * 64)),
+    ]
+
+
+def test_bad_messages_are_counted_by_reason_refused_and_harm_nothing(inbox, trajectories):
+    cases = broken(trajectories[0])
+    for reason, payload in cases:
+        before = inbox.drops[reason]
+        answer = put(inbox, payload)
+        assert answer.startswith(reason), (reason, answer)
+        assert inbox.drops[reason] == before + 1
+    assert len(inbox.store) == 0 and set(inbox.drops) <= set(REASONS)
+    assert put(inbox, wire.encode_trajectory(trajectories[0])) == b"stored"
+
+
+def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, trajectories):
+    gate = threading.Event()
+    store = Store(tmp_path / "gated")
+    inbox = Inbox(
+        store, envs.spec(job.variations[0].task), 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity=2
+    )
+    payload = wire.encode_trajectory(trajectories[0])
+    queries = [Asked(payload) for _ in range(8)]
+    for query in queries:
+        inbox.put(query)
+    busy = [q for q in queries if q.answer == "busy"]
+    assert len(busy) >= 4 and inbox.drops["busy"] == len(busy)
+    gate.set()
+    assert all(q.answered.wait(5) for q in queries)
+    inbox.close()
+    store.close()
+
+
+def test_a_full_disk_acknowledges_nothing_and_is_reported(inbox, trajectories, monkeypatch):
+    def full(items):
+        raise StoreError("segment: could not be written (No space left on device)")
+
+    monkeypatch.setattr(inbox.store, "append", full)
+    assert put(inbox, wire.encode_trajectory(trajectories[0])).startswith("busy")
+    assert "No space left" in str(inbox.failures[0])

@@ -1,0 +1,141 @@
+"""Whole runs in one process: the same bytes whatever happened on the way."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from icrl_dist import launch
+from icrl_dist.agent import load_agent
+from icrl_dist.config import ConfigError
+from icrl_dist.store import Store
+from learner import checkpoints, service
+
+
+def run_inline(run, folder, report=lambda event: None, **options):
+    launch.prepare(run, folder, **{"resume": False, "overwrite": False, **options})
+    return launch.train_inline(run, folder, report)
+
+
+@pytest.fixture(autouse=True)
+def no_tensorboard(monkeypatch):
+    monkeypatch.setattr(service, "Metrics", lambda folder: METRICS(folder, tensorboard=False))
+
+
+METRICS = service.Metrics
+
+
+@pytest.fixture
+def undisturbed(small_run, tmp_path):
+    return run_inline(small_run, tmp_path / "undisturbed")
+
+
+def same(result, other):
+    names = ("dataset_digest", "weights_digest", "trajectories", "version")
+    return [result[n] for n in names] == [other[n] for n in names]
+
+
+def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small_run, tmp_path, undisturbed):
+    folder = tmp_path / "undisturbed"
+    store = Store(folder / "dataset")
+    versions = [checkpoints.read_manifest(checkpoints.version_file(folder, v)) for v in range(3)]
+    for identity in store.index:
+        t = store.read(identity)
+        if identity.stage == "adapt":
+            assert (t.weights, t.digest) == (identity.round, versions[identity.round]["weights_digest"])
+        else:
+            assert (t.weights, t.digest) == (-1, "")
+    store.close()
+    adapt = 7 * 3 * (small_run.icaa.trials + 1)
+    assert undisturbed["trajectories"] == len(store) == 42 + 2 * adapt
+    assert undisturbed["weights_digest"] == versions[2]["weights_digest"]
+    assert undisturbed["version"] == 2 and undisturbed["drops"] == {}
+
+
+def test_repeating_a_run_gives_the_same_bytes_and_another_seed_others(small_run, tmp_path, undisturbed):
+    assert same(run_inline(small_run, tmp_path / "again"), undisturbed)
+    other = run_inline(dataclasses.replace(small_run, seed=1), tmp_path / "other")
+    assert other["dataset_digest"] != undisturbed["dataset_digest"]
+
+
+@pytest.mark.parametrize("when", [("collect", 0, 20), ("fit", 0, 4), ("collect", 2, 40), ("fit", 2, 3)])
+def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, undisturbed, when, monkeypatch):
+    what, produces, step = when
+    stopped = []
+
+    def stop_at(event):
+        at = event.get("stage"), event.get("version", -2) + 1
+        if event["event"] == "progress" and at == (what, produces) and event["step"] >= step and not stopped:
+            stopped.append(event)
+            made[0].stop()
+
+    made = []
+    real = service.Service.__init__
+
+    def remember(self, *arguments):
+        real(self, *arguments)
+        made.append(self)
+        self._progress.__func__  # noqa: B018
+
+    monkeypatch.setattr(service.Service, "__init__", remember)
+    monkeypatch.setattr(service.time, "monotonic", Hurry(service.time.monotonic))
+    folder = tmp_path / "stopped"
+    with pytest.raises(launch.TrainInterrupted):
+        run_inline(small_run, folder, stop_at)
+    assert stopped
+    if what == "fit":
+        partial = checkpoints.read_manifest(folder / "checkpoints" / checkpoints.PARTIAL)
+        assert partial["produces"] == produces and 0 < partial["step"] < small_run.pretrain.steps
+    assert same(run_inline(small_run, folder, resume=True), undisturbed)
+
+
+class Hurry:
+    """A clock of which every reading is a second after the last: progress is shown each time."""
+
+    def __init__(self, clock):
+        self._now = clock()
+
+    def __call__(self):
+        self._now += 1e-3
+        return self._now
+
+
+def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(small_run, tmp_path, undisturbed):
+    agent = load_agent(tmp_path / "undisturbed", seed=0)
+    manifest = agent.manifest
+    assert manifest["weights_digest"] == undisturbed["weights_digest"]
+    assert (manifest["size"], manifest["horizon"], manifest["version"]) == (3, 8, 2)
+    assert len(manifest["test_goals"]) == 2 and all(len(goal) == 2 for goal in manifest["test_goals"])
+    json.dumps(manifest)
+    agent.reset_context(batch=2)
+    assert agent.act(np.zeros((2, 2))).shape == (2,)
+
+
+def test_a_folder_in_use_and_other_numbers_are_refused(small_run, tmp_path, undisturbed):
+    folder = tmp_path / "undisturbed"
+    with pytest.raises(ConfigError, match="exists: use --resume"):
+        launch.prepare(small_run, folder, resume=False, overwrite=False)
+    with pytest.raises(ConfigError, match="other numbers"):
+        launch.prepare(dataclasses.replace(small_run, seed=5), folder, resume=True, overwrite=False)
+    with pytest.raises(ConfigError, match="holds no run"):
+        launch.prepare(small_run, tmp_path / "nothing", resume=True, overwrite=False)
+    wide = dataclasses.replace(small_run, model=dataclasses.replace(small_run.model, width=32))
+    (folder / "run.toml").write_text(launch.dumps(wide))
+    with pytest.raises(ConfigError, match="a checkpoint of another model"):
+        run_inline(wide, folder, resume=True)
+    large = dataclasses.replace(small_run, darkroom=dataclasses.replace(small_run.darkroom, horizon=9))
+    (folder / "run.toml").write_text(launch.dumps(large))
+    with pytest.raises(ConfigError, match="a checkpoint of another spec"):
+        run_inline(large, folder, resume=True)
+
+
+def test_a_job_that_always_fails_ends_the_run_with_its_cause(small_run, tmp_path, monkeypatch):
+    from icrl_dist import jobs
+
+    def broken(job, worker):
+        raise ZeroDivisionError("the environment broke")
+
+    monkeypatch.setattr(jobs, "random_context", broken)
+    with pytest.raises(launch.TrainFailed, match=r"failed 3 times, last: ZeroDivisionError: the environment broke"):
+        run_inline(small_run, tmp_path / "broken")
