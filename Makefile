@@ -22,7 +22,7 @@ format: env
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-env: $(READY)
+env: $(READY) ## the virtual environment
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"icrl-dist needs Python 3.11, this is {v[0]}.{v[1]}: run make PYTHON=python3.11")'

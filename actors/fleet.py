@@ -13,7 +13,11 @@ from typing import Any
 
 from icrl_dist.config import ConfigError
 
-_QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
+_SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_worker_niceness": "0",  # Ray's 15 starves the workers as soon as anything else runs
+}
 
 
 class FleetFailed(RuntimeError):  # noqa: N818
@@ -32,6 +36,13 @@ def _work(endpoint: str, run_name: str, name: str) -> None:
         Worker(link, run_name, name).run()
 
 
+def check_cores(actors: int) -> None:
+    """Raises ConfigError if this machine has fewer cores than ``actors``: they would wait for ever."""
+    cores = len(os.sched_getaffinity(0))
+    if actors > cores:
+        raise ConfigError(f"--actors {actors}: this machine has {cores} cores; ask for at most {cores}")
+
+
 class Fleet:
     """``actors`` Ray workers, each restarted at most ``restarts`` times."""
 
@@ -40,14 +51,12 @@ class Fleet:
 
         Raises ConfigError if there are fewer cores than workers: they would wait for ever.
         """
-        os.environ.update(_QUIET)
+        os.environ.update(_SETTINGS)
         import ray
 
         self._ray: Any = ray
         if address is None:
-            cores = len(os.sched_getaffinity(0))
-            if actors > cores:
-                raise ConfigError(f"--actors {actors}: this machine has {cores} cores; ask for at most {cores}")
+            check_cores(actors)
             ray.init(
                 num_cpus=actors,
                 object_store_memory=100 << 20,

@@ -65,7 +65,8 @@ class InContextAgent:
         )
 
     def _shaped(self, name: str, value: ArrayLike, dtype: type, *rest: int) -> np.ndarray:
-        array, shape = np.asarray(value, dtype), (self._policy.batch, *rest)
+        array: np.ndarray = np.asarray(value, dtype)
+        shape = (self._policy.batch, *rest)
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}, expected {shape}; reset_context(batch=B) sets B")
         return array

@@ -124,6 +124,7 @@ class Doctor:
 
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
+    from actors.fleet import check_cores
     from icrl_dist import launch
     from icrl_dist.terminal import Display
 
@@ -132,6 +133,8 @@ def train(arguments: Train, console: Console) -> int:
     folder = (arguments.out or Path("runs") / Path(arguments.run).stem).absolute()
     if arguments.actors < 1:
         raise ConfigError(f"--actors {arguments.actors}: at least 1 worker is needed")
+    if arguments.engine == "ray" and arguments.address is None:
+        check_cores(arguments.actors)
     launch.prepare(run, folder, arguments.resume, arguments.overwrite)
     began = time.monotonic()
     try:
@@ -275,7 +278,7 @@ def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
     from icrl_dist.bench import env, stream
 
-    timed = {} if arguments.seconds is None else {"seconds": arguments.seconds}
+    timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     if arguments.name == "env":
         result, text = (r := env.run(arguments.problem, **timed)), env.describe(r)
     else:
@@ -324,7 +327,9 @@ def _parse(name: str, arguments: Sequence[str]) -> Any:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The ``icrl-dist`` command.  Returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    console = Console(stderr="--json" in words)
+    to_stderr = "--json" in words
+    terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
+    console = Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
     if not words or words[0] in ("--help", "-h"):
         print(_help())
         return OK if words else USAGE

@@ -79,14 +79,18 @@ class ICAAConfig:
     """N: each variation is rolled out for N + 1 trials."""
     context_trials: int = 20
     """N_: the first N_ + 1 trials become contexts, labels come from strictly later ones."""
-    label_trials: Literal["later", "top_return"] = "later"
-    """``later``: every later trial (Algorithm 3); ``top_return``: the better half of them."""
+    label_trials: Literal["later", "top_return", "improved"] = "later"
+    """``later``: every later trial (Algorithm 3); ``top_return``: the better half of them;
+    ``improved``: those with a higher return than the context trials had on average, so that a
+    variation in which nothing was learned gives no labels."""
     context: Literal["trial", "history"] = "history"
     """``history``: a context is trials 0 to n, what the deployed agent sees (Algorithm 1, line
     16); ``trial``: any of the trials, and with optim.episodes = 1 one of them (Algorithm 3,
     line 13)."""
     steps: int = 4000
     """Fine-tuning steps a round."""
+    learning_rate: float = 1e-3
+    """Peak learning rate of fine-tuning."""
     new_fraction: float = 0.5
     """Share of a fine-tuning batch that comes from self-labelled data; the rest from D^0."""
 
@@ -116,6 +120,8 @@ class OptimConfig:
     """Peak learning rate."""
     weight_decay: float = 1e-4
     """AdamW's decoupled weight decay."""
+    beta2: float = 0.999
+    """AdamW's memory of squared gradients; shorter (0.98) suits short fits at high rates."""
     batch: int = 128
     """Contexts a step."""
     queries: int = 32
@@ -158,6 +164,9 @@ class StreamConfig:
 
     endpoint: str = "tcp/127.0.0.1:0"
     """Where the learner listens; port 0 takes a free one.  Loopback unless you change it."""
+    job_tasks: int = 4
+    """Tasks a job: their variations are stepped as one batch.  Larger batches decide faster,
+    smaller ones spread better over workers; the digests depend on it."""
     credits: int = 8
     """W: trajectories a worker may have unanswered."""
     reply_timeout_s: float = 10.0
@@ -261,6 +270,7 @@ def validate(run: Run, source: str) -> None:
     need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
     need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
     need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
+    need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
     need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
     need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
     need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
@@ -274,6 +284,7 @@ def validate(run: Run, source: str) -> None:
         "model.layers": run.model.layers,
         "model.width": run.model.width,
         "optim.learning_rate": optim.learning_rate,
+        "icaa.learning_rate": icaa.learning_rate,
         "optim.batch": optim.batch,
         "optim.queries": optim.queries,
         "optim.episodes": optim.episodes,
@@ -281,6 +292,7 @@ def validate(run: Run, source: str) -> None:
         "evaluate.episodes": run.evaluate.episodes,
         "evaluate.seeds": run.evaluate.seeds,
         "stream.credits": run.stream.credits,
+        "stream.job_tasks": run.stream.job_tasks,
         "stream.lease_s": run.stream.lease_s,
         "stream.reply_timeout_s": run.stream.reply_timeout_s,
         "stream.max_message_bytes": run.stream.max_message_bytes,

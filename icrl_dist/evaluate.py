@@ -129,7 +129,8 @@ def _rows(run: Run, chosen: Sequence[Variation], level: int) -> tuple[list[Varia
 def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
     """How good a round's own labels are, against the exact answer (Theorem E.5, measured).
 
-    ``agreement``: share of labels that the optimal policy would also take; the mean return of
+    ``agreement``: share of labels that the optimal policy would also take; ``labelling``: share
+    of the variations that gave labels; the mean return of
     the trials that became contexts and of those that gave labels; the optimum beside them.
     Empty for a phase whose labels are not the model's own.
     """
@@ -140,14 +141,16 @@ def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
         hypotheses = Hypotheses.of([trials[0].variation])
         truth = soft_labels(hypotheses, run.darkroom.gamma, run.darkroom.label_slack)[0]
         own = self_labelled(run, trials)
-        good = truth[cell_numbers(own.queries, hypotheses.size), own.labels.argmax(axis=1)] > 0
-        agreement.append(good.mean())
+        if own is not None:
+            good = truth[cell_numbers(own.queries, hypotheses.size), own.labels.argmax(axis=1)] > 0
+            agreement.append(good.mean())
         cut = run.icaa.context_trials + 1
         early.append(np.mean([t.episode_return for t in trials[:cut]]))
         late.append(np.mean([t.episode_return for t in trials[cut:]]))
         best.append(optimal_returns(hypotheses)[0])
     return {
-        "agreement": float(np.mean(agreement)),
+        "agreement": float(np.mean(agreement)) if agreement else 0.0,
+        "labelling": len(agreement) / len(early),
         "context_return": float(np.mean(early)),
         "label_return": float(np.mean(late)),
         "optimum": float(np.mean(best)),

@@ -43,6 +43,7 @@ def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
     ``slack``.
     """
     hypotheses = Hypotheses.of(job.variations)
+    place = {row: index for index, row in enumerate(job.rows())}
     mode = job.setting("labels")
     if mode == "heuristic":
         table = heuristic_labels(hypotheses)
@@ -51,11 +52,11 @@ def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
     states = cells(hypotheses.size)
     identities = list(job.identities())
     rngs = [identity.rng(job.seed) for identity in identities]
-    env = envs.batch([job.variations[i.variation] for i in identities])
+    env = envs.batch([job.variation(identity) for identity in identities])
     ran = episode(env, RandomPolicy(env.spec.actions), rngs)
     for row, (identity, rng) in enumerate(zip(identities, rngs, strict=True)):
         query = rng.integers(0, len(states), size=int(_number(job, "queries")))
-        labels = table[identity.variation, query]
+        labels = table[place[identity.task, identity.variation], query]
         if mode == "sampled":
             labels = np.eye(env.spec.actions, dtype=np.float32)[sample(labels, rng.random(len(query)))]
         origin = "heuristic" if mode == "heuristic" else "optimal"
@@ -72,12 +73,12 @@ def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
     context = ContextConfig(max=int(_number(job, "context_max")), keep="all")
     env = envs.batch(job.variations)
     policy = InContextPolicy(model, env.batch, context)
-    rows = [[Identity(job.stage, job.round, job.task, k, n) for k in range(env.batch)] for n in range(job.trials)]
+    rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     trials = ([identity.rng(job.seed) for identity in row] for row in rows)
     nothing = np.zeros((0, env.spec.observation), np.float32), np.zeros((0, env.spec.actions), np.float32)
     for row, ran in zip(rows, deploy_online(env, policy, trials), strict=True):
-        for k, identity in enumerate(row):
-            yield _trajectory(job, identity, ran, k, worker, digest, *nothing, "none")
+        for b, identity in enumerate(row):
+            yield _trajectory(job, identity, ran, b, worker, digest, *nothing, "none")
 
 
 def _number(job: Job, name: str) -> float:
@@ -100,7 +101,7 @@ def _trajectory(
 ) -> Trajectory:
     return Trajectory(
         identity=identity,
-        variation=job.variations[identity.variation],
+        variation=job.variation(identity),
         weights=job.weights,
         digest=digest,
         worker=worker,

@@ -32,7 +32,8 @@ def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
 
 def optimiser(model: PretrainedTransformer, config: OptimConfig) -> torch.optim.AdamW:
     """AdamW of appendix B.2."""
-    return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    betas = (0.9, config.beta2)
+    return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=betas)
 
 
 def rate(step: int, steps: int, warmup: int) -> float:
@@ -47,12 +48,13 @@ def fit(
     model: PretrainedTransformer,
     opt: torch.optim.Optimizer,
     config: OptimConfig,
+    learning_rate: float,
     steps: int,
     batch: Callable[[int], Batch],
     progress: Callable[[int, float], None] = lambda step, value: None,
     first: int = 0,
 ) -> float:
-    """Minimise eq. (1) for ``steps`` steps; ``batch(step)`` draws the data.
+    """Minimise eq. (1) for ``steps`` steps at peak rate ``learning_rate``; ``batch(step)`` draws the data.
 
     A step depends on its number, the weights and the optimiser alone, so a fit stopped after
     ``first`` steps goes on as if it had never stopped.  Returns the mean loss of the last
@@ -63,7 +65,7 @@ def fit(
     total, counted = 0.0, 0
     for step in range(first, steps):
         for group in opt.param_groups:
-            group["lr"] = config.learning_rate * rate(step, steps, warmup)
+            group["lr"] = learning_rate * rate(step, steps, warmup)
         value = batch_loss(model, batch(step))
         opt.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
@@ -71,7 +73,7 @@ def fit(
         opt.step()
         current = value.item()
         if not math.isfinite(current):
-            raise FloatingPointError(f"loss is {current} at step {step}: lower optim.learning_rate ({config.learning_rate})")
+            raise FloatingPointError(f"loss is {current} at step {step}: lower the learning rate ({learning_rate})")
         if step >= steps - max(1, steps // 10):
             total, counted = total + current, counted + 1
         progress(step + 1, current)

@@ -28,6 +28,8 @@ class Phase:
     round: int
     steps: int
     """Optimiser steps of the fit."""
+    learning_rate: float
+    """Peak learning rate of the fit."""
 
     @property
     def acting(self) -> int:
@@ -58,7 +60,7 @@ class Method:
 
 
 def _pretrain_only(run: Run) -> tuple[Phase, ...]:
-    return (Phase("pretrain", 0, run.pretrain.steps),)
+    return (Phase("pretrain", 0, run.pretrain.steps, run.optim.learning_rate),)
 
 
 def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
@@ -73,12 +75,21 @@ def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], t
         ("queries", run.pretrain.queries),
         ("slack", room.label_slack),
     )
-    train = tasks.split(run).train
+    chosen = [variations(i, task) for i, task in enumerate(tasks.split(run).train)]
+    trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
+    return _jobs(run, phase, "random_context", chosen, trials, settings)
+
+
+def _jobs(
+    run: Run, phase: Phase, kind: str, chosen: Sequence[tuple[Variation, ...]], trials: int, settings: Params
+) -> tuple[Job, ...]:
+    """Jobs of ``stream.job_tasks`` tasks each, given the K variations of every task."""
+    together = run.stream.job_tasks
     jobs = []
-    for i, task in enumerate(train):
-        chosen = variations(i, task)
-        trials = max(1, run.pretrain.contexts // (len(train) * len(chosen)))
-        jobs.append(Job("random_context", "pretrain", 0, i, chosen, trials, phase.acting, run.seed, settings))
+    for first in range(0, len(chosen), together):
+        group = chosen[first : first + together]
+        flat = tuple(v for variations in group for v in variations)
+        jobs.append(Job(kind, phase.stage, phase.round, first, flat, trials, phase.acting, run.seed, settings, len(group)))
     return tuple(jobs)
 
 
@@ -122,7 +133,7 @@ def _icag_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
 
 def _icaa_phases(run: Run) -> tuple[Phase, ...]:
     """Lines 3 and 5: T^0 from D^0, then rounds j = 0..J."""
-    rounds = (Phase("adapt", j, run.icaa.steps) for j in range(run.icaa.rounds + 1))
+    rounds = (Phase("adapt", j, run.icaa.steps, run.icaa.learning_rate) for j in range(run.icaa.rounds + 1))
     return (*_pretrain_only(run), *rounds)
 
 
@@ -131,11 +142,9 @@ def _icaa_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
     if phase.stage == "pretrain":
         return _dpt_ask(run, phase)
     settings: Params = (("context_max", run.context.max),)
-    jobs = []
-    for i, task in enumerate(tasks.split(run).train):
-        variations = tasks.variations(run, i, tasks.deployed(task))
-        jobs.append(Job("adapt", "adapt", phase.round, i, variations, run.icaa.trials + 1, phase.acting, run.seed, settings))
-    return tuple(jobs)
+    train = enumerate(tasks.split(run).train)
+    chosen = [tasks.variations(run, i, tasks.deployed(task), phase.round) for i, task in train]
+    return _jobs(run, phase, "adapt", chosen, run.icaa.trials + 1, settings)
 
 
 def _icaa_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
@@ -143,20 +152,28 @@ def _icaa_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
     pretrain = _pretrain_learn(run, phase, data)
     if phase.stage == "pretrain":
         return pretrain
-    own = [self_labelled(run, group) for j in range(phase.round + 1) for group in by_variation(data.select("adapt", j))]
+    groups = (group for j in range(phase.round + 1) for group in by_variation(data.select("adapt", j)))
+    own = [examples for group in groups if (examples := self_labelled(run, group)) is not None]
+    if not own:
+        return pretrain
     share = run.icaa.new_fraction
     return (Pool(1 - share, pretrain[0].examples), Pool(share, own))
 
 
-def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
-    """One variation's trials as examples (lines 13 and 14).
+def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
+    """One variation's trials as examples (lines 13 and 14); None if no trial is fit to label.
 
     The first N_ + 1 trials are contexts; query states and labels are the states and actions
-    of strictly later trials: all of them, or the better half by return.
+    of strictly later trials, all or the best of them as ``icaa.label_trials`` says.
     """
     contexts, later = trials[: run.icaa.context_trials + 1], list(trials[run.icaa.context_trials + 1 :])
     if run.icaa.label_trials == "top_return":
         later = sorted(later, key=lambda t: -t.episode_return)[: (len(later) + 1) // 2]
+    elif run.icaa.label_trials == "improved":
+        before = np.mean([t.episode_return for t in contexts])
+        later = [t for t in later if t.episode_return > before]
+    if not later:
+        return None
     queries = np.concatenate([t.observations[:-1] for t in later])
     actions = np.concatenate([t.actions for t in later])
     labels = np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]

@@ -223,7 +223,7 @@ class Weights:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Job:
-    """A fixed batch of work: all K variations of one task, for a number of trials.
+    """A fixed batch of work: all K variations of a few tasks, for a number of trials.
 
     The batch is part of the job and not of the worker, so floating-point results do not
     depend on how jobs are spread.
@@ -234,7 +234,9 @@ class Job:
     stage: str
     round: int
     task: int
+    """Number of the first task."""
     variations: tuple[Variation, ...]
+    """The K variations of the first task, then those of the next, and so on."""
     trials: int
     """Episodes in each variation."""
     weights: int
@@ -242,15 +244,27 @@ class Job:
     seed: int
     settings: Params = ()
     """Further numbers that the function needs, from the run's config."""
+    tasks: int = 1
+    """How many consecutive tasks."""
 
     def setting(self, name: str) -> Value:
         return _Named(self.kind, self.settings)[name]
 
+    def rows(self) -> list[tuple[int, int]]:
+        """Number of the task, and of the variation within it, of each of ``variations``."""
+        count = len(self.variations) // self.tasks
+        return [(self.task + row // count, row % count) for row in range(len(self.variations))]
+
     def identities(self) -> Iterable[Identity]:
         """Every trajectory this job will deliver."""
-        for variation in range(len(self.variations)):
+        for task, variation in self.rows():
             for trial in range(self.trials):
-                yield Identity(self.stage, self.round, self.task, variation, trial)
+                yield Identity(self.stage, self.round, task, variation, trial)
+
+    def variation(self, identity: Identity) -> Variation:
+        """The variation environment that a trajectory of this job comes from."""
+        count = len(self.variations) // self.tasks
+        return self.variations[(identity.task - self.task) * count + identity.variation]
 
     @property
     def name(self) -> tuple[str, int, int]:

@@ -45,7 +45,7 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
         raise Rejected("spec", f"{identity}: an action lies outside 0..{spec.actions - 1}")
     if not all(np.isfinite(a).all() for a in trajectory.arrays().values()):
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
-    if trajectory.variation != job.variations[identity.variation]:
+    if trajectory.variation != job.variation(identity):
         raise Rejected("unexpected", f"{identity}: comes from another variation than its job's")
     if (trajectory.weights, trajectory.digest) != (job.weights, digest):
         raise Rejected("stale-weights", f"{identity}: weights {trajectory.weights} acted, the job names {job.weights}")

@@ -32,6 +32,9 @@ from learner.work import Board
 
 Report = Callable[[dict[str, Any]], None]
 
+PERIOD_S = 0.25
+"""Progress is told this often."""
+
 _FIT_DRAWS = 104
 """Spawn key of a fit's draws, apart from every trajectory's (those begin with a stage)."""
 
@@ -235,7 +238,7 @@ class Service:
                 self._save(partial, produces=phase.produces, step=step)
             self._check()
 
-        loss = pretrain.fit(self.model, self._opt, optim, phase.steps, batch, progress, self._partial)
+        loss = pretrain.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, batch, progress, self._partial)
         torch.set_num_threads(torch_threads)
         self._partial = 0
         self.version = phase.produces
@@ -268,7 +271,7 @@ class Service:
             raise Interrupted
 
     def _progress(self, what: str, phase: Phase, done: int, total: int, force: bool, **values: float) -> None:
-        if not force and time.monotonic() - self._shown < 0.25:
+        if not force and time.monotonic() - self._shown < PERIOD_S:
             return
         self._shown = time.monotonic()
         fields: dict[str, Any] = {

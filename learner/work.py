@@ -27,6 +27,7 @@ class Board:
     def __init__(self, lease_s: float, max_failures: int = 3) -> None:
         self._lease_s, self._max_failures = lease_s, max_failures
         self._slots: dict[tuple[str, int, int], _Slot] = {}
+        self._slot_of: dict[tuple[str, int, int], _Slot] = {}
         self.expected = 0
         self.arrived = 0
         self.leases = 0
@@ -36,6 +37,7 @@ class Board:
         """Begin a phase; what is ``stored`` already is not asked for again."""
         have = set(stored)
         self._slots = {job.name: _Slot(job, set(job.identities()) - have) for job in jobs}
+        self._slot_of = {i[:3]: slot for slot in self._slots.values() for i in slot.job.identities()}
         self.expected = sum(len(job.variations) * job.trials for job in jobs)
         self.arrived = self.expected - sum(len(slot.missing) for slot in self._slots.values())
         self.leases = 0
@@ -59,12 +61,12 @@ class Board:
 
     def wants(self, identity: Identity) -> Job | None:
         """The job that still needs this trajectory, if any."""
-        slot = self._slots.get(identity[:3])
+        slot = self._slot_of.get(identity[:3])
         return slot.job if slot and identity in slot.missing else None
 
     def received(self, identity: Identity, now: float) -> None:
         """A trajectory is stored; its job's lease is extended, for its holder is at work."""
-        slot = self._slots.get(identity[:3])
+        slot = self._slot_of.get(identity[:3])
         if slot and identity in slot.missing:
             slot.missing.remove(identity)
             slot.deadline = max(slot.deadline, now + self._lease_s)

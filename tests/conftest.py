@@ -24,6 +24,7 @@ from icrl_dist.config import (  # noqa: E402
     DarkRoomConfig,
     EvaluateConfig,
     ICAAConfig,
+    LearnerConfig,
     ModelConfig,
     OptimConfig,
     PretrainConfig,
@@ -56,4 +57,5 @@ def small_run() -> Run:
         optim=OptimConfig(batch=8, queries=4, episodes=2, warmup=2),
         context=ContextConfig(max=40),
         evaluate=EvaluateConfig(episodes=3, seeds=2),
+        learner=LearnerConfig(threads=1),
     )

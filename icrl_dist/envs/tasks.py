@@ -38,9 +38,12 @@ def deployed(task: Task) -> Task:
     return task.replace(start=(0, 0))
 
 
-def variations(run: Run, index: int, task: Task) -> tuple[Variation, ...]:
-    """The K training variations of task number ``index``, phi_0 first (Algorithm 2, line 7)."""
-    rng = np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_PRIORS, index)))
+def variations(run: Run, index: int, task: Task, round: int = 0) -> tuple[Variation, ...]:
+    """The K training variations of task number ``index``, phi_0 first (Algorithm 2, line 7).
+
+    Every round of ICAA samples its adversaries anew (Algorithm 3, line 11).
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_PRIORS, index, round)))
     adversaries = adversary_set(rng, run.adversary.count, darkroom.ACTIONS, run.adversary.p_max)
     return tuple(Variation(task, a) for a in adversaries)
 

@@ -46,9 +46,12 @@ class PretrainedTransformer(nn.Module):
         self.embed_query = nn.Linear(features, config.width)
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
         self.head = nn.Linear(config.width, spec.actions)
-        for module in self.modules():
+        for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
-                nn.init.normal_(module.weight, std=0.02 if module.in_features > 4 * features else module.in_features**-0.5)
+                # Variance 1 / fan-in, for 0.02 is GPT-2's at widths near 1000; what is added to
+                # the residual stream, less by depth.
+                added = 2 * config.layers if name.endswith((".out", ".feed.2")) else 1
+                nn.init.normal_(module.weight, std=(module.in_features * added) ** -0.5)
                 nn.init.zeros_(module.bias)
 
     def features(self, observations: Float[Tensor, "*B S"]) -> Float[Tensor, "*B F"]:

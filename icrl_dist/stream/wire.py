@@ -150,6 +150,7 @@ def encode_job(job: Job) -> bytes:
             "weights": job.weights,
             "seed": job.seed,
             "settings": _from_params(job.settings),
+            "tasks": job.tasks,
         },
     )
 
@@ -167,6 +168,7 @@ def decode_job(data: bytes, limit: int = SMALL) -> Job:
         weights=_integer(fields["weights"], "weights", -1),
         seed=_integer(fields["seed"], "seed", 0),
         settings=_to_params(fields["settings"], "settings"),
+        tasks=_integer(fields["tasks"], "tasks", 1),
     )
 
 
@@ -207,7 +209,7 @@ def monitor_trajectory(trajectory: Trajectory, time: float) -> bytes:
 _ALWAYS = {"v", "kind"}
 _TRAJECTORY = _ALWAYS | {"identity", "variation", "weights", "digest", "worker", "origin", "arrays"}
 _WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}
-_JOB = _ALWAYS | {"job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings"}
+_JOB = _ALWAYS | {"job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings", "tasks"}
 _DTYPES = {name: np.dtype(name) for name in WEIGHT_DTYPES | {dtype for dtype, _ in ARRAYS.values()}}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import betainc
 
 from icrl_dist.envs.adversary import ALPHA_RANGE, adversary_set, argmax_law, override_law
 from icrl_dist.types import NULL, Adversary
@@ -47,9 +48,11 @@ def test_equal_alphas_give_a_uniform_law(alpha: float) -> None:
     np.testing.assert_allclose(argmax_law((alpha,) * 5), 0.2, atol=1e-9)
 
 
-def test_two_actions_have_a_closed_form() -> None:
-    """Of Gamma(1) and Gamma(2) the second is the larger with probability 3/4."""
-    np.testing.assert_allclose(argmax_law((1.0, 2.0)), [0.25, 0.75], atol=1e-9)
+@pytest.mark.parametrize("alpha", [(1.0, 2.0), (0.05, 2.0), (0.01, 0.3), (0.05, 0.06), (7.0, 5.0)], ids=str)
+def test_two_actions_have_a_closed_form(alpha: tuple[float, float]) -> None:
+    """The first component of a Dirichlet of two is Beta distributed: the larger one if above 1/2."""
+    first = 1 - betainc(*alpha, 0.5)
+    np.testing.assert_allclose(argmax_law(alpha), [first, 1 - first], atol=1e-9)
 
 
 def test_the_law_follows_a_permutation_of_alpha() -> None:

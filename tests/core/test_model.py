@@ -275,6 +275,7 @@ def test_fit_learns_the_corridor() -> None:
         model,
         pretrain.optimiser(model, config),
         config,
+        config.learning_rate,
         200,
         lambda step: corridor_batch(pools, step),
         lambda step, value: seen.append((step, value)),
@@ -293,7 +294,9 @@ def test_fit_stops_at_a_loss_that_is_no_number() -> None:
     with torch.no_grad():
         model.head.bias.fill_(math.nan)
     with pytest.raises(FloatingPointError, match=r"nan at step 0.*learning_rate \(0\.25\)"):
-        pretrain.fit(model, pretrain.optimiser(model, config), config, 3, lambda step: corridor_batch(pools, step))
+        pretrain.fit(
+            model, pretrain.optimiser(model, config), config, config.learning_rate, 3, lambda step: corridor_batch(pools, step)
+        )
 
 
 def test_rate_rises_then_falls_to_a_tenth() -> None:

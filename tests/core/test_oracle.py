@@ -260,13 +260,16 @@ def feed(agent: ExactAgent, one: Trajectory, h: int) -> None:
 @pytest.mark.parametrize("every_step", [False, True])
 def test_exact_agent_updates_when_its_deployment_says(hypotheses: tuple[Variation, ...], every_step: bool) -> None:
     """Algorithm 1 appends at an episode's end; ``every_step`` at every transition."""
+    # A third adversary and labels of no meaning, so that every change of the posterior shows.
+    meddlers = [Variation(v.task, Adversary.of("uniform", p=0.9)) for v in hypotheses[::2]]
+    hypotheses = (*hypotheses, *meddlers)
     h = Hypotheses.of(hypotheses)
-    labels = oracle.soft_labels(h, 0.99, 0.1)
+    labels = np.random.default_rng(0).dirichlet([1.0] * ACTIONS, size=(len(hypotheses), SIZE * SIZE)).astype(np.float32)
     agent = ExactAgent(h, labels, 1, every_step)
     query = np.array([[0.0, 2.0]], np.float32)
     past: list[Trajectory] = []
     moved_within = False
-    for seed in range(2):
+    for seed in range(3):
         one = episode(hypotheses[7], seed)
         for step in range(HORIZON):
             known = [slow_likelihood(v, past) for v in hypotheses]

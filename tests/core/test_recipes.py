@@ -13,7 +13,6 @@ from icrl_dist.recipes import METHODS, by_variation, self_labelled
 from icrl_dist.types import NULL, Identity
 
 
-
 class Kept:
     """A dataset in memory, given in any order."""
 
@@ -54,7 +53,8 @@ def test_every_method_shares_out_the_same_number_of_contexts(small_run):
     for name in ("dpt", "icag", "icaa"):
         phase = METHODS[name].phases(small_run)[0]
         asked = METHODS[name].ask(small_run, phase)
-        assert len(asked) == len(tasks.split(small_run).train)
+        assert sum(job.tasks for job in asked) == len(tasks.split(small_run).train)
+        assert all(job.tasks <= small_run.stream.job_tasks for job in asked)
         assert sum(len(job.variations) * job.trials for job in asked) == small_run.pretrain.contexts
         assert all(job.weights == -1 for job in asked)
 
@@ -63,7 +63,11 @@ def test_dpt_and_d0_of_icaa_have_no_disturbance_and_icag_has_k_adversaries(small
     adversaries = {}
     for name in ("dpt", "icag", "icaa"):
         phase = METHODS[name].phases(small_run)[0]
-        adversaries[name] = [[v.adversary for v in job.variations] for job in METHODS[name].ask(small_run, phase)]
+        adversaries[name] = [
+            [job.variations[row].adversary for row, (of, _) in enumerate(job.rows()) if of == task]
+            for job in METHODS[name].ask(small_run, phase)
+            for task in range(job.task, job.task + job.tasks)
+        ]
     assert adversaries["dpt"] == adversaries["icaa"] == [[NULL]] * len(adversaries["dpt"])
     for chosen in adversaries["icag"]:
         assert chosen[0] == NULL
@@ -95,7 +99,7 @@ def test_a_job_delivers_exactly_its_identities_and_one_version_acts_in_all(small
         (0, 0, "digest 0"),
         (1, 1, "digest 1"),
     }
-    count = len(tasks.split(small_run).train)
+    count = len(method.ask(small_run, method.phases(small_run)[1]))
     assert policies.asked == [0] * count + [1] * count
 
 

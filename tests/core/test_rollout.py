@@ -89,7 +89,10 @@ def test_a_kept_cache_equals_a_fresh_one_also_after_an_episode_was_dropped(model
         ran = episode(envs.batch(variations), policy, rngs(n))
         for row in range(3):
             history[row].append(
-                [(ran.observations[row, h], ran.actions[row, h], ran.observations[row, h + 1], ran.rewards[row, h]) for h in range(HORIZON)]
+                [
+                    (ran.observations[row, h], ran.actions[row, h], ran.observations[row, h + 1], ran.rewards[row, h])
+                    for h in range(HORIZON)
+                ]
             )
             state = np.array([1.0, 2.0], np.float32)
             expected = logits_of(model, [t for past in history[row][-2:] for t in past], state).softmax(-1).numpy()
@@ -113,7 +116,9 @@ def test_offline_deployment_sees_the_data_and_only_the_data(model, variations):
     data = episode(env, RandomPolicy(5), rngs(8))
     policy = InContextPolicy(model, 3, ContextConfig(max=100))
     ran = deploy_offline(env, policy, [data], rngs(9))
-    history = [(data.observations[1, h], data.actions[1, h], data.observations[1, h + 1], data.rewards[1, h]) for h in range(HORIZON)]
+    history = [
+        (data.observations[1, h], data.actions[1, h], data.observations[1, h + 1], data.rewards[1, h]) for h in range(HORIZON)
+    ]
     single = envs.batch([variations[1]])
     rng = rngs(9)[1]
     state = single.reset([rng])[0]

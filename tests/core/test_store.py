@@ -20,7 +20,7 @@ def trajectories(small_run):
 
 
 @pytest.fixture
-def Store():
+def Store():  # noqa: N802 - stands for the class
     """Stores that are closed when the test ends."""
     opened = []
 

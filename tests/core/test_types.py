@@ -105,7 +105,7 @@ def test_identity_refuses_other_text(text: str) -> None:
 def test_every_identity_and_seed_has_its_own_stream() -> None:
     keys = {i.key() for i in IDENTITIES}
     assert len(keys) == len(IDENTITIES)
-    draws = {(seed, i): i.rng(seed).integers(2**63) for i in IDENTITIES[::7] for seed in (0, 1)}
+    draws = {(seed, i): i.rng(seed).integers(2**63) for i in IDENTITIES for seed in (0, 1)}
     assert len(set(draws.values())) == len(draws)
     assert all(i.rng(seed).integers(2**63) == value for (seed, i), value in draws.items())
 

@@ -114,7 +114,12 @@ def broken(trajectory):
         ("spec", changed(actions=far)),
         ("spec", changed(labels=trajectory.labels[:, :4])),
         ("unexpected", changed(identity=Identity("adapt", 7, 0, 0, 0))),
-        ("unexpected", changed(variation=dataclasses.replace(trajectory.variation, task=trajectory.variation.task.replace(goal=(0, 0), size=4)))),
+        (
+            "unexpected",
+            changed(
+                variation=dataclasses.replace(trajectory.variation, task=trajectory.variation.task.replace(goal=(0, 0), size=4))
+            ),
+        ),
         ("stale-weights", changed(weights=3)),
         ("stale-weights", changed(digest="f" * 64)),
     ]
@@ -135,7 +140,14 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
     gate = threading.Event()
     store = Store(tmp_path / "gated")
     inbox = Inbox(
-        store, envs.spec(job.variations[0].task), 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity=2
+        store,
+        envs.spec(job.variations[0].task),
+        1 << 20,
+        lambda i: gate.wait() and job,
+        lambda v: "",
+        lambda t: None,
+        print,
+        capacity=2,
     )
     payload = wire.encode_trajectory(trajectories[0])
     queries = [Asked(payload) for _ in range(8)]

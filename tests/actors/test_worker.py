@@ -1,0 +1,132 @@
+"""A worker against a scripted learner on a MemoryLink."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+import icrl_dist
+from actors.policy import LivePolicy
+from actors.worker import Worker
+from icrl_dist.config import dumps
+from icrl_dist.envs import spec, tasks
+from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.recipes import METHODS
+from icrl_dist.stream import wire
+from icrl_dist.stream.link import Keys, MemoryHub, Refused, Unanswered
+from icrl_dist.types import Weights
+
+KEYS = Keys("test")
+
+
+@pytest.fixture
+def hub():
+    hub = MemoryHub()
+    links = []
+
+    def link():
+        links.append(hub.link())
+        return links[-1]
+
+    yield link
+    for one in links:
+        one.close()
+
+
+def weights(run, version):
+    torch.manual_seed(version)
+    arrays = weights_of(PretrainedTransformer(spec(tasks.split(run).train[0]), run.model))
+    return Weights(version, arrays, wire.weights_digest(arrays))
+
+
+class Learner:
+    """Hands out a list of answers, keeps what arrives."""
+
+    def __init__(self, link, run, answers):
+        self.run, self.answers, self.asked, self.stored = run, list(answers), [], []
+        link.serve(KEYS.work, self.work)
+        link.serve(KEYS.data, self.data)
+
+    def work(self, query):
+        kind, fields = wire.decode_message(query.payload)
+        self.asked.append((kind, fields))
+        if kind == "hello":
+            query.reply(wire.encode_message("hello", run=dumps(self.run)))
+        elif kind == "failed":
+            query.reply(wire.encode_message("noted"))
+        else:
+            query.reply(self.answers.pop(0))
+
+    def data(self, query):
+        self.stored.append(wire.decode_trajectory(query.payload, 1 << 20))
+        query.reply(b"stored")
+
+
+def job_message(job):
+    return wire.encode_message("job", job=wire.encode_job(job))
+
+
+STOP = wire.encode_message("stop")
+
+
+def test_a_worker_does_its_job_says_who_it_is_and_stops(hub, small_run):
+    job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[2]
+    learner = Learner(hub(), small_run, [wire.encode_message("wait", seconds=0.01), job_message(job), STOP])
+    seen = []
+    watching = hub()
+    watching.subscribe(KEYS.monitor_all, lambda key, payload: seen.append(wire.decode_message(payload)))
+    Worker(hub(), "test", "w7").run()
+    assert [t.identity for t in learner.stored] == list(job.identities())
+    assert {t.worker for t in learner.stored} == {"w7"}
+    assert learner.asked[0][1]["version"] == icrl_dist.__version__
+    assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
+    monitored = [fields["identity"] for kind, fields in seen if kind == "trajectory"]
+    assert monitored == [str(i) for i in job.identities()][: len(monitored)] and monitored
+
+
+def test_a_job_that_raises_is_reported_and_the_worker_goes_on(hub, small_run):
+    phase = METHODS["icag"].phases(small_run)[0]
+    good, other = METHODS["icag"].ask(small_run, phase)[:2]
+    bad = dataclasses.replace(other, settings=())
+    learner = Learner(hub(), small_run, [job_message(bad), job_message(good), STOP])
+    Worker(hub(), "test", "w0").run()
+    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    assert report["job"] == list(bad.name) and "KeyError" in report["error"] and ".py:" in report["error"]
+    assert len(learner.stored) == len(list(good.identities()))
+
+
+def test_a_refused_hello_ends_the_worker_with_the_reason(hub):
+    hub().serve(KEYS.work, lambda query: query.refuse("schema: worker runs another version"))
+    with pytest.raises(Refused, match="another version"):
+        Worker(hub(), "test", "w0").run()
+
+
+def test_a_worker_gives_up_when_the_learner_stays_away(hub):
+    with pytest.raises(Unanswered):
+        Worker(hub(), "test", "w0", patience_s=0.3).run()
+
+
+def test_the_policy_waits_for_exactly_the_version_that_is_named(hub, small_run):
+    learner = hub()
+    latest = [b""]
+    learner.serve(KEYS.weights_latest, lambda q: q.reply(latest[0]) if latest[0] else q.refuse("busy"))
+    policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=5.0)
+    zero, one = weights(small_run, 0), weights(small_run, 1)
+    threading.Timer(0.3, lambda: learner.publish(KEYS.weights, wire.encode_weights(zero), droppable=False)).start()
+    model, digest = policy.at(0)
+    assert digest == zero.digest
+    np.testing.assert_array_equal(weights_of(model)["head.weight"], zero.arrays["head.weight"])
+    latest[0] = wire.encode_weights(one)
+    model, digest = policy.at(1)
+    assert digest == one.digest
+    np.testing.assert_array_equal(weights_of(model)["head.weight"], one.arrays["head.weight"])
+    with pytest.raises(Unanswered, match="version 0 is gone; the learner is at 1"):
+        policy.at(0)
+
+
+def test_the_policy_does_not_wait_for_ever(hub, small_run):
+    policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
+    with pytest.raises(Unanswered, match=r"version 3 did not come within 0.3 s"):
+        policy.at(3)

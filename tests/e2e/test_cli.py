@@ -1,0 +1,122 @@
+"""Bad input: one line that names the value, the place and the remedy; exit code 2; nothing half-written."""
+
+import json
+import os
+import re
+import socket
+from importlib import metadata
+
+import pytest
+
+from icrl_dist import cli
+
+
+def refused(capsys, *arguments):
+    """The one line that the command printed, which must end with exit code 2."""
+    assert cli.main([str(a) for a in arguments]) == 2
+    printed = capsys.readouterr()
+    lines = printed.err.strip().splitlines()
+    assert len(lines) == 1, printed
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[darkroom]\nsiz = 4", r"unknown key darkroom.siz; did you mean 'size'\?"),
+        ("[darkrom]\nsize = 4", r"unknown key darkrom; did you mean 'darkroom'\?"),
+        ('[darkroom]\nsize = "7"', r"darkroom.size = '7': expected int, got str"),
+        ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has at least 2 cells"),
+        ("[adversary]\np_max = 1.5", r"adversary.p_max = 1.5: a probability lies in \[0, 1\]"),
+        ("[evaluate]\np = [0.0, -0.1]", r"evaluate.p = -0.1: a probability lies in \[0, 1\]"),
+        ('method = "ppo"', r"method = 'ppo': choose one of 'dpt', 'icag', 'icaa'"),
+        ("[icaa]\ntrials = 5\ncontext_trials = 5", r"icaa.context_trials = 5: must be below icaa.trials"),
+        ("darkroom = [", r"not valid TOML"),
+    ],
+)
+def test_a_bad_run_file(capsys, tmp_path, text, expected):
+    file = tmp_path / "bad.toml"
+    file.write_text(text)
+    line = refused(capsys, "train", file, "--out", tmp_path / "out")
+    assert re.search(expected, line) and str(file) in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_run_names_the_nearest(capsys, tmp_path):
+    assert "did you mean 'demo'?" in refused(capsys, "train", "dmeo", "--out", tmp_path / "out")
+    assert "no such file" in refused(capsys, "train", tmp_path / "none.toml")
+
+
+def test_an_impossible_override(capsys, tmp_path):
+    line = refused(capsys, "train", "smoke", "--adversary.p-max", "2", "--out", tmp_path / "out")
+    assert "adversary.p_max = 2" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_folder_that_exists(capsys, tmp_path):
+    (tmp_path / "precious").write_text("x")
+    line = refused(capsys, "train", "smoke", "--out", tmp_path)
+    assert str(tmp_path) in line and "--resume" in line and "--overwrite" in line
+    line = refused(capsys, "train", "smoke", "--out", tmp_path, "--overwrite")
+    assert [f.name for f in tmp_path.iterdir()] == ["precious"], "only a run is ever overwritten"
+
+
+def test_more_workers_than_cores(capsys, tmp_path):
+    cores = len(os.sched_getaffinity(0))
+    line = refused(capsys, "train", "smoke", "--out", tmp_path / "out", "--actors", cores + 1)
+    assert f"--actors {cores + 1}" in line and f"{cores} cores" in line
+    assert not (tmp_path / "out").exists()
+    assert "at least 1" in refused(capsys, "train", "smoke", "--out", tmp_path / "out", "--actors", "0")
+
+
+def test_a_port_in_use(capsys, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        line = refused(capsys, "train", "smoke", "--out", tmp_path / "out", "--stream.endpoint", f"tcp/127.0.0.1:{port}")
+    assert f"tcp/127.0.0.1:{port}" in line and "free that port" in line
+
+
+def test_nothing_to_evaluate_or_to_listen_to(capsys, tmp_path, monkeypatch):
+    assert "no such run folder" in refused(capsys, "evaluate", tmp_path / "none")
+    assert "holds no checkpoint" in refused(capsys, "evaluate", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert "no run is on" in refused(capsys, "tap")
+    line = refused(capsys, "tap", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.5")
+    assert "tcp/127.0.0.1:1" in line
+
+
+def test_an_unknown_command_and_an_unknown_flag(capsys):
+    assert "'trian'" in refused(capsys, "trian")
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["train", "smoke", "--adversary.cuont", "3"])
+    assert stopped.value.code == 2
+    assert "cuont" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
+def test_help_teaches_and_does_nothing(capsys, command):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([command, "--help"])
+    assert stopped.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"icrl-dist {command}" in printed and (cli.COMMANDS[command][0].__doc__ or "?").split()[0] in printed
+
+
+def test_the_version_is_the_packages(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == metadata.version("icrl-dist")
+
+
+def test_bench_env_ends_with_one_json_object(capsys):
+    assert cli.main(["bench", "env", "--seconds", "0.1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["steps_per_s"] > 0
+    assert cli.main(["bench", "env", "--problem", "darkrom"]) == 2
+
+
+def test_our_packages_are_the_ones_imported():
+    import actors
+    import icrl_dist
+    import learner
+
+    roots = {os.path.dirname(os.path.dirname(package.__file__)) for package in (actors, learner, icrl_dist)}  # noqa: PTH120
+    assert len(roots) == 1

@@ -1,0 +1,229 @@
+"""The real thing: a learner process, two Ray workers, Zenoh over loopback, two ICAA rounds."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from icrl_dist import recipes
+from icrl_dist.agent import load_agent
+from icrl_dist.config import load
+from icrl_dist.store import Store
+from icrl_dist.stream import wire
+from icrl_dist.stream.zenoh_link import ZenohLink
+from learner import checkpoints
+
+CLI = [sys.executable, "-m", "icrl_dist.cli"]
+# Rounds long enough to be disturbed in the middle.
+LONGER = ["--icaa.trials", "40", "--icaa.context-trials", "10"]
+
+
+def start(*arguments, **options):
+    return subprocess.Popen(
+        [*CLI, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
+    )
+
+
+def finish(process, timeout=90):
+    output, _ = process.communicate(timeout=timeout)
+    return output
+
+
+def result_of(folder):
+    return json.loads((folder / "result.json").read_text())
+
+
+def wait_for(condition, what, timeout=60):
+    deadline = time.monotonic() + timeout
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
+        time.sleep(0.02)
+    return value
+
+
+def endpoint_of(folder):
+    file = folder / "endpoint"
+    return wait_for(lambda: file.exists() and file.read_text().strip(), "the learner listening")
+
+
+@contextlib.contextmanager
+def on_first_adapt_trajectory(folder, act):
+    """Calls ``act`` once, when a trajectory of round 0 shows on the monitor plane."""
+    acted = threading.Event()
+
+    def hear(key, payload):
+        _, fields = wire.decode_message(payload)
+        if fields["identity"].startswith("adapt/0") and not acted.is_set():
+            acted.set()
+            act()
+
+    with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
+        link.subscribe(f"icrl/{folder.name}/mon/trajectory/**", hear)
+        yield acted
+
+
+def workers_of(process):
+    return [p for p in psutil.Process(process.pid).children(recursive=True) if "_Host" in " ".join(p.cmdline())]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """One run through Ray and Zenoh with a tap and the documented script beside it."""
+    folder = tmp_path_factory.mktemp("runs") / "smoke"
+    began = time.monotonic()
+    process = start("train", "smoke", "--out", folder, "--json")
+    endpoint = endpoint_of(folder)
+    quiet = {"stdout": subprocess.PIPE, "text": True}
+    tap = subprocess.Popen([*CLI, "tap", "--connect", endpoint], **quiet)
+    script = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs" / "tap.md").read_text(), re.DOTALL)
+    documented = subprocess.Popen([sys.executable, "-c", script.group(1), endpoint, folder.name], **quiet)
+    output = finish(process)
+    seconds = time.monotonic() - began
+    lines = {}
+    for name, listener in (("tap", tap), ("documented", documented)):
+        listener.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            lines[name] = listener.communicate(timeout=10)[0].splitlines()
+        listener.kill()
+    assert process.returncode == 0, output
+    return folder, output, lines, seconds
+
+
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory):
+    """The longer run in one process: what every disturbed one must equal."""
+    folder = tmp_path_factory.mktemp("runs") / "inline"
+    process = start("train", "smoke", *LONGER, "--engine", "inline", "--out", folder)
+    output = finish(process)
+    assert process.returncode == 0, output
+    return result_of(folder)
+
+
+def equal(result, other):
+    return all(result[name] == other[name] for name in ("dataset_digest", "weights_digest", "trajectories"))
+
+
+def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undisturbed):
+    folder, _, _, seconds = undisturbed
+    run = load(str(folder / "run.toml"))
+    method = recipes.METHODS[run.method]
+    wanted = {i for phase in method.phases(run) for job in method.ask(run, phase) for i in job.identities()}
+    store = Store(folder / "dataset")
+    trajectories = [store.read(identity) for identity in store.index]
+    store.close()
+    assert {t.identity for t in trajectories} == wanted and len(trajectories) == len(wanted)
+    assert {t.worker for t in trajectories} == {"w0", "w1"}
+    for t in trajectories:
+        if t.identity.stage == "adapt":
+            about = checkpoints.read_manifest(checkpoints.version_file(folder, t.identity.round))
+            assert (t.weights, t.digest) == (t.identity.round, about["weights_digest"])
+    assert {t.weights for t in trajectories} == {-1, 0, 1}
+    assert seconds < 80, "smoke is for tests: it is to stay short"
+
+
+def test_ray_and_inline_end_with_the_same_bytes(undisturbed, tmp_path):
+    process = start("train", "smoke", "--engine", "inline", "--out", tmp_path / "inline")
+    output = finish(process)
+    assert process.returncode == 0, output
+    assert equal(result_of(tmp_path / "inline"), result_of(undisturbed[0]))
+
+
+def test_the_result_is_on_the_last_line_and_in_the_folder(undisturbed):
+    folder, output, _, _ = undisturbed
+    result = json.loads(output.splitlines()[-1])
+    assert result["rows"] == result_of(folder)["rows"]
+    assert {(row["agent"], row["p"]) for row in result["rows"]} == {
+        (agent, p) for agent in ("T^2 (icaa)", "T^0", "random", "oracle") for p in (0.0, 0.2)
+    }
+    assert Path(result["figure"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_acting_with_zeroed_weights_changes_the_actions(undisturbed):
+    def actions(zero):
+        agent = load_agent(undisturbed[0], seed=1)
+        if zero:
+            for parameter in agent.model.parameters():
+                parameter.data.zero_()
+        agent.reset_context(batch=64)
+        return agent.act(np.tile([[1.0, 2.0]], (64, 1)))
+
+    assert (actions(zero=False) == actions(zero=False)).all()
+    assert (actions(zero=False) != actions(zero=True)).any()
+
+
+def test_tap_and_the_documented_script_print_a_line_a_trajectory(undisturbed):
+    folder, _, lines, _ = undisturbed
+    store = Store(folder / "dataset")
+    stored = {str(identity) for identity in store.index}
+    store.close()
+    for name in ("tap", "documented"):
+        heard = [json.loads(line) for line in lines[name]]
+        identities = [fields["identity"] for fields in heard]
+        assert identities and set(identities) <= stored, name
+        # Connected before the first round began, and nobody was slow: all of the last round.
+        assert sum(i.startswith("adapt/1") for i in identities) == 84, name
+
+
+def test_evaluate_prints_returns_beside_the_oracles(undisturbed):
+    process = start("evaluate", undisturbed[0], "--episodes", "2", "--seeds", "2", "--p", "0", "0.4", "--json")
+    output = finish(process)
+    assert process.returncode == 0, output
+    rows = json.loads(output.splitlines()[-1])["rows"]
+    assert [row["p"] for row in rows] == [0.0] * 4 + [0.4] * 4
+    assert all(len(row["episodes"]) == 2 for row in rows)
+    assert next(row for row in rows if row["agent"] == "oracle")["episodes"] == [9.0, 9.0]
+
+
+def test_kill_9_of_a_worker_midway_changes_nothing(longer, tmp_path):
+    folder = tmp_path / "killed"
+    process = start("train", "smoke", *LONGER, "--out", folder)
+    with on_first_adapt_trajectory(folder, lambda: os.kill(workers_of(process)[0].pid, signal.SIGKILL)) as killed:
+        assert killed.wait(60)
+    output = finish(process)
+    assert process.returncode == 0, output
+    assert "died" in output and "starting it again" in output
+    assert equal(result_of(folder), longer)
+
+
+def test_kill_9_of_the_learner_midway_changes_nothing(longer, tmp_path):
+    folder = tmp_path / "learner"
+    process = start("train", "smoke", *LONGER, "--out", folder)
+
+    def kill():
+        (learner,) = [p for p in psutil.Process(process.pid).children() if "learner" in p.cmdline()]
+        learner.kill()
+
+    with on_first_adapt_trajectory(folder, kill) as killed:
+        assert killed.wait(60)
+    output = finish(process)
+    assert process.returncode == 0, output
+    assert "the learner died (exit code -9)" in output
+    assert equal(result_of(folder), longer)
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(longer, tmp_path):
+    folder = tmp_path / "interrupted"
+    process = start("train", "smoke", *LONGER, "--out", folder, start_new_session=True)
+    with on_first_adapt_trajectory(folder, lambda: os.killpg(process.pid, signal.SIGINT)) as interrupted:
+        family = psutil.Process(process.pid).children(recursive=True)
+        assert interrupted.wait(60)
+        family += psutil.Process(process.pid).children(recursive=True)
+    output = finish(process)
+    assert process.returncode == 130, output
+    assert "--resume" in output and (folder / "checkpoints" / "version-0000.npz").exists()
+    _, alive = psutil.wait_procs(family, timeout=15)
+    assert not [p.cmdline() for p in alive]
+    again = start("train", "smoke", *LONGER, "--out", folder, "--resume")
+    output = finish(again)
+    assert again.returncode == 0, output
+    assert equal(result_of(folder), longer)
