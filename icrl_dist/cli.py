@@ -16,16 +16,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
 from icrl_dist.config import ConfigError, Run, load, validate
-
-if TYPE_CHECKING:
-    from icrl_dist.evaluate import Result
-    from icrl_dist.terminal import Display
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -125,7 +121,7 @@ class Doctor:
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
-    from icrl_dist import launch
+    from icrl_dist import heldout, launch
     from icrl_dist.terminal import Display
 
     run = arguments.config
@@ -143,12 +139,12 @@ def train(arguments: Train, console: Console) -> int:
                 result = launch.train_inline(run, folder, display.report)
             else:
                 result = launch.train_ray(run, folder, arguments.actors, arguments.address, display.report)
-            results = _online(run, folder, display)
+            results = heldout.online(run, folder, display)
     except launch.TrainInterrupted:
         console.print(f"interrupted; `icrl-dist train {arguments.run} --resume` goes on from the checkpoint", markup=False)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
-    result |= _finish_online(run, folder, results, console)
+    result |= heldout.show_online(run, folder, results, console)
     (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
@@ -163,10 +159,11 @@ def train(arguments: Train, console: Console) -> int:
 
 def evaluate(arguments: Evaluate, console: Console) -> int:
     """``icrl-dist evaluate``: per-episode returns beside the oracle's."""
+    from icrl_dist import heldout
     from icrl_dist.agent import checkpoint_file
     from icrl_dist.config import parse
     from icrl_dist.store import load_checkpoint
-    from icrl_dist.terminal import Display, returns_table
+    from icrl_dist.terminal import Display
 
     checkpoint = load_checkpoint(checkpoint_file(arguments.what))
     run = parse(str(checkpoint.manifest.get("run", "")), str(arguments.what))
@@ -174,69 +171,16 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     chosen = {name: value for name, value in given.items() if value not in (None, ())}
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
     validate(run, "evaluate")
-    with Display(console) as display:
-        results = _online(run, arguments.what, display) if arguments.suite == "online" else _offline(run, arguments.what)
     answer: dict[str, Any] = {"suite": arguments.suite, "deploy": arguments.deploy, "what": str(arguments.what)}
     if arguments.suite == "online":
-        answer |= _finish_online(run, arguments.what, results, console)
+        with Display(console) as display:
+            results = heldout.online(run, arguments.what, display)
+        answer |= heldout.show_online(run, arguments.what, results, console)
     else:
-        console.print(returns_table(results, "One episode given data collected before, on goals never trained on"))
-        answer["rows"] = [result.row() for result in results]
+        answer |= heldout.show_offline(heldout.offline(run, arguments.what), console)
     if arguments.json:
         print(json.dumps(answer))
     return OK
-
-
-def _models(what: Path) -> dict[str, Any]:
-    """The newest model and, in a run folder, the T^0 that it grew from."""
-    from icrl_dist.agent import checkpoint_file, model_of
-    from icrl_dist.store import load_checkpoint
-
-    newest = load_checkpoint(checkpoint_file(what))
-    version = newest.manifest["version"]
-    models = {f"T^{version} ({newest.manifest['method']})": model_of(newest)[0]}
-    if what.is_dir() and version > 0:
-        models["T^0"] = model_of(load_checkpoint(checkpoint_file(what, 0)))[0]
-    return models
-
-
-def _online(run: Run, what: Path, display: Display) -> list[Result]:
-    from icrl_dist import evaluate
-
-    agents: dict[str, evaluate.MakePolicy] = {name: evaluate.in_context(run, model) for name, model in _models(what).items()}
-    agents |= {"random": evaluate.random, evaluate.ORACLE: evaluate.optimal(run)}
-    total = len(agents) * len(run.evaluate.p) * run.evaluate.episodes
-    done = 0
-
-    def progress(agent: str, p: float, episodes: int) -> None:
-        nonlocal done
-        done += 1
-        display.report({"event": "progress", "stage": "evaluate", "phase": "held-out evaluation", "step": done, "steps": total})
-
-    return evaluate.online(run, agents, progress)
-
-
-def _offline(run: Run, what: Path) -> list[Result]:
-    from icrl_dist import evaluate
-
-    return evaluate.offline(run, _models(what))
-
-
-def _finish_online(run: Run, what: Path, results: list[Result], console: Console) -> dict[str, Any]:
-    """Print the table, draw the figure, keep the rows; returns them with the figure's path."""
-    from icrl_dist import plots
-    from icrl_dist.store import atomic_write
-    from icrl_dist.terminal import returns_table
-
-    rows = [result.row() for result in results]
-    folder = (what if what.is_dir() else what.parent) / "report"
-    size, count = run.darkroom.size, len(results[0].optimum)
-    title = f"{run.method.upper()} on {count} held-out goals of a {size}x{size} Dark Room, {run.evaluate.seeds} seeds"
-    atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
-    figure = plots.adaptation(rows, folder / "adaptation.png", title)
-    console.print(returns_table(results, f"Return by online episode: {title}"))
-    console.print(f"figure {figure}", highlight=False, markup=False)
-    return {"rows": rows, "figure": str(figure)}
 
 
 def tap(arguments: Tap, console: Console) -> int:

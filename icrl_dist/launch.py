@@ -79,7 +79,7 @@ def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
     import torch
 
     from actors.worker import Worker
-    from icrl_dist.stream.link import MemoryHub
+    from icrl_dist.stream.memory_link import MemoryHub
     from learner.service import Interrupted, RunFailed, Service
 
     hub = MemoryHub()
@@ -132,7 +132,7 @@ def train_ray(run: Run, folder: Path, actors: int, address: str | None, report: 
                     fleet.start(learner.endpoint, folder.name)
                     started = True
                 elif event["event"] == "finished":
-                    result = event
+                    result = {name: value for name, value in event.items() if name != "event"}
             if interrupted.is_set():
                 learner.interrupt(report)
                 raise TrainInterrupted

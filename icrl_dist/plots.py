@@ -18,6 +18,7 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import MaxNLocator
 
     levels = sorted({row["p"] for row in rows})
     figure, axes = pyplot.subplots(1, len(levels), figsize=(4.6 * len(levels), 3.6), sharey=True, squeeze=False)
@@ -33,10 +34,11 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
         axis.axhline(here[0]["optimum"], color="black", linestyle="--", linewidth=1, label="oracle (knows the goal)")
         axis.set_title("no disturbance" if p == 0 else f"actions overridden with p = {p:g}", fontsize=10)
         axis.set_xlabel("online episode")
-        axis.set_ylim(bottom=0)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.set_ylim(0, 1.08 * max(row["optimum"] for row in rows))
         axis.grid(alpha=0.25)
     axes[0][0].set_ylabel("return on goals never trained on")
-    axes[0][-1].legend(fontsize=8, loc="lower right")
+    axes[0][-1].legend(fontsize=8, loc="center right")
     figure.suptitle(title, fontsize=11)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -29,6 +29,7 @@ from icrl_dist.config import (  # noqa: E402
     OptimConfig,
     PretrainConfig,
     Run,
+    StreamConfig,
 )
 from icrl_dist.envs import darkroom  # noqa: E402
 from icrl_dist.types import Task  # noqa: E402
@@ -57,5 +58,6 @@ def small_run() -> Run:
         optim=OptimConfig(batch=8, queries=4, episodes=2, warmup=2),
         context=ContextConfig(max=40),
         evaluate=EvaluateConfig(episodes=3, seeds=2),
+        stream=StreamConfig(job_tasks=2),
         learner=LearnerConfig(threads=1),
     )

@@ -6,7 +6,8 @@ import queue
 import threading
 from collections.abc import Callable
 
-from icrl_dist.stream.link import Dispatcher, Link, LinkError, Outcome, Refused, Unanswered
+from icrl_dist.stream.link import Link, LinkError, Outcome, Refused, Unanswered
+from icrl_dist.stream.threads import Dispatcher
 
 BACKOFF_S = (0.05, 2.0)
 """First and longest wait before an item is sent again, seconds; each wait doubles the last."""

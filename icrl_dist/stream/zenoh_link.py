@@ -22,17 +22,15 @@ from zenoh import CongestionControl, ConsolidationMode, Priority
 from zenoh.handlers import Callback
 
 from icrl_dist.stream.link import (
-    Dispatcher,
     Done,
     Link,
     LinkError,
-    Mailbox,
     Outcome,
     Query,
     Refused,
     Unanswered,
-    handle,
 )
+from icrl_dist.stream.threads import Dispatcher, Mailbox, handle
 
 _REFUSED = b"refused: "
 """Before a reason of ours: Zenoh answers for itself with error replies too (``Timeout``)."""

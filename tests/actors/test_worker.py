@@ -15,7 +15,8 @@ from icrl_dist.envs import spec, tasks
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, MemoryHub, Refused, Unanswered
+from icrl_dist.stream.link import Keys, Refused, Unanswered
+from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 
 KEYS = Keys("test")

@@ -17,7 +17,9 @@ import pytest
 
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Dispatcher, Keys, Link, LinkError, MemoryHub, Unanswered, matches
+from icrl_dist.stream.link import Keys, Link, LinkError, Unanswered, matches
+from icrl_dist.stream.memory_link import MemoryHub
+from icrl_dist.stream.threads import Dispatcher
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 from tests.contracts.link_battery import KEYS, LinkBattery, Links, eventually

@@ -20,6 +20,7 @@ from icrl_dist.agent import load_agent
 from icrl_dist.config import load
 from icrl_dist.store import Store
 from icrl_dist.stream import wire
+from icrl_dist.stream.link import Refused
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import checkpoints
 
@@ -69,6 +70,7 @@ def on_first_adapt_trajectory(folder, act):
 
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
         link.subscribe(f"icrl/{folder.name}/mon/trajectory/**", hear)
+        acted.link = link
         yield acted
 
 
@@ -189,10 +191,13 @@ def test_kill_9_of_a_worker_midway_changes_nothing(longer, tmp_path):
     process = start("train", "smoke", *LONGER, "--out", folder)
     with on_first_adapt_trajectory(folder, lambda: os.kill(workers_of(process)[0].pid, signal.SIGKILL)) as killed:
         assert killed.wait(60)
+        with pytest.raises(Refused, match="not-msgpack"):
+            killed.link.request(f"icrl/{folder.name}/data", b"\xc1garbage", timeout_s=10)
     output = finish(process)
     assert process.returncode == 0, output
     assert "died" in output and "starting it again" in output
     assert equal(result_of(folder), longer)
+    assert result_of(folder)["drops"]["not-msgpack"] == 1
 
 
 def test_kill_9_of_the_learner_midway_changes_nothing(longer, tmp_path):

@@ -1,0 +1,172 @@
+"""Links within one process: the same behaviour as between machines, timeouts included."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from icrl_dist.stream.link import Done, Link, LinkError, Outcome, Query, Refused, Unanswered, matches
+from icrl_dist.stream.threads import Dispatcher, Mailbox, handle
+
+
+class MemoryHub:
+    """The network within one process: every link of a hub reaches every other."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._links: list[MemoryLink] = []
+        self._dispatcher: Dispatcher | None = None
+        self._under_way: set[_MemoryQuery] = set()
+        self._expiring = False
+
+    def link(self) -> MemoryLink:
+        """Another link to this hub."""
+        made = MemoryLink(self)
+        with self._lock:
+            self._links.append(made)
+            self._dispatcher = self._dispatcher or Dispatcher("memory-hub")
+        return made
+
+    def _expire_soon(self) -> None:
+        if self._under_way and not self._expiring and self._dispatcher is not None:
+            self._expiring = True
+            self._dispatcher.post(self._expire, 0.02)
+
+    def _expire(self) -> None:
+        now = time.monotonic()
+        with self._lock:
+            late = [query for query in self._under_way if query.deadline <= now]
+        for query in late:
+            query.end(Unanswered(f"no answer on {query.key} in time"))
+        with self._lock:
+            self._expiring = False
+            self._expire_soon()
+
+
+class MemoryLink(Link):
+    """A link to a :class:`MemoryHub`: for tests, debugging and ``--engine inline``.
+
+    Handlers of requests and ``done`` run on the hub's one thread.
+    """
+
+    def __init__(self, hub: MemoryHub) -> None:
+        self._hub = hub
+        self._servers: dict[str, Callable[[Query], None]] = {}
+        self._mailboxes: list[tuple[str, Mailbox]] = []
+        self._watchers: list[tuple[str, Mailbox]] = []
+        self._alive: set[str] = set()
+        self._closed = False
+
+    def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
+        with self._hub._lock:
+            dispatcher = self._dispatcher()
+            found = [(link, link._servers[key]) for link in self._hub._links if key in link._servers]
+            if not found:
+                dispatcher.post(lambda: done(Unanswered(f"nobody serves {key}")))
+                return
+            server, handler = found[0]
+            query = _MemoryQuery(self, server, key, payload, done, time.monotonic() + timeout_s)
+            self._hub._under_way.add(query)
+            dispatcher.post(lambda: handle(handler, query))
+            self._hub._expire_soon()
+
+    def serve(self, key: str, handler: Callable[[Query], None]) -> None:
+        with self._hub._lock:
+            self._dispatcher()
+            self._servers[key] = handler
+
+    def publish(self, key: str, payload: bytes, droppable: bool) -> None:
+        with self._hub._lock:
+            self._dispatcher()
+            for link in self._hub._links:
+                for expr, mailbox in link._mailboxes:
+                    if matches(expr, key):
+                        mailbox.put(key, payload, droppable=droppable)
+
+    def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
+        with self._hub._lock:
+            self._dispatcher()
+            self._mailboxes.append((key_expr, Mailbox(handler)))
+
+    def announce(self, key: str) -> None:
+        with self._hub._lock:
+            self._dispatcher()
+            self._alive.add(key)
+            self._tell(key, True)
+
+    def watch(self, key_expr: str, handler: Callable[[str, bool], None]) -> None:
+        with self._hub._lock:
+            self._dispatcher()
+            mailbox = Mailbox(handler)
+            self._watchers.append((key_expr, mailbox))
+            for link in self._hub._links:
+                for key in link._alive:
+                    if matches(key_expr, key):
+                        mailbox.put(key.rpartition("/")[2], True, droppable=False)
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        return ()
+
+    def close(self) -> None:
+        hub, last = self._hub, None
+        with hub._lock:
+            if self._closed:
+                return
+            self._closed = True
+            hub._links.remove(self)
+            for key in self._alive:
+                self._tell(key, False)
+            cut = [query for query in hub._under_way if self in (query.asker, query.server)]
+            if hub._dispatcher is not None:
+                for query in cut:
+                    hub._dispatcher.post(lambda query=query: query.end(Unanswered("the link was closed")))  # type: ignore[misc]
+            if not hub._links:
+                last, hub._dispatcher, hub._expiring = hub._dispatcher, None, False
+        for _, mailbox in self._mailboxes + self._watchers:
+            mailbox.close()
+        if last is not None:
+            last.close()
+
+    def _dispatcher(self) -> Dispatcher:
+        if self._closed or self._hub._dispatcher is None:
+            raise LinkError("this link is closed: open another")
+        return self._hub._dispatcher
+
+    def _tell(self, key: str, alive: bool) -> None:
+        for link in self._hub._links:
+            for expr, mailbox in link._watchers:
+                if matches(expr, key):
+                    mailbox.put(key.rpartition("/")[2], alive, droppable=False)
+
+
+class _MemoryQuery:
+    def __init__(self, asker: MemoryLink, server: MemoryLink, key: str, payload: bytes, done: Done, deadline: float) -> None:
+        self.asker, self.server = asker, server
+        self.key, self.payload, self.deadline = key, payload, deadline
+        self._done = done
+        self._answered = False
+
+    def reply(self, payload: bytes) -> None:
+        self._answer(bytes(payload))
+
+    def refuse(self, reason: str) -> None:
+        self._answer(Refused(reason))
+
+    def end(self, outcome: Outcome) -> None:
+        """Tell the asker, on the hub's thread; of all outcomes the first one counts."""
+        with self.asker._hub._lock:
+            if self not in self.asker._hub._under_way:
+                return
+            self.asker._hub._under_way.remove(self)
+        self._done(outcome)
+
+    def _answer(self, outcome: Outcome) -> None:
+        with self.asker._hub._lock:
+            if self._answered:
+                raise RuntimeError(f"this query on {self.key} has been answered already")
+            self._answered = True
+            dispatcher = self.asker._hub._dispatcher
+            if dispatcher is not None:
+                dispatcher.post(lambda: self.end(outcome))

@@ -1,0 +1,185 @@
+"""Reading strangers' bytes: every field checked, sizes bounded, nothing executed.
+
+Whatever is wrong raises :class:`WireError` with one of the reasons in ``REASONS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Set
+from typing import Any, NoReturn, TypeVar
+
+import msgpack
+import numpy as np
+
+from icrl_dist.types import ARRAYS
+
+_T = TypeVar("_T")
+
+VERSION = 1
+"""Version of every message; a reader refuses all others."""
+
+REASONS: dict[str, str] = {
+    "oversized": "longer than the reader's limit",
+    "not-msgpack": "not exactly one msgpack value of plain types",
+    "version": "written by another version of the wire",
+    "schema": "a field is missing, unknown, of the wrong type or out of range",
+    "dtype": "an array of a dtype that does not belong there",
+    "shape": "an array whose shape disagrees with its bytes, its rank or its companions",
+    "digest": "weights that do not hash to the digest they came with",
+}
+"""Every reason of a :class:`WireError`, fit to count drops by."""
+
+WEIGHT_DTYPES = frozenset({"<f2", "<f4", "<f8", "<i4", "<i8", "|u1"})
+"""Dtypes that a model's parameters may have."""
+
+_ITEMS = 1 << 14
+DEPTH = 8
+_CELLS = 1 << 31
+_TEXT = 1 << 16
+
+_DTYPES = {name: np.dtype(name) for name in WEIGHT_DTYPES | {dtype for dtype, _ in ARRAYS.values()}}
+
+
+class WireError(ValueError):
+    """A message that is not what it should be; ``reason`` is a key of ``REASONS``."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f"{reason}: {detail}")
+        self.reason = reason
+        self.detail = detail
+
+
+def pack(kind: str, fields: Mapping[str, object]) -> bytes:
+    """A message of this version.  What msgpack cannot hold is refused."""
+    try:
+        packed: bytes = msgpack.packb({"v": VERSION, "kind": kind, **fields}, use_bin_type=True)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WireError("schema", f"{kind} holds what msgpack cannot: {error}") from error
+    return packed
+
+
+def unpack(data: bytes, limit: int) -> dict[str, Any]:
+    """The one msgpack map that ``data`` is, of this version and within ``limit`` bytes."""
+    if len(data) > limit:
+        raise WireError("oversized", f"{len(data)} bytes, the limit is {limit}")
+    try:
+        message = msgpack.unpackb(
+            data,
+            raw=False,
+            strict_map_key=True,
+            ext_hook=_no_extension,
+            max_str_len=min(len(data), _TEXT),
+            max_bin_len=len(data),
+            max_array_len=min(len(data), _ITEMS),
+            max_map_len=min(len(data), _ITEMS),
+            max_ext_len=0,
+        )
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise WireError("not-msgpack", f"{type(error).__name__}: {error}") from error
+    message = as_map(message, "message")
+    version = message.get("v")
+    if type(version) is not int or version != VERSION:
+        raise WireError("version", f"version {version!r}, this side reads {VERSION}: install the same release on both sides")
+    return message
+
+
+def _no_extension(code: int, data: bytes) -> NoReturn:
+    raise ValueError(f"extension type {code}")
+
+
+def exactly(value: object, what: str, names: Set[str]) -> dict[str, Any]:
+    """``value`` as a map with these names, no fewer and no more."""
+    found = as_map(value, what)
+    if found.keys() != names:
+        odd = names ^ found.keys()
+        raise WireError("schema", f"{what}: missing or unknown {show(sorted(map(str, odd)))}")
+    return found
+
+
+def show(value: object) -> str:
+    """A value for an error message, cut to fit a line."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def typed(value: object, kind: type[_T], what: str) -> _T:
+    """``value``, if it is exactly of this type."""
+    if type(value) is not kind:
+        raise WireError("schema", f"{what} is {show(value)}, expected {kind.__name__}")
+    return value
+
+
+def as_map(value: object, what: str) -> dict[str, Any]:
+    """``value`` as a map of names."""
+    found: dict[str, Any] = typed(value, dict, what)
+    for name in found:
+        if type(name) is not str:
+            raise WireError("schema", f"{what} has the key {show(name)}, expected text")
+    return found
+
+
+def as_list(value: object, what: str, length: int | None = None) -> list[Any]:
+    """``value`` as a list, of this length if one is given."""
+    if type(value) is not list:
+        raise WireError("schema", f"{what} is {show(value)}, expected list")
+    if length is not None and len(value) != length:
+        raise WireError("schema", f"{what} has {len(value)} entries, expected {length}")
+    return value
+
+
+def text(value: object, what: str) -> str:
+    """``value`` as text."""
+    return typed(value, str, what)
+
+
+def integer(value: object, what: str, low: int) -> int:
+    """``value`` as a whole number, at least ``low``."""
+    found = typed(value, int, what)
+    if found < low:
+        raise WireError("schema", f"{what} is {found}, expected at least {low}")
+    return found
+
+
+def from_array(array: np.ndarray) -> list[object]:
+    """An array as ``[dtype, shape, bytes]``."""
+    return [array.dtype.str, list(array.shape), array.tobytes()]
+
+
+def to_array(name: str, value: object, dtypes: Iterable[str], ndim: int | None) -> np.ndarray:
+    """The inverse of ``from_array``: read-only, without a copy, of an allowed dtype and rank."""
+    dtype, shape, content = as_list(value, name, 3)
+    if type(dtype) is not str or dtype not in dtypes:
+        raise WireError("dtype", f"{name} is {show(dtype)}, expected one of {sorted(dtypes)}")
+    if type(content) is not bytes:
+        raise WireError("schema", f"{name}'s content is {show(content)}, expected bytes")
+    cells = extent = 1
+    for size in as_list(shape, name):
+        if type(size) is not int or size < 0:
+            raise WireError("schema", f"{name} has shape {show(shape)}, expected whole numbers")
+        cells *= size
+        extent *= size or 1
+    if len(shape) > DEPTH or extent > _CELLS or (ndim is not None and len(shape) != ndim):
+        raise WireError("shape", f"{name} has shape {show(shape)}, expected {ndim or 'few'} dimensions")
+    kind = _DTYPES[dtype]
+    if cells * kind.itemsize != len(content):
+        raise WireError("shape", f"{name} has shape {shape} of {dtype} but {len(content)} bytes")
+    return np.frombuffer(content, kind).reshape(shape)
+
+
+def check_plain(value: object, where: str, depth: int) -> None:
+    """Refuse what is not nested plain values of builtin types."""
+    if value is None or isinstance(value, (bool, int, float, str, bytes)):
+        if type(value).__module__ != "builtins":
+            raise WireError("schema", f"{where} is a {type(value).__module__}.{type(value).__name__}: convert it first")
+    elif depth == 0:
+        raise WireError("schema", f"{where} is nested deeper than {DEPTH}")
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            if type(name) is not str:
+                raise WireError("schema", f"{where} has the key {show(name)}, expected strings")
+            check_plain(item, f"{where}.{name}", depth - 1)
+    elif isinstance(value, list):
+        for item in value:
+            check_plain(item, f"{where}[]", depth - 1)
+    else:
+        raise WireError("schema", f"{where} is {show(value)}: not a plain value")
