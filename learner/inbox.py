@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 
 from icrl_dist.store import Store, StoreError
-from icrl_dist.stream import wire
+from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Query
 from icrl_dist.types import Identity, Job, Spec, Trajectory
 
@@ -73,12 +73,23 @@ class Inbox:
         self._thread.start()
 
     def put(self, query: Query) -> None:
-        """Accept a query without ever blocking; a full queue answers ``busy``: send it again."""
+        """Accept a request without ever blocking; a full queue answers ``busy``: send it again."""
         try:
-            self._queue.put_nowait(query)
-        except queue.Full:
-            self.drops["busy"] += 1
-            query.refuse("busy")
+            trajectories = batch.split(query, self._limit)
+        except wire.WireError as error:
+            self._refuse(query, error)
+            return
+        for one in trajectories:
+            try:
+                self._queue.put_nowait(one)
+            except queue.Full:
+                self.drops["busy"] += 1
+                one.refuse("busy")
+
+    def _refuse(self, query: Query, error: wire.WireError | Rejected) -> None:
+        self.drops[error.reason] += 1
+        _log.warning("refused a message: %s", error)
+        query.refuse(str(error))
 
     def close(self) -> None:
         """Take in what is queued, then stop."""
@@ -97,23 +108,20 @@ class Inbox:
                 group.append(following)
             try:
                 self.take(group)
-            except StoreError as error:
-                for query in group:
-                    query.refuse(f"busy: {error}")
+            except StoreError as error:  # unanswered, what was sent will be sent again
                 self._failed(error)
                 return
             if stop:
                 return
 
     def take(self, group: list[Query]) -> None:
-        """Check a group of messages, store the good ones durably, then answer all of them.
+        """Check a group of messages, refuse the bad ones, store the good ones, then acknowledge those.
 
-        Raises StoreError if they could not be stored; none of them is answered then.
+        Raises StoreError if they could not be stored; none of them is acknowledged then.
         """
         good: dict[Identity, tuple[Trajectory, bytes]] = {}
-        answers: list[tuple[Query, str]] = []
+        taken: list[Query] = []
         for query in group:
-            reason = ""
             try:
                 trajectory = wire.decode_trajectory(query.payload, self._limit)
                 identity = trajectory.identity
@@ -126,15 +134,11 @@ class Inbox:
                     check(trajectory, job, self._spec, self._digest_of(job.weights))
                     good[identity] = (trajectory, query.payload)
             except (wire.WireError, Rejected) as error:
-                self.drops[error.reason] += 1
-                reason = str(error)
-                _log.warning("refused a message: %s", reason)
-            answers.append((query, reason))
+                self._refuse(query, error)
+            else:
+                taken.append(query)
         self._store.append(list(good.values()))
         for trajectory, _ in good.values():
             self._stored(trajectory)
-        for query, reason in answers:
-            if reason:
-                query.refuse(reason)
-            else:
-                query.reply(b"stored")
+        for query in taken:
+            query.reply(b"stored")

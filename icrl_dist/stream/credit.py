@@ -4,13 +4,30 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
+from icrl_dist.stream import batch
 from icrl_dist.stream.link import Link, LinkError, Outcome, Refused, Unanswered
+from icrl_dist.stream.strict import WireError
 from icrl_dist.stream.threads import Dispatcher
 
 BACKOFF_S = (0.05, 2.0)
 """First and longest wait before an item is sent again, seconds; each wait doubles the last."""
+
+FLIGHTS = 2
+"""Requests under way: one is answered while the other travels.  The second leaves when half
+the credits wait, the first at once, so nothing is kept back from an idle link."""
+
+TOGETHER_BYTES = 1 << 20
+"""Items travel together up to so many bytes; a larger one travels alone."""
+
+
+@dataclass(slots=True)
+class _Item:
+    payload: bytes
+    resends: int = 0
 
 
 class CreditSender:
@@ -19,7 +36,7 @@ class CreditSender:
     Unanswered items, and those refused as ``busy``, are sent again for as long as it takes; the
     other side drops duplicates.  Any other refusal is final: the item is given up and the next
     ``send`` or ``drain`` raises Refused.  ``on_event`` hears ``resent`` and ``refused``, with why,
-    and must not block.
+    and must not block.  The other side takes requests apart with ``batch.split``.
     """
 
     def __init__(
@@ -44,6 +61,9 @@ class CreditSender:
         self._credit: queue.SimpleQueue[None] = queue.SimpleQueue()
         for _ in range(credits):
             self._credit.put(None)
+        self._waiting: deque[_Item] = deque()
+        self._enough = max(1, credits // FLIGHTS)
+        self._flights = 0
         self._outstanding = 0
         self._failure: Refused | LinkError | None = None
         self._closed = False
@@ -65,7 +85,8 @@ class CreditSender:
                 raise
             self._outstanding += 1
             self.sent += 1
-        self._attempt(payload, 0)
+            self._waiting.append(_Item(payload))
+        self._fly()
 
     def drain(self, timeout_s: float) -> None:
         """Wait until every item is acknowledged.  Raises Refused for one that was not, Unanswered after ``timeout_s``."""
@@ -90,33 +111,61 @@ class CreditSender:
         if self._closed:
             raise LinkError(f"the sender on {self._key} is closed, {self._outstanding} items were unanswered")
 
-    def _attempt(self, payload: bytes, resends: int) -> None:
-        if self._closed:
-            return
+    def _fly(self) -> None:
+        """Send what waits, together, if the link is idle or there is enough to be worth a second request."""
+        with self._changed:
+            if self._closed or not self._waiting or self._flights >= FLIGHTS:
+                return
+            if self._flights and len(self._waiting) < self._enough:
+                return
+            items, size = [self._waiting.popleft()], 0
+            while self._waiting and (size := size + len(items[-1].payload)) + len(self._waiting[0].payload) <= TOGETHER_BYTES:
+                items.append(self._waiting.popleft())
+            self._flights += 1
         try:
-            self._link.send(self._key, payload, self._timeout_s, lambda outcome: self._settle(payload, resends, outcome))
+            request = batch.join([item.payload for item in items])
+            self._link.send(self._key, request, self._timeout_s, lambda outcome: self._land(items, outcome))
         except LinkError as error:
-            self._give_up(error)
+            with self._changed:
+                self._flights -= 1
+                for _ in items:
+                    self._give_up(error)
 
-    def _settle(self, payload: bytes, resends: int, outcome: Outcome) -> None:
-        if isinstance(outcome, bytes):
-            with self._changed:
-                self.acknowledged += 1
-                self._release()
-        elif isinstance(outcome, Unanswered) or outcome.reason.startswith("busy"):
-            with self._changed:
-                self.resent += 1
-            first, longest = BACKOFF_S
-            self._resends.post(lambda: self._attempt(payload, resends + 1), min(longest, first * 2 ** min(resends, 16)))
-            self._tell("resent", str(outcome))
-        else:
-            self._give_up(outcome)
-            self._tell("refused", outcome.reason)
+    def _land(self, items: list[_Item], outcome: Outcome) -> None:
+        reasons, final = _reasons(outcome, len(items))
+        events: list[tuple[str, str]] = []
+        with self._changed:
+            self._flights -= 1
+            again: list[_Item] = []
+            for item, reason in zip(items, reasons, strict=True):
+                if not reason:
+                    self.acknowledged += 1
+                    self._release()
+                elif not final or reason.startswith("busy"):
+                    item.resends += 1
+                    self.resent += 1
+                    again.append(item)
+                    events.append(("resent", reason))
+                else:
+                    self._give_up(Refused(reason))
+                    events.append(("refused", reason))
+            if again:
+                first, longest = BACKOFF_S
+                delay = min(longest, first * 2 ** min(again[0].resends - 1, 16))
+                self._resends.post(lambda: self._again(again), delay)
+        self._fly()
+        if self._on_event is not None:
+            for event, reason in events:
+                self._on_event(event, reason)
+
+    def _again(self, items: list[_Item]) -> None:
+        with self._changed:
+            self._waiting.extendleft(reversed(items))
+        self._fly()
 
     def _give_up(self, failure: Refused | LinkError) -> None:
-        with self._changed:
-            self._failure = self._failure or failure
-            self._release()
+        self._failure = self._failure or failure
+        self._release()
 
     def _release(self) -> None:
         self._outstanding -= 1
@@ -124,6 +173,12 @@ class CreditSender:
         if self._failure or not self._outstanding:
             self._changed.notify_all()
 
-    def _tell(self, event: str, reason: str) -> None:
-        if self._on_event is not None:
-            self._on_event(event, reason)
+
+def _reasons(outcome: Outcome, count: int) -> tuple[list[str], bool]:
+    """Why each item was not taken, empty where it was; and whether a reason is the other side's own."""
+    if isinstance(outcome, bytes):
+        try:
+            return batch.reasons(outcome, count), True
+        except WireError as error:
+            return [f"an answer that is none: {error}"] * count, False
+    return [str(outcome)] * count, isinstance(outcome, Refused)

@@ -268,6 +268,8 @@ def _open(settings: Mapping[str, object]) -> zenoh.Session:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
+        "transport/link/tx/queue/size/data": 8,  # a request of several trajectories goes out without waiting
+        "transport/link/rx/buffer_size": 1 << 18,  # and comes in with few reads
     }
     config = zenoh.Config()
     try:

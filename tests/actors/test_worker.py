@@ -14,7 +14,7 @@ from icrl_dist.config import dumps
 from icrl_dist.envs import spec, tasks
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS
-from icrl_dist.stream import wire
+from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
@@ -61,8 +61,9 @@ class Learner:
             query.reply(self.answers.pop(0))
 
     def data(self, query):
-        self.stored.append(wire.decode_trajectory(query.payload, 1 << 20))
-        query.reply(b"stored")
+        for one in batch.split(query, 1 << 20):
+            self.stored.append(wire.decode_trajectory(one.payload, 1 << 20))
+            one.reply(b"stored")
 
 
 def job_message(job):

@@ -148,6 +148,7 @@ time.sleep(60)
 
 LEARNER = """
 import sys, time
+from icrl_dist.stream import batch
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 known = set(open(sys.argv[2]).read().split())
@@ -159,7 +160,10 @@ def store(query):
         print(name, file=file, flush=True)
     time.sleep(0.001)
     query.reply(b"stored")
-ZenohLink.listen(sys.argv[1]).serve(Keys("battery").data, store)
+def take_apart(query):
+    for part in batch.split(query, 1 << 20):
+        store(part)
+ZenohLink.listen(sys.argv[1]).serve(Keys("battery").data, take_apart)
 time.sleep(60)
 """
 

@@ -85,18 +85,26 @@ def undisturbed(tmp_path_factory):
     began = time.monotonic()
     process = start("train", "smoke", "--out", folder, "--json")
     endpoint = endpoint_of(folder)
-    quiet = {"stdout": subprocess.PIPE, "text": True}
-    tap = subprocess.Popen([*CLI, "tap", "--connect", endpoint], **quiet)
     script = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs" / "tap.md").read_text(), re.DOTALL)
-    documented = subprocess.Popen([sys.executable, "-c", script.group(1), endpoint, folder.name], **quiet)
-    output = finish(process)
-    seconds = time.monotonic() - began
-    lines = {}
-    for name, listener in (("tap", tap), ("documented", documented)):
-        listener.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            lines[name] = listener.communicate(timeout=10)[0].splitlines()
-        listener.kill()
+    commands = {
+        "tap": [*CLI, "tap", "--connect", endpoint],
+        "documented": [sys.executable, "-c", script.group(1), endpoint, folder.name],
+    }
+    heard = {name: folder.parent / name for name in commands}
+    with contextlib.ExitStack() as stack:
+        # Into files: a pipe that nobody empties would hold up the listener.
+        files = {name: stack.enter_context(heard[name].open("w")) for name in commands}
+        listeners = [subprocess.Popen(commands[name], stdout=files[name], stderr=subprocess.DEVNULL) for name in commands]
+        output = finish(process)
+        seconds = time.monotonic() - began
+        for listener in listeners:
+            listener.send_signal(signal.SIGINT)
+            try:
+                listener.wait(timeout=10)
+            finally:
+                listener.kill()
+                listener.wait()
+    lines = {name: file.read_text().splitlines() for name, file in heard.items()}
     assert process.returncode == 0, output
     return folder, output, lines, seconds
 

@@ -3,13 +3,14 @@
 import dataclasses
 import threading
 
+import msgpack
 import numpy as np
 import pytest
 
 from icrl_dist import envs, jobs
 from icrl_dist.recipes import METHODS
 from icrl_dist.store import Store, StoreError
-from icrl_dist.stream import wire
+from icrl_dist.stream import batch, wire
 from icrl_dist.types import Identity
 from learner.inbox import REASONS, Inbox
 
@@ -65,18 +66,21 @@ def inbox(tmp_path, small_run, job):
     store.close()
 
 
-def put(inbox, payload):
-    query = Asked(payload)
+def put(inbox, *payloads):
+    """What became of the trajectories of one request: empty where stored, else why not."""
+    query = Asked(batch.join(payloads))
     inbox.put(query)
     assert query.answered.wait(5)
-    return query.answer
+    answers = batch.reasons(query.answer, len(payloads))
+    return answers if len(answers) > 1 else answers[0]
 
 
 def test_a_good_trajectory_is_on_disk_before_the_answer(inbox, trajectories, monkeypatch):
     order = []
     append = inbox.store.append
     monkeypatch.setattr(inbox.store, "append", lambda items: (append(items), order.append("stored")))
-    monkeypatch.setattr(Asked, "reply", lambda self, payload: (order.append("answered"), self.answered.set()))
+    reply = Asked.reply
+    monkeypatch.setattr(Asked, "reply", lambda self, payload: (order.append("answered"), reply(self, payload)))
     put(inbox, wire.encode_trajectory(trajectories[0]))
     assert order == ["stored", "answered"]
     assert trajectories[0].identity in inbox.store
@@ -84,7 +88,7 @@ def test_a_good_trajectory_is_on_disk_before_the_answer(inbox, trajectories, mon
 
 def test_a_duplicate_is_acknowledged_and_stored_once(inbox, trajectories):
     payload = wire.encode_trajectory(trajectories[0])
-    assert put(inbox, payload) == put(inbox, payload) == b"stored"
+    assert put(inbox, payload) == put(inbox, payload) == ""
     assert len(inbox.store) == 1 and inbox.drops == {"duplicate": 1}
     pair = [Asked(wire.encode_trajectory(trajectories[1])) for _ in range(2)]
     inbox.take(pair)
@@ -107,7 +111,6 @@ def broken(trajectory):
         ("not-msgpack", b"\xc1garbage"),
         ("not-msgpack", b""),
         ("not-msgpack", good[:-1]),
-        ("oversized", good + b"\0" * (1 << 20)),
         ("schema", wire.encode_message("trajectory")),
         ("not-finite", changed(rewards=nan)),
         ("spec", changed(observations=trajectory.observations[:5], **short)),
@@ -133,7 +136,31 @@ def test_bad_messages_are_counted_by_reason_refused_and_harm_nothing(inbox, traj
         assert answer.startswith(reason), (reason, answer)
         assert inbox.drops[reason] == before + 1
     assert len(inbox.store) == 0 and set(inbox.drops) <= set(REASONS)
-    assert put(inbox, wire.encode_trajectory(trajectories[0])) == b"stored"
+    assert put(inbox, wire.encode_trajectory(trajectories[0])) == ""
+
+
+def test_each_trajectory_of_a_request_is_answered_for_itself(inbox, trajectories):
+    good = [wire.encode_trajectory(t) for t in trajectories[:3]]
+    answers = put(inbox, good[0], b"\xc1garbage", good[1], good[0], good[2])
+    assert [bool(a) for a in answers] == [False, True, False, False, False]
+    assert answers[1].startswith("not-msgpack")
+    assert len(inbox.store) == 3 and inbox.drops == {"not-msgpack": 1, "duplicate": 1}
+
+
+@pytest.mark.parametrize(
+    ("reason", "payload"),
+    [
+        ("not-msgpack", b"\xc1garbage"),
+        ("not-msgpack", b""),
+        ("oversized", b"\0" * ((1 << 20) + 1)),
+        ("schema", wire.encode_message("batch")),
+        ("version", msgpack.packb({"v": 2, "kind": "batch", "items": []})),
+    ],
+)
+def test_a_request_that_is_no_batch_is_refused_whole(inbox, reason, payload):
+    query = Asked(payload)
+    inbox.put(query)
+    assert query.answer.startswith(reason) and inbox.drops == {reason: 1}
 
 
 def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, trajectories):
@@ -150,10 +177,10 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
         capacity=2,
     )
     payload = wire.encode_trajectory(trajectories[0])
-    queries = [Asked(payload) for _ in range(8)]
+    queries = [Asked(batch.join([payload])) for _ in range(8)]
     for query in queries:
         inbox.put(query)
-    busy = [q for q in queries if q.answer == "busy"]
+    busy = [q for q in queries if q.answer and batch.reasons(q.answer, 1) == ["busy"]]
     assert len(busy) >= 4 and inbox.drops["busy"] == len(busy)
     gate.set()
     assert all(q.answered.wait(5) for q in queries)
@@ -162,9 +189,14 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
 
 
 def test_a_full_disk_acknowledges_nothing_and_is_reported(inbox, trajectories, monkeypatch):
+    failed = threading.Event()
+
     def full(items):
+        threading.Timer(0.05, failed.set).start()
         raise StoreError("segment: could not be written (No space left on device)")
 
     monkeypatch.setattr(inbox.store, "append", full)
-    assert put(inbox, wire.encode_trajectory(trajectories[0])).startswith("busy")
-    assert "No space left" in str(inbox.failures[0])
+    query = Asked(batch.join([wire.encode_trajectory(trajectories[0])]))
+    inbox.put(query)
+    assert failed.wait(5)
+    assert query.answer is None and "No space left" in str(inbox.failures[0])
