@@ -67,7 +67,7 @@ class CreditSender:
         self._outstanding = 0
         self._failure: Refused | LinkError | None = None
         self._closed = False
-        self._resends = Dispatcher("resends")
+        self._dispatcher = Dispatcher("credit")
 
     @property
     def outstanding(self) -> int:
@@ -102,7 +102,7 @@ class CreditSender:
             self._closed = True
             self._changed.notify_all()
         self._credit.put(None)
-        self._resends.close()
+        self._dispatcher.close()
 
     def _raise(self) -> None:
         failure, self._failure = self._failure, None
@@ -114,9 +114,7 @@ class CreditSender:
     def _fly(self) -> None:
         """Send what waits, together, if the link is idle or there is enough to be worth a second request."""
         with self._changed:
-            if self._closed or not self._waiting or self._flights >= FLIGHTS:
-                return
-            if self._flights and len(self._waiting) < self._enough:
+            if not self._ready():
                 return
             items, size = [self._waiting.popleft()], 0
             while self._waiting and (size := size + len(items[-1].payload)) + len(self._waiting[0].payload) <= TOGETHER_BYTES:
@@ -130,6 +128,11 @@ class CreditSender:
                 self._flights -= 1
                 for _ in items:
                     self._give_up(error)
+
+    def _ready(self) -> bool:
+        if self._closed or not self._waiting or self._flights >= FLIGHTS:
+            return False
+        return not self._flights or len(self._waiting) >= self._enough
 
     def _land(self, items: list[_Item], outcome: Outcome) -> None:
         reasons, final = _reasons(outcome, len(items))
@@ -152,8 +155,10 @@ class CreditSender:
             if again:
                 first, longest = BACKOFF_S
                 delay = min(longest, first * 2 ** min(again[0].resends - 1, 16))
-                self._resends.post(lambda: self._again(again), delay)
-        self._fly()
+                self._dispatcher.post(lambda: self._again(again), delay)
+            if self._ready():
+                # Not from here: this may be the link's own thread, which must not use the link.
+                self._dispatcher.post(self._fly)
         if self._on_event is not None:
             for event, reason in events:
                 self._on_event(event, reason)

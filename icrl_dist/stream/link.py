@@ -116,13 +116,19 @@ class Link(Protocol):
         """Ask and wait.  Raises Refused or Unanswered; never call it from a handler."""
         answers: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         self.send(key, payload, timeout_s, answers.put)
-        outcome = answers.get()
+        try:
+            outcome = answers.get(timeout=timeout_s + 5.0)  # the link keeps the deadline; this is for one that is stuck
+        except queue.Empty:
+            raise Unanswered(f"the link is stuck: {key} was to be answered within {timeout_s:g} s") from None
         if isinstance(outcome, bytes):
             return outcome
         raise outcome
 
     def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
-        """Ask without waiting; ``done`` is called once, from another thread, and must not block."""
+        """Ask without waiting; ``done`` is called once, from another thread.
+
+        It must neither block nor use a link: it may run on the network's own thread, within its locks.
+        """
 
     def serve(self, key: str, handler: Callable[[Query], None]) -> None:
         """Answer requests for ``key``.  The handler must not block; if it raises, the error is the answer."""
