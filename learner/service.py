@@ -87,7 +87,7 @@ class Service:
             self.fail,
         )
         link.serve(self._keys.work, self._work)
-        link.serve(self._keys.data, self.inbox.put)
+        self._taking = False
         link.watch(self._keys.alive_all, self._watch)
         self._take_up()
 
@@ -200,6 +200,9 @@ class Service:
         with self._lock:
             self._board.open(jobs, self.store.index)
             already = self._board.arrived
+        if not self._taking:  # earlier, nothing was expected yet: what comes meanwhile is sent again
+            self._link.serve(self._keys.data, self.inbox.put)
+            self._taking = True
         began = time.monotonic()
         while True:
             with self._lock:
