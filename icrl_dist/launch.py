@@ -123,6 +123,7 @@ def train_ray(run: Run, folder: Path, actors: int, address: str | None, report: 
         stack.callback(learner.end)
         fleet = Fleet(actors, run.learner.restarts, address)
         stack.callback(fleet.close)
+        stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
         result: dict[str, Any] | None = None
         started = False
         while True:

@@ -224,6 +224,19 @@ def test_kill_9_of_the_learner_midway_changes_nothing(longer, tmp_path):
     assert equal(result_of(folder), longer)
 
 
+def test_a_polite_kill_is_a_ctrl_c(tmp_path):
+    folder = tmp_path / "terminated"
+    process = start("train", "smoke", *LONGER, "--out", folder)
+    with on_first_adapt_trajectory(folder, process.terminate) as terminated:
+        family = psutil.Process(process.pid).children(recursive=True)
+        assert terminated.wait(60)
+    output = finish(process)
+    assert process.returncode == 130, output
+    assert "SIGTERM" not in output and "--resume" in output
+    _, alive = psutil.wait_procs(family, timeout=15)
+    assert not [p.cmdline() for p in alive]
+
+
 def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(longer, tmp_path):
     folder = tmp_path / "interrupted"
     process = start("train", "smoke", *LONGER, "--out", folder, start_new_session=True)
