@@ -7,6 +7,7 @@ the trajectory will be there after any crash.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
@@ -15,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from icrl_dist.store import Store, StoreError
+from icrl_dist.store import Store
 from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Query
 from icrl_dist.types import Identity, Job, Spec, Trajectory
@@ -93,7 +94,10 @@ class Inbox:
 
     def close(self) -> None:
         """Take in what is queued, then stop."""
-        self._queue.put(None)
+        while self._thread.is_alive():
+            with contextlib.suppress(queue.Full):
+                self._queue.put(None, timeout=0.1)
+                break
         self._thread.join()
 
     def _run(self) -> None:
@@ -108,7 +112,8 @@ class Inbox:
                 group.append(following)
             try:
                 self.take(group)
-            except StoreError as error:  # unanswered, what was sent will be sent again
+            except Exception as error:  # the run ends; unanswered, what was sent will be sent again
+                _log.exception("the inbox cannot go on")
                 self._failed(error)
                 return
             if stop:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import pickle
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from icrl_dist.oracle import cell_numbers
-from icrl_dist.types import ARRAYS, NULL, STAGES, Adversary, Identity, Job, Spec, Task, Trajectory, Variation
+from icrl_dist.types import ARRAYS, NULL, STAGES, Identity, Job, Spec, Task, Trajectory, Variation
 
 
 def trajectory(horizon: int = 3, **changes: Any) -> Trajectory:
@@ -77,12 +76,6 @@ def test_replace_keeps_the_type_and_the_rest() -> None:
     assert type(other) is Task
     assert task["goal"] == (1, 2)
     assert Task("null") != NULL, "a task is no adversary, whatever its name"
-
-
-def test_names_survive_pickling() -> None:
-    """Ray may carry a job's name; equality must survive the trip."""
-    variation = Variation(Task.of("darkroom", size=3), Adversary.of("uniform", p=0.1))
-    assert pickle.loads(pickle.dumps(variation)) == variation
 
 
 IDENTITIES = [Identity(s, *rest) for s in STAGES for rest in itertools.product((0, 1, 2, 11), repeat=4)]

@@ -200,3 +200,20 @@ def test_a_full_disk_acknowledges_nothing_and_is_reported(inbox, trajectories, m
     inbox.put(query)
     assert failed.wait(5)
     assert query.answer is None and "No space left" in str(inbox.failures[0])
+
+
+def test_a_failed_inbox_closes_even_with_a_full_queue(tmp_path, small_run, job, trajectories):
+    failures = []
+
+    def bug(identity):
+        raise ZeroDivisionError("a bug")
+
+    store = Store(tmp_path / "bug")
+    spec = envs.spec(job.variations[0].task)
+    inbox = Inbox(store, spec, 1 << 20, bug, lambda v: "", lambda t: None, failures.append, capacity=2)
+    payload = wire.encode_trajectory(trajectories[0])
+    for _ in range(20):
+        inbox.put(Asked(batch.join([payload])))
+    inbox.close()
+    assert [type(f) for f in failures] == [ZeroDivisionError]
+    store.close()
