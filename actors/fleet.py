@@ -73,7 +73,6 @@ class Fleet:
                 raise ConfigError(f"--actors {actors}: the cluster at {address} has {cores} cores; ask for at most {cores}")
         self._actors, self._budget = actors, dict.fromkeys(range(actors), restarts)
         self._running: dict[Any, tuple[int, Any]] = {}
-        self._pids: dict[int, Any] = {}
         self._lives = dict.fromkeys(range(actors), 0)
         self._endpoint = self._run_name = ""
 
@@ -86,7 +85,6 @@ class Fleet:
     def _launch(self, index: int) -> None:
         host = self._ray.remote(num_cpus=1, max_restarts=0)(_Host).remote()
         name = f"w{index}" if not self._lives[index] else f"w{index}-{self._lives[index]}"
-        self._pids[index] = host.pid.remote()
         self._running[host.work.remote(self._endpoint, self._run_name, name)] = (index, host)
 
     def watch(self, note: Callable[[str], None]) -> int:
@@ -109,10 +107,6 @@ class Fleet:
                 self._launch(index)
         return len(self._running)
 
-    def pids(self) -> list[int]:
-        """Process ids of the workers, for tests that kill them."""
-        return [self._ray.get(self._pids[index]) for index, _ in self._running.values()]
-
     def close(self) -> None:
         """End every worker, and Ray if it was started here."""
         for _, host in self._running.values():
@@ -127,9 +121,6 @@ class _Host:
 
     def work(self, endpoint: str, run_name: str, name: str) -> None:
         _work(endpoint, run_name, name)
-
-    def pid(self) -> int:
-        return os.getpid()
 
 
 def _cause(error: BaseException) -> str:

@@ -15,7 +15,6 @@ import icrl_dist
 from actors.policy import LivePolicy
 from icrl_dist import jobs
 from icrl_dist.config import Run, parse
-from icrl_dist.envs import spec as spec_of
 from icrl_dist.envs import tasks
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
@@ -48,8 +47,7 @@ class Worker:
         self._link.announce(self._keys.alive(self.name))
         _, hello = self._ask("hello", version=icrl_dist.__version__, pid=os.getpid())
         run = parse(hello["run"], "the learner's run")
-        spec = spec_of(tasks.split(run).train[0])
-        policy = LivePolicy(self._link, self._keys, spec, run.model, run.stream.max_message_bytes)
+        policy = LivePolicy(self._link, self._keys, tasks.spec(run), run.model, run.stream.max_message_bytes)
         credit = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
         with contextlib.closing(credit) as sender:
             while not self._stop.is_set():
@@ -63,7 +61,7 @@ class Worker:
                     self._do(wire.decode_job(fields["job"]), policy, sender, run)
 
     def _do(self, job: Job, policy: LivePolicy, sender: CreditSender, run: Run) -> None:
-        name = "/".join(map(str, job.name))
+        name = job.label
         try:
             for trajectory in jobs.do(job, policy, self.name):
                 sender.send(wire.encode_trajectory(trajectory))

@@ -269,3 +269,8 @@ class Job:
     @property
     def name(self) -> tuple[str, int, int]:
         return (self.stage, self.round, self.task)
+
+    @property
+    def label(self) -> str:
+        """The name for people: ``adapt/0/3``."""
+        return "/".join(map(str, self.name))

@@ -15,7 +15,6 @@ import torch
 import icrl_dist
 from icrl_dist import context, pretrain
 from icrl_dist.config import Run, dumps
-from icrl_dist.envs import spec as spec_of
 from icrl_dist.envs import tasks
 from icrl_dist.evaluate import label_quality
 from icrl_dist.metrics import Metrics
@@ -55,7 +54,7 @@ class Service:
         self._run, self._folder, self._link, self._report = run, folder, link, report
         self._method = METHODS[run.method]
         self._keys = Keys(folder.name)
-        self._spec = spec_of(tasks.split(run).train[0])
+        self._spec = tasks.spec(run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
         torch.manual_seed(run.seed)
         torch.use_deterministic_algorithms(True)
@@ -121,7 +120,7 @@ class Service:
             freed = [] if alive else self._board.lost(worker)
         text = f"worker {worker} joined" if alive else f"worker {worker} is gone"
         if freed:
-            text += "; its job goes to another: " + ", ".join("/".join(map(str, job.name)) for job in freed)
+            text += "; its job goes to another: " + ", ".join(job.label for job in freed)
         self._report({"event": "worker", "worker": worker, "alive": alive, "text": text})
 
     def _work(self, query: Query) -> None:

@@ -94,4 +94,4 @@ class Board:
         slot.failures.append(error)
         if len(slot.failures) < self._max_failures:
             return None
-        return f"job {'/'.join(map(str, name))} failed {len(slot.failures)} times, last: {error}"
+        return f"job {slot.job.label} failed {len(slot.failures)} times, last: {error}"

@@ -9,7 +9,7 @@ import numpy as np
 from icrl_dist.config import Run
 from icrl_dist.envs import darkroom
 from icrl_dist.envs.adversary import adversary_set, sample_dirichlet
-from icrl_dist.types import NULL, Adversary, Task, Variation
+from icrl_dist.types import NULL, Adversary, Spec, Task, Variation
 
 # Spawn keys of the draws that are not a trajectory's; a trajectory's begin with a stage number.
 _SPLIT, _PRIORS, _UNSEEN = 101, 102, 103
@@ -31,6 +31,11 @@ def split(run: Run) -> Split:
     tasks = [darkroom.task(goals[i], room.size, room.horizon) for i in order]
     cut = round(room.train_fraction * len(tasks))
     return Split(tuple(tasks[:cut]), tuple(tasks[cut:]))
+
+
+def spec(run: Run) -> Spec:
+    """The spec that all of a run's tasks share."""
+    return darkroom.spec(split(run).train[0])
 
 
 def deployed(task: Task) -> Task:
