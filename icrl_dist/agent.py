@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from icrl_dist.config import ConfigError, ContextConfig, parse
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
 from icrl_dist.rollout import InContextPolicy, sample
-from icrl_dist.store import Checkpoint, StoreError, load_checkpoint
+from icrl_dist.store import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
 from icrl_dist.types import Spec
 
 
@@ -90,10 +90,10 @@ def checkpoint_file(what: Path, version: int | None = None) -> Path:
         if what.is_file():
             return what
         raise ConfigError(f"{what}: no such run folder or checkpoint; `icrl-dist train demo` makes one in runs/demo")
-    found = sorted((what / "checkpoints").glob("version-*.npz" if version is None else f"version-{version:04d}.npz"))
-    if not found:
+    found = version_file(what, newest_version(what) if version is None else version)
+    if not found.is_file():
         raise ConfigError(f"{what}: holds no {'checkpoint' if version is None else f'version {version}'} yet")
-    return found[-1]
+    return found
 
 
 def model_of(checkpoint: Checkpoint) -> tuple[PretrainedTransformer, ContextConfig]:

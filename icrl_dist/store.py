@@ -170,6 +170,17 @@ class Checkpoint:
         return {k.removeprefix(prefix + "/"): v for k, v in self.arrays.items() if k.startswith(prefix + "/")}
 
 
+def version_file(folder: Path, version: int) -> Path:
+    """Where T^version lies."""
+    return folder / "checkpoints" / f"version-{version:04d}.npz"
+
+
+def newest_version(folder: Path) -> int:
+    """The newest complete version in a run folder; -1 if there is none."""
+    names = (folder / "checkpoints").glob("version-*.npz")
+    return max((int(name.stem.removeprefix("version-")) for name in names), default=-1)
+
+
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint so that ``path`` holds the old one or the new one, never half of one."""
     manifest = np.frombuffer(json.dumps(checkpoint.manifest).encode(), dtype=np.uint8)

@@ -22,17 +22,6 @@ from icrl_dist.types import Spec
 PARTIAL = "partial.npz"
 
 
-def version_file(folder: Path, version: int) -> Path:
-    """Where T^version lies."""
-    return folder / "checkpoints" / f"version-{version:04d}.npz"
-
-
-def newest_version(folder: Path) -> int:
-    """The newest complete version in a run folder; -1 if there is none."""
-    names = sorted((folder / "checkpoints").glob("version-*.npz"))
-    return int(names[-1].stem.removeprefix("version-")) if names else -1
-
-
 def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]:
     """What a checkpoint says of itself: enough to deploy it, and to know where it comes from."""
     split = tasks.split(run)

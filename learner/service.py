@@ -20,7 +20,7 @@ from icrl_dist.evaluate import label_quality
 from icrl_dist.metrics import Metrics
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS, Phase
-from icrl_dist.store import Store
+from icrl_dist.store import Store, newest_version, version_file
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link, Query
 from icrl_dist.types import Identity, Job, Trajectory, Weights
@@ -60,7 +60,7 @@ class Service:
         torch.use_deterministic_algorithms(True)
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
         self._opt = pretrain.optimiser(self.model, run.optim)
-        self.version = checkpoints.newest_version(folder)
+        self.version = newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder)
         self._lock = threading.Lock()
@@ -244,7 +244,7 @@ class Service:
         torch.set_num_threads(torch_threads)
         self._partial = 0
         self.version = phase.produces
-        self._save(checkpoints.version_file(self._folder, self.version), loss=loss, dataset_digest=self.store.digest())
+        self._save(version_file(self._folder, self.version), loss=loss, dataset_digest=self.store.digest())
         partial.unlink(missing_ok=True)
         self._publish()
         self._metrics.write(self.version, "version", loss=loss, seconds=time.monotonic() - began)
@@ -260,7 +260,7 @@ class Service:
     def _take_up(self) -> None:
         """Go on from the newest version, and from the fit that was under way, if there are any."""
         if self.version >= 0:
-            checkpoints.restore(checkpoints.version_file(self._folder, self.version), self._spec, self.model, self._opt)
+            checkpoints.restore(version_file(self._folder, self.version), self._spec, self.model, self._opt)
             self._publish()
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
         if partial.exists() and checkpoints.read_manifest(partial)["produces"] == self.version + 1:

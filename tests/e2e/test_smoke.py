@@ -18,7 +18,7 @@ import pytest
 from icrl_dist import recipes
 from icrl_dist.agent import load_agent
 from icrl_dist.config import load
-from icrl_dist.store import Store
+from icrl_dist.store import Store, version_file
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Refused
 from icrl_dist.stream.zenoh_link import ZenohLink
@@ -133,7 +133,7 @@ def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undi
     assert {t.worker for t in trajectories} == {"w0", "w1"}
     for t in trajectories:
         if t.identity.stage == "adapt":
-            about = checkpoints.read_manifest(checkpoints.version_file(folder, t.identity.round))
+            about = checkpoints.read_manifest(version_file(folder, t.identity.round))
             assert (t.weights, t.digest) == (t.identity.round, about["weights_digest"])
     assert {t.weights for t in trajectories} == {-1, 0, 1}
 

@@ -9,7 +9,7 @@ import pytest
 from icrl_dist import launch
 from icrl_dist.agent import load_agent
 from icrl_dist.config import ConfigError
-from icrl_dist.store import Store
+from icrl_dist.store import Store, version_file
 from learner import checkpoints, service
 
 
@@ -39,7 +39,7 @@ def same(result, other):
 def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small_run, tmp_path, undisturbed):
     folder = tmp_path / "undisturbed"
     store = Store(folder / "dataset")
-    versions = [checkpoints.read_manifest(checkpoints.version_file(folder, v)) for v in range(3)]
+    versions = [checkpoints.read_manifest(version_file(folder, v)) for v in range(3)]
     for identity in store.index:
         t = store.read(identity)
         if identity.stage == "adapt":
