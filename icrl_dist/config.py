@@ -8,22 +8,19 @@ they need many.
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import json
 import math
 import tomllib
 import typing
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+from icrl_dist.tables import ConfigError, build, dumps, nearest
+
+__all__ = ["ConfigError", "Run", "dumps", "load", "parse", "validate"]
 
 METHOD_NAMES = ("dpt", "icag", "icaa")
-
-
-class ConfigError(ValueError):
-    """A value that a run cannot have: what, where, and the remedy, on one line."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +226,7 @@ def load(name_or_path: str) -> Run:
         if not file.is_file():
             names = sorted(f.name.removesuffix(".toml") for f in packaged.iterdir() if f.name.endswith(".toml"))
             raise ConfigError(
-                f"run {name_or_path!r}: no packaged run of that name{_nearest(name_or_path, names)}; "
+                f"run {name_or_path!r}: no packaged run of that name{nearest(name_or_path, names)}; "
                 f"there are {', '.join(names)}; a path must end in .toml"
             )
         text = file.read_text(encoding="utf-8")
@@ -242,7 +239,7 @@ def parse(text: str, source: str) -> Run:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{source}: not valid TOML: {error}") from None
-    run = typing.cast(Run, _build(Run, tables, source, ""))
+    run = typing.cast(Run, build(Run, tables, source))
     validate(run, source)
     return run
 
@@ -310,64 +307,3 @@ def validate(run: Run, source: str) -> None:
     }
     for where, value in not_negative.items():
         need(0 <= value < math.inf, where, value, "must not be negative, and be finite")
-
-
-def dumps(run: Run) -> str:
-    """The run as TOML that ``parse`` reads back to an equal value."""
-    lines: list[str] = []
-    tables: list[str] = []
-    for item in dataclasses.fields(run):
-        value = getattr(run, item.name)
-        if dataclasses.is_dataclass(value):
-            rows = [f"{f.name} = {_toml(getattr(value, f.name))}" for f in dataclasses.fields(value)]
-            tables.append("\n".join([f"[{item.name}]", *rows]))
-        else:
-            lines.append(f"{item.name} = {_toml(value)}")
-    return "\n".join(lines) + "\n\n" + "\n\n".join(tables) + "\n"
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return repr(value)
-
-
-def _nearest(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
-
-
-def _build(cls: type, table: dict[str, Any], source: str, prefix: str) -> object:
-    hints = typing.get_type_hints(cls)
-    for key in table:
-        if key not in hints:
-            known = list(hints)
-            raise ConfigError(f"{source}: unknown key {prefix}{key}{_nearest(key, known)}; known keys here: {', '.join(known)}")
-    values = {key: _value(hints[key], value, source, prefix + key) for key, value in table.items()}
-    return cls(**values)
-
-
-def _value(hint: Any, value: Any, source: str, where: str) -> Any:
-    if dataclasses.is_dataclass(hint):
-        if not isinstance(value, dict):
-            raise ConfigError(f"{source}: {where} = {value!r}: expected a table [{where}]")
-        return _build(typing.cast(type, hint), value, source, where + ".")
-    origin = typing.get_origin(hint)
-    if origin is Literal:
-        if value not in typing.get_args(hint):
-            choices = ", ".join(map(repr, typing.get_args(hint)))
-            raise ConfigError(f"{source}: {where} = {value!r}: choose one of {choices}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise ConfigError(f"{source}: {where} = {value!r}: expected a list")
-        return tuple(_value(typing.get_args(hint)[0], v, source, where) for v in value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not hint:
-        raise ConfigError(f"{source}: {where} = {value!r}: expected {hint.__name__}, got {type(value).__name__}")
-    return value

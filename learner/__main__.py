@@ -70,7 +70,7 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
             where.unlink(missing_ok=True)
             service.close()
         report({"event": "finished", **result})
-        service.dismiss()
+        service.desk.dismiss()
     return DONE
 
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-import icrl_dist
 from icrl_dist import context, pretrain
-from icrl_dist.config import Run, dumps
+from icrl_dist.config import Run
 from icrl_dist.envs import tasks
 from icrl_dist.evaluate import label_quality
 from icrl_dist.metrics import Metrics
@@ -22,10 +21,11 @@ from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS, Phase
 from icrl_dist.store import Store, newest_version, version_file
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link, Query
+from icrl_dist.stream.link import Keys, Link
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
 from learner.broadcast import Broadcast
+from learner.desk import Desk
 from learner.inbox import Inbox
 from learner.work import Board
 
@@ -66,10 +66,8 @@ class Service:
         self._lock = threading.Lock()
         self._board = Board(run.stream.lease_s)
         self._stop = threading.Event()
-        self._finished = threading.Event()
         self._changed = threading.Event()
         self._error: BaseException | None = None
-        self.workers: dict[str, bool] = {}
         self._shown = -np.inf
         self._lag = 0
         self.store = Store(folder / "dataset")
@@ -85,9 +83,8 @@ class Service:
             self._stored,
             self.fail,
         )
-        link.serve(self._keys.work, self._work)
+        self.desk = Desk(run, link, self._keys, self._board, self._lock, report, lambda line: self.fail(RunFailed(line)))
         self._taking = False
-        link.watch(self._keys.alive_all, self._watch)
         self._take_up()
 
     # What other threads call.
@@ -114,48 +111,6 @@ class Service:
         self._error = error
         self._changed.set()
 
-    def _watch(self, worker: str, alive: bool) -> None:
-        with self._lock:
-            self.workers[worker] = alive
-            freed = [] if alive else self._board.lost(worker)
-        text = f"worker {worker} joined" if alive else f"worker {worker} is gone"
-        if freed:
-            text += "; its job goes to another: " + ", ".join(job.label for job in freed)
-        self._report({"event": "worker", "worker": worker, "alive": alive, "text": text})
-
-    def _work(self, query: Query) -> None:
-        try:
-            kind, fields = wire.decode_message(query.payload, self._run.stream.max_message_bytes)
-            query.reply(self._answer(kind, fields))
-        except (wire.WireError, KeyError, TypeError, ValueError) as error:
-            query.refuse(f"schema: {error}")
-
-    def _answer(self, kind: str, fields: dict[str, Any]) -> bytes:
-        worker = str(fields["worker"])
-        if kind == "hello":
-            if fields["version"] != icrl_dist.__version__:
-                raise ValueError(f"worker {worker} runs icrl-dist {fields['version']}, the learner {icrl_dist.__version__}")
-            return wire.encode_message("hello", run=dumps(self._run))
-        if kind == "ask":
-            if self._finished.is_set():
-                return wire.encode_message("stop")
-            with self._lock:
-                job = self._board.lease(worker, time.monotonic())
-            return (
-                wire.encode_message("wait", seconds=0.1)
-                if job is None
-                else wire.encode_message("job", job=wire.encode_job(job))
-            )
-        if kind == "failed":
-            stage, round_, task = fields["job"]
-            self._report({"event": "note", "text": f"worker {worker}: job {stage}/{round_}/{task} failed: {fields['error']}"})
-            with self._lock:
-                final = self._board.failed((stage, round_, task), str(fields["error"]))
-            if final:
-                self.fail(RunFailed(final))
-            return wire.encode_message("noted")
-        raise ValueError(f"message kind {kind!r}: expected hello, ask or failed")
-
     # The run, on the caller's thread.
 
     def run(self) -> dict[str, Any]:
@@ -178,16 +133,10 @@ class Service:
                 "threads": self._threads,
                 "instruction_set": torch.backends.cpu.get_cpu_capability(),
             }
-            self._finished.set()
+            self.desk.finish()
             return result
         finally:
             self._metrics.close()
-
-    def dismiss(self, timeout_s: float = 3.0) -> None:
-        """After the end: tell the workers that ask to stop, until none is left or time is up."""
-        deadline = time.monotonic() + timeout_s
-        while any(self.workers.values()) and time.monotonic() < deadline:
-            time.sleep(0.02)
 
     def close(self) -> None:
         """Stop taking in and let go of the files."""
@@ -284,7 +233,7 @@ class Service:
             "steps": total,
             "version": self.version,
             "trajectories": len(self.store),
-            "workers": sum(self.workers.values()),
+            "workers": sum(self.desk.workers.values()),
             "lag": self._lag,
             "drops": dict(self.inbox.drops),
             **values,
