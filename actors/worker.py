@@ -7,32 +7,41 @@ import logging
 import os
 import threading
 import time
-import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import icrl_dist
 from actors.policy import LivePolicy
-from icrl_dist import jobs
-from icrl_dist.config import Run, parse
+from actors.watchdog import Watchdog
+from icrl_dist import crashes, jobs
+from icrl_dist.config import parse
 from icrl_dist.envs import tasks
+from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys, Link, Unanswered
-from icrl_dist.types import Job, Trajectory
+from icrl_dist.stream.link import Keys, Link, LinkError, Refused, Unanswered
+from icrl_dist.types import Identity, Job, Trajectory
 
 _log = logging.getLogger(__name__)
+
+HEARTBEAT_S = 0.5
 
 
 class Worker:
     """One worker on its own link.  Nothing is pushed at it; it holds at most one job."""
 
-    def __init__(self, link: Link, run_name: str, name: str, patience_s: float = 60.0) -> None:
-        """``patience_s``: how long the learner may be away before the worker gives up."""
+    def __init__(self, link: Link, run_name: str, name: str, patience_s: float = 60.0, folder: Path | None = None) -> None:
+        """``patience_s``: how long the learner may be away before the worker gives up.
+
+        ``folder``: the run folder, for a worker that has its process to itself: there it leaves
+        its crash records, and its stacks when it must end because a job outlasts its deadline.
+        """
         self._link, self._keys, self.name, self._patience_s = link, Keys(run_name), name, patience_s
+        self._folder = folder
         self._stop = threading.Event()
         self._episodes = self._steps = 0
-        self._beat = 0.0
+        self._job = ""
 
     def stop(self) -> None:
         """End after the job at hand."""
@@ -41,42 +50,60 @@ class Worker:
     def run(self) -> None:
         """Work until the learner says stop.
 
-        Raises Refused if the learner refuses this worker or its trajectories, Unanswered if
-        the learner is away for longer than ``patience_s``.
+        Raises Refused if the learner refuses this worker, Unanswered if the learner is away for
+        longer than ``patience_s``.
         """
         self._link.announce(self._keys.alive(self.name))
         _, hello = self._ask("hello", version=icrl_dist.__version__, pid=os.getpid())
         run = parse(hello["run"], "the learner's run")
         policy = LivePolicy(self._link, self._keys, tasks.spec(run), run.model, run.stream.max_message_bytes)
-        credit = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
-        with contextlib.closing(credit) as sender:
+        sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
+        watchdog = Watchdog(self._folder, self.name)
+        with contextlib.closing(watchdog), contextlib.closing(sender), self._heartbeat(sender):
             while not self._stop.is_set():
-                kind, fields = self._ask("ask")
+                kind, fields = self._ask("ask", **self._count(sender))
                 if kind == "stop":
                     return
                 if kind == "wait":
-                    self._heartbeat("", sender.resent)
                     self._stop.wait(float(fields["seconds"]))
                 else:
-                    self._do(wire.decode_job(fields["job"]), policy, sender, run)
+                    job = wire.decode_job(fields["job"])
+                    self._do(job, float(fields["deadline_s"]), policy, sender, watchdog, run.stream.lease_s)
 
-    def _do(self, job: Job, policy: LivePolicy, sender: CreditSender, run: Run) -> None:
-        name = job.label
+    def _do(
+        self, job: Job, deadline_s: float, policy: LivePolicy, sender: CreditSender, watchdog: Watchdog, drain_s: float
+    ) -> None:
+        """Do a job, each trajectory within ``deadline_s``; waiting for others does not count."""
+        self._job = job.label
+        made: set[Identity] = set()
         try:
-            for trajectory in jobs.do(job, policy, self.name):
-                sender.send(wire.encode_trajectory(trajectory))
+            work = jobs.do(job, _Waiting(policy, watchdog), self.name)
+            while (trajectory := _next(work, watchdog, deadline_s)) is not None:
+                made.add(trajectory.identity)
                 self._episodes += 1
                 self._steps += len(trajectory.actions)
+                sender.send(wire.encode_trajectory(trajectory))
                 self._show(trajectory)
-                self._heartbeat(name, sender.resent)
-            sender.drain(timeout_s=run.stream.lease_s)
+            sender.drain(timeout_s=drain_s)
         except Unanswered as error:
-            _log.warning("job %s given back: %s", name, error)
+            _log.warning("job %s given back: %s", job.label, error)
         except Exception as error:
-            _log.exception("job %s failed", name)
-            line = traceback.extract_tb(error.__traceback__)[-1]
-            text = f"{type(error).__name__}: {error} ({os.path.basename(line.filename)}:{line.lineno})"  # noqa: PTH119
-            self._ask("failed", job=list(job.name), error=text)
+            _log.exception("job %s failed", job.label)
+            refused = isinstance(error, Refused)  # then the reason names the trajectory
+            under_way = None if refused else next((identity for identity in job.identities() if identity not in made), None)
+            record = crashes.raised(self.name, job, under_way, error)
+            _settle(sender, drain_s)
+            self._ask("failed", job=list(job.name), record=record, file=self._keep(record))
+        finally:
+            self._job = ""
+
+    def _keep(self, record: dict[str, Any]) -> str:
+        """Write the record into the run folder, if that is on this machine; the file's name."""
+        try:
+            return crashes.write(self._folder, record).name if self._folder else ""
+        except OSError as error:
+            _log.warning("the learner is to write this crash record: %s", error)
+            return ""
 
     def _ask(self, kind: str, **fields: object) -> tuple[str, dict[str, Any]]:
         payload = wire.encode_message(kind, worker=self.name, **fields)
@@ -87,12 +114,68 @@ class Worker:
         message = wire.monitor_trajectory(trajectory, time.time())
         self._link.publish(self._keys.monitor(f"trajectory/{self.name}"), message, droppable=True)
 
-    def _heartbeat(self, job: str, resent: int) -> None:
-        if time.monotonic() - self._beat > 0.5:
-            self._beat = time.monotonic()
-            counters: dict[str, Any] = {"episodes": self._episodes, "steps": self._steps, "resent": resent}
-            message = wire.encode_message("worker", worker=self.name, job=job, time=time.time(), **counters)
-            self._link.publish(self._keys.monitor(f"worker/{self.name}"), message, droppable=True)
+    def _count(self, sender: CreditSender) -> dict[str, int]:
+        return {
+            "episodes": self._episodes,
+            "steps": self._steps,
+            "resent": sender.resent,
+            "trajectories": sender.acknowledged,
+        }
+
+    @contextlib.contextmanager
+    def _heartbeat(self, sender: CreditSender) -> Iterator[None]:
+        """Meanwhile tell the monitor plane how it goes, from a thread that is not stuck when the work is."""
+        ended = threading.Event()
+
+        def beat() -> None:
+            key = self._keys.monitor(f"worker/{self.name}")
+            while True:
+                fields = {**self._count(sender), **crashes.memory()}
+                message = wire.encode_message("worker", worker=self.name, job=self._job, time=time.time(), **fields)
+                try:
+                    self._link.publish(key, message, droppable=True)
+                except LinkError as error:
+                    _log.warning("a heartbeat is lost: %s", error)
+                if ended.wait(HEARTBEAT_S):
+                    return
+
+        thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join(5.0)
+
+
+class _Waiting:
+    """The policy as jobs see it: waiting for the weights is no environment's fault."""
+
+    def __init__(self, policy: LivePolicy, watchdog: Watchdog) -> None:
+        self._policy, self._watchdog = policy, watchdog
+
+    def at(self, version: int) -> tuple[PretrainedTransformer, str]:
+        with self._watchdog.paused():
+            return self._policy.at(version)
+
+
+def _next(work: Iterator[Trajectory], watchdog: Watchdog, deadline_s: float) -> Trajectory | None:
+    with watchdog.over(deadline_s):
+        return next(work, None)
+
+
+def _settle(sender: CreditSender, timeout_s: float) -> None:
+    """What the job made until it failed is stored or refused before the next one begins."""
+    while True:
+        try:
+            sender.drain(timeout_s)
+        except Refused as error:
+            _log.warning("refused as well: %s", error)
+        except Unanswered as error:
+            _log.warning("still being sent: %s", error)
+            return
+        else:
+            return
 
 
 def patiently(request: Callable[[], bytes], patience_s: float) -> bytes:

@@ -10,9 +10,9 @@ from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from icrl_dist.config import ConfigError, ContextConfig, parse
+from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
 from icrl_dist.rollout import InContextPolicy, sample
-from icrl_dist.store import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
 from icrl_dist.types import Spec
 
 

@@ -21,7 +21,9 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from icrl_dist.config import ConfigError, Run, load, validate
+from icrl_dist.config import ConfigError, Run, load, override, validate
+from icrl_dist.lineage import parse_source
+from icrl_dist.types import Identity
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -32,16 +34,26 @@ class Train:
 
     RUN is a packaged run (demo, smoke, darkroom) or the path of a TOML file.  Every number of
     the run can be overridden: ``icrl-dist train demo --method icag --adversary.count 4``.
+    ``icrl-dist train --from runs/demo@0 --set adversary.count=16`` goes on from T^0 of another
+    run, with its data and other numbers.
     """
 
-    run: tyro.conf.Positional[str]
-    """Name of a packaged run, or path of a run file."""
+    run: tyro.conf.Positional[str] = ""
+    """Name of a packaged run, or path of a run file; with --from the other run's numbers are
+    taken if it is left out."""
+    source: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """RUN_DIR@ROUND: begin with T^ROUND of another run and the data it was fitted to; both are
+    shared, not copied."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """SECTION.NAME=VALUE, as in adversary.count=16; may be given many times."""
     engine: Literal["ray", "inline"] = "ray"
     """``ray``: a learner process and Ray workers; ``inline``: all in this process, same results."""
     address: str | None = None
     """Address of a Ray cluster to take workers from; without it Ray starts here."""
     actors: int = 2
     """Workers."""
+    oversubscribe: bool = False
+    """Allow more workers than cores: slower, and the same results."""
     out: Path | None = None
     """Run folder; runs/RUN if not given."""
     resume: bool = False
@@ -87,6 +99,9 @@ class Tap:
     """Run folder to listen to; the newest under runs/ if neither this nor --connect is given."""
     connect: str | None = None
     """Endpoint of a learner, such as tcp/127.0.0.1:7447."""
+    certificates: str | None = None
+    """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/; the run's own if
+    not given."""
     count: int = 0
     """End after so many lines; 0 goes on until Ctrl-C."""
     timeout: float = 30.0
@@ -97,13 +112,65 @@ class Tap:
 class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
-    name: tyro.conf.Positional[Literal["env", "stream"]]
+    name: tyro.conf.Positional[Literal["env", "stream", "ingest", "broadcast", "fuzz"]]
     """``env``: environment steps a second; ``stream``: trajectories a second through the stream
-    and, in the same run, as Ray actor returns."""
+    and, in the same run, as Ray actor returns; ``ingest``: trajectories a second onto the disk, with
+    and without fsync; ``broadcast``: weights to eight processes, beside ``ray.put`` and ``get``;
+    ``fuzz``: 100,000 hostile inputs to every reader of bytes."""
     problem: str = "darkroom"
     """Which environment (env only)."""
     seconds: float | None = None
-    """How long to measure."""
+    """How long to measure (env, stream and ingest)."""
+    folder: Path = Path("runs")
+    """Whose disk to write to (ingest), where to keep an input that breaks something (fuzz)."""
+    json: bool = False
+    """Print one JSON object on the last line."""
+
+
+@dataclass(frozen=True)
+class Explain:
+    """Where a training example came from: task, adversary, weights, seed, worker, labels, bytes.
+
+    Without IDENTITY: the whole ledger, a JSON line a trajectory.
+    """
+
+    what: tyro.conf.Positional[Path]
+    """Run folder."""
+    identity: tyro.conf.Positional[str | None] = None
+    """STAGE/ROUND/TASK/VARIATION/TRIAL, such as adapt/0/3/1/7."""
+    rerun: bool = False
+    """Make it once more on this machine and compare every byte."""
+    json: bool = False
+    """Print one JSON object on the last line."""
+
+
+@dataclass(frozen=True)
+class Chaos:
+    """Disturb a small job on a seeded schedule: every digest must equal the undisturbed run's.
+
+    RUN is run once undisturbed, then once for each fault: kill-worker, kill-learner and
+    kill-tree (SIGKILL), stop-learner (SIGSTOP for 15 s), cut-link (12 s of silence), torn-tail
+    and flip-byte (a damaged dataset), full-disk (needs root, or user namespaces).  A fault that
+    did not land, for nothing died, was sent again or was repaired, fails the command as another
+    digest does.  ``icrl-dist chaos smoke`` takes some minutes on two cores.
+    """
+
+    run: tyro.conf.Positional[str] = "smoke"
+    """Name of a packaged run, or path of a run file."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """SECTION.NAME=VALUE, as in icaa.trials=60; may be given many times."""
+    seeds: int = 1
+    """Schedules to run: each strikes elsewhere."""
+    seed: int = 0
+    """The first schedule's seed."""
+    faults: str = ""
+    """Some of the faults, such as kill-worker,torn-tail; all if not given."""
+    actors: int = 2
+    """Workers."""
+    out: Path = Path("runs/chaos")
+    """Where run folders and logs are made; those of faults that changed nothing are removed."""
+    reference: Path | None = None
+    """Folder of a finished run with the same numbers, to compare with instead of running it."""
     json: bool = False
     """Print one JSON object on the last line."""
 
@@ -122,39 +189,53 @@ def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
     from icrl_dist import heldout, launch
+    from icrl_dist.files import atomic_write
     from icrl_dist.terminal import Display
 
-    run = arguments.config
-    validate(run, arguments.run)
-    folder = (arguments.out or Path("runs") / Path(arguments.run).stem).absolute()
+    if not arguments.run and not arguments.source:
+        raise ConfigError("train: name a RUN, such as demo, or another run to go on from with --from RUN_DIR@ROUND")
+    source = parse_source(arguments.source) if arguments.source else None
+    name = Path(arguments.run).stem or f"{source[0].name}-from-{source[1]}" if source else Path(arguments.run).stem
+    run = override(arguments.config, arguments.set, "--set")
+    validate(run, arguments.run or str(arguments.source))
+    folder = (arguments.out or Path("runs") / name).absolute()
     if arguments.actors < 1:
         raise ConfigError(f"--actors {arguments.actors}: at least 1 worker is needed")
-    if arguments.engine == "ray" and arguments.address is None:
+    if arguments.engine == "ray" and arguments.address is None and not arguments.oversubscribe:
         check_cores(arguments.actors)
-    launch.prepare(run, folder, arguments.resume, arguments.overwrite)
+    if arguments.engine == "ray":
+        launch.check_security(run, arguments.address)
+    launch.prepare(run, folder, arguments.resume, arguments.overwrite, source)
     began = time.monotonic()
     try:
         with Display(console) as display:
             if arguments.engine == "inline":
                 result = launch.train_inline(run, folder, display.report)
             else:
-                result = launch.train_ray(run, folder, arguments.actors, arguments.address, display.report)
+                result = launch.train_ray(
+                    run, folder, arguments.actors, arguments.address, display.report, arguments.oversubscribe
+                )
             results = heldout.online(run, folder, display)
     except launch.TrainInterrupted:
-        console.print(f"interrupted; `icrl-dist train {arguments.run} --resume` goes on from the checkpoint", markup=False)
+        given = arguments.run or f"--from {arguments.source}"
+        console.print(f"interrupted; `icrl-dist train {given} --resume` goes on from the checkpoint", markup=False)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
     result |= heldout.show_online(run, folder, results, console)
-    (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+    atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
         f"trajectories, {result['seconds']:.0f} s, run folder {folder}",
         highlight=False,
         markup=False,
     )
+    if result["staleness"]:
+        console.print(f"asynchronous: trajectories by versions behind: {result['lag']}; digests differ from run to run")
+    for given_up in result["quarantined"]:
+        console.print(f"quarantined: {given_up['variation']}: {given_up['cause']}", highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))
-    return OK
+    return FAILED if result["quarantined"] else OK
 
 
 def evaluate(arguments: Evaluate, console: Console) -> int:
@@ -162,7 +243,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     from icrl_dist import heldout
     from icrl_dist.agent import checkpoint_file
     from icrl_dist.config import parse
-    from icrl_dist.store import load_checkpoint
+    from icrl_dist.files import load_checkpoint
     from icrl_dist.terminal import Display
 
     checkpoint = load_checkpoint(checkpoint_file(arguments.what))
@@ -185,10 +266,10 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
 
 def tap(arguments: Tap, console: Console) -> int:
     """``icrl-dist tap``: a JSON line a trajectory."""
-    from icrl_dist.stream import wire
+    from icrl_dist.stream import security, wire
     from icrl_dist.stream.zenoh_link import ZenohLink
 
-    endpoint = arguments.connect or _endpoint(arguments.what)
+    endpoint, certificates = _learner(arguments.what, arguments.connect, arguments.certificates)
     left = [arguments.count]
     over = threading.Event()
 
@@ -203,34 +284,91 @@ def tap(arguments: Tap, console: Console) -> int:
 
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: over.set())
-    with ZenohLink.connect(endpoint, timeout_s=arguments.timeout) as link:
+    with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
         link.subscribe("icrl/*/mon/trajectory/**", show)
         over.wait()
     return OK
 
 
-def _endpoint(what: Path | None) -> str:
+def _learner(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str]:
+    """Where the learner is reached that a run folder or ``--connect`` means, and the certificates to show it."""
+    if connect:
+        if not certificates and connect.startswith("tls/"):
+            raise ConfigError(
+                f"--connect {connect}: TLS needs --certificates, a folder with ca.pem, monitor.pem and monitor.key"
+            )
+        return connect, certificates or ""
     files = [what / "endpoint"] if what else sorted(Path("runs").glob("*/endpoint"), key=lambda f: f.stat().st_mtime)
     if not files or not files[-1].is_file():
         raise ConfigError(
             f"no run is on in {what or 'runs/'}: start one with `icrl-dist train`, or name it with --connect tcp/HOST:PORT"
         )
-    return files[-1].read_text().strip()
+    stream = load(str(files[-1].with_name("run.toml"))).stream
+    return stream.connect or files[-1].read_text().strip(), certificates or stream.certificates
 
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import env, stream
+    from icrl_dist.bench import broadcast, env, fuzz, ingest, stream
 
+    if arguments.seconds is not None and arguments.name in ("broadcast", "fuzz"):
+        raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
-    if arguments.name == "env":
-        result, text = (r := env.run(arguments.problem, **timed)), env.describe(r)
-    else:
-        result, text = (r := stream.run(**timed)), stream.describe(r)
+    match arguments.name:
+        case "env":
+            result, text = (r := env.run(arguments.problem, **timed)), env.describe(r)
+        case "stream":
+            result, text = (r := stream.run(**timed)), stream.describe(r)
+        case "ingest":
+            result, text = (r := ingest.run(arguments.folder, **timed)), ingest.describe(r)
+        case "broadcast":
+            result, text = (r := broadcast.run()), broadcast.describe(r)
+        case "fuzz":
+            result, text = (r := fuzz.run(folder=arguments.folder)), fuzz.describe(r)
     console.print(text, highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))
-    return OK
+    return OK if result.get("ok", True) else FAILED
+
+
+def explain(arguments: Explain, console: Console) -> int:
+    """``icrl-dist explain``: one trajectory's origin, or the whole ledger."""
+    from icrl_dist import explain as explaining
+
+    if arguments.identity is None:
+        for line in explaining.ledger(arguments.what):
+            print(json.dumps(line))
+        return OK
+    try:
+        identity = Identity.parse(arguments.identity)
+    except ValueError as error:
+        raise ConfigError(f"explain: {error}") from None
+    answer = explaining.explain(arguments.what, identity, arguments.rerun)
+    console.print(explaining.describe(answer), highlight=False, markup=False)
+    if arguments.json:
+        print(json.dumps(answer))
+    sound = answer["intact"] and answer.get("weights_intact", True) and answer.get("rerun_equal", True)
+    return OK if sound else FAILED
+
+
+def chaos(arguments: Chaos, console: Console) -> int:
+    """``icrl-dist chaos``: exit code 1 if a fault did not land or changed a digest."""
+    from icrl_dist.chaos.campaign import Campaign
+    from icrl_dist.chaos.training import Broken
+    from icrl_dist.launch import TrainFailed
+
+    given = arguments
+    if given.seeds < 1 or given.actors < 1:
+        raise ConfigError(f"--seeds {given.seeds} --actors {given.actors}: at least 1 of each is needed")
+    seeds = range(given.seed, given.seed + given.seeds)
+    with Campaign(given.run, given.set, given.actors, given.out, console) as campaign:
+        try:
+            answer = campaign.run(given.faults, seeds, given.reference)
+        except Broken as error:
+            raise TrainFailed(f"undisturbed: {error}") from None
+    if given.json:
+        print(json.dumps(answer))
+    return OK if answer["ok"] else FAILED
 
 
 def doctor(arguments: Doctor, console: Console) -> int:
@@ -247,6 +385,8 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "evaluate": (Evaluate, evaluate),
     "tap": (Tap, tap),
     "bench": (Bench, bench),
+    "explain": (Explain, explain),
+    "chaos": (Chaos, chaos),
     "doctor": (Doctor, doctor),
 }
 
@@ -258,14 +398,13 @@ def _help() -> str:
 
 
 def _parse(name: str, arguments: Sequence[str]) -> Any:
-    kind = COMMANDS[name][0]
-    default: Any = None
-    if kind is Train:
-        words = [a for a in arguments if not a.startswith("-")]
-        named = next((w for w in words if w.endswith(".toml")), words[0] if words else None)
-        if named is not None and not {"--help", "-h"} & set(arguments):
-            default = Train(run=named, config=load(named))
-    return tyro.cli(kind, prog=f"icrl-dist {name}", args=list(arguments), **({"default": default} if default else {}))
+    kind, prog = COMMANDS[name][0], f"icrl-dist {name}"
+    found: Any = tyro.cli(kind, prog=prog, args=list(arguments))
+    if isinstance(found, Train) and (found.run or found.source):
+        # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
+        base = load(found.run or str(parse_source(found.source or "")[0] / "run.toml"))
+        return tyro.cli(kind, prog=prog, args=list(arguments), default=Train(run=found.run, config=base))
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -290,16 +429,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:
-        code = _code(error)
+        from icrl_dist.files import explained
+
+        told = explained(error)
+        code = _code(told)
         if code is None:
             raise
-        print(f"icrl-dist: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"icrl-dist: {' '.join(str(told).split())}", file=sys.stderr)
         return code
 
 
 def _code(error: Exception) -> int | None:
     """The exit code of an error that its message explains; None for a bug, which keeps its trace."""
-    from icrl_dist.store import StoreError
+    from icrl_dist.files import StoreError
     from icrl_dist.stream.link import LinkError, Unanswered
 
     if isinstance(error, (ConfigError, LinkError)):

@@ -8,17 +8,18 @@ they need many.
 
 from __future__ import annotations
 
-import math
 import tomllib
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from icrl_dist.limits import validate
 from icrl_dist.tables import ConfigError, build, dumps, nearest
 
-__all__ = ["ConfigError", "Run", "dumps", "load", "parse", "validate"]
+__all__ = ["ConfigError", "Run", "dumps", "load", "override", "parse", "validate"]
 
 METHOD_NAMES = ("dpt", "icag", "icaa")
 
@@ -161,6 +162,12 @@ class StreamConfig:
 
     endpoint: str = "tcp/127.0.0.1:0"
     """Where the learner listens; port 0 takes a free one.  Loopback unless you change it."""
+    connect: str = ""
+    """Where workers and monitors reach the learner, if not where it listens: a proxy, a NAT, a
+    port forward."""
+    certificates: str = ""
+    """Folder with ca.pem, and ROLE.pem and ROLE.key for each role that this machine plays
+    (learner, worker, monitor); needed to listen anywhere but on this machine."""
     job_tasks: int = 4
     """Tasks a job: their variations are stepped as one batch.  Larger batches decide faster,
     smaller ones spread better over workers; the digests depend on it."""
@@ -169,9 +176,12 @@ class StreamConfig:
     reply_timeout_s: float = 10.0
     """A trajectory without a reply for so long is sent again."""
     lease_s: float = 60.0
-    """A job not finished within so long goes to another worker."""
+    """The longest that a job's next trajectory may take; shorter once it has been measured."""
     max_message_bytes: int = 16 << 20
     """A larger message is refused."""
+    staleness: int = 0
+    """Rounds that collecting may run ahead of the fits: jobs may name weights up to so many
+    versions old (asynchronous mode).  Above 0, digests differ from run to run."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +192,10 @@ class LearnerConfig:
     """Threads of a fit; 0 takes every core, for the workers wait meanwhile.  The weights
     digest depends on it, so it is recorded."""
     restarts: int = 3
-    """Restarts of the learner, and of each worker, before the run gives up."""
+    """Restarts of the learner, and of each worker in a row without progress, before the run
+    gives up."""
+    cache_mb: int = 1024
+    """Megabytes of the dataset that a fit keeps in memory; the rest is read when it is drawn."""
     device: str = "auto"
     """``auto`` takes a GPU where there is one; ``cpu`` or ``cuda`` decide."""
 
@@ -237,73 +250,34 @@ def parse(text: str, source: str) -> Run:
     """The run that TOML ``text`` describes.  Raises ConfigError naming ``source`` and the key."""
     try:
         tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also a number or a nesting beyond Python's limits
         raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    return _from_tables(tables, source)
+
+
+def _from_tables(tables: dict[str, Any], source: str) -> Run:
+    """The run that TOML tables describe.  Raises ConfigError naming ``source`` and the key."""
     run = typing.cast(Run, build(Run, tables, source))
     validate(run, source)
     return run
 
 
-def validate(run: Run, source: str) -> None:
-    """Raises ConfigError for values that are well typed but impossible."""
+def override(run: Run, settings: Sequence[str], source: str) -> Run:
+    """The run with ``settings`` such as ``adversary.count=16`` in place; text needs no quotes.
 
-    def need(condition: bool, where: str, value: object, remedy: str) -> None:
-        if not condition:
-            raise ConfigError(f"{source}: {where} = {value!r}: {remedy}")
-
-    room, icaa, optim = run.darkroom, run.icaa, run.optim
-    need(room.size >= 2, "darkroom.size", room.size, "a room has at least 2 cells a side")
-    need(room.horizon >= 1, "darkroom.horizon", room.horizon, "an episode has at least 1 step")
-    need(0 < room.train_fraction < 1, "darkroom.train_fraction", room.train_fraction, "use a share between 0 and 1")
-    need(0 < room.gamma <= 1, "darkroom.gamma", room.gamma, "a discount lies in (0, 1]")
-    train = round(room.train_fraction * room.size**2)
-    need(0 < train < room.size**2, "darkroom.train_fraction", room.train_fraction, "leave goals to train and to test")
-    need(0 <= run.adversary.p_max <= 1, "adversary.p_max", run.adversary.p_max, "a probability lies in [0, 1]")
-    need(run.adversary.count >= 1, "adversary.count", run.adversary.count, "at least 1, the null adversary")
-    need(run.seed >= 0, "seed", run.seed, "seeds are not negative")
-    for p in run.evaluate.p:
-        need(0 <= p <= 1, "evaluate.p", p, "a probability lies in [0, 1]")
-    need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
-    need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
-    need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
-    need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
-    need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
-    need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
-    need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
-    need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
-    need(run.context.max >= room.horizon, "context.max", run.context.max, "must hold at least one episode")
-    need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
-    need(run.learner.device in ("auto", "cpu", "cuda"), "learner.device", run.learner.device, "use auto, cpu or cuda")
-    positive = {
-        "pretrain.queries": run.pretrain.queries,
-        "pretrain.steps": run.pretrain.steps,
-        "icaa.steps": icaa.steps,
-        "model.layers": run.model.layers,
-        "model.width": run.model.width,
-        "optim.learning_rate": optim.learning_rate,
-        "icaa.learning_rate": icaa.learning_rate,
-        "optim.batch": optim.batch,
-        "optim.queries": optim.queries,
-        "optim.episodes": optim.episodes,
-        "optim.clip": optim.clip,
-        "evaluate.episodes": run.evaluate.episodes,
-        "evaluate.seeds": run.evaluate.seeds,
-        "stream.credits": run.stream.credits,
-        "stream.job_tasks": run.stream.job_tasks,
-        "stream.lease_s": run.stream.lease_s,
-        "stream.reply_timeout_s": run.stream.reply_timeout_s,
-        "stream.max_message_bytes": run.stream.max_message_bytes,
-    }
-    for where, value in positive.items():
-        need(0 < value < math.inf, where, value, "must be above 0 and finite")
-    not_negative = {
-        "darkroom.split_seed": room.split_seed,
-        "darkroom.label_slack": room.label_slack,
-        "model.fourier": run.model.fourier,
-        "optim.weight_decay": optim.weight_decay,
-        "optim.warmup": optim.warmup,
-        "learner.threads": run.learner.threads,
-        "learner.restarts": run.learner.restarts,
-    }
-    for where, value in not_negative.items():
-        need(0 <= value < math.inf, where, value, "must not be negative, and be finite")
+    Raises ConfigError for a setting that is none, or that the run cannot have.
+    """
+    tables = tomllib.loads(dumps(run))
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        *path, key = name.strip().split(".")
+        if not equals or len(path) > 1:
+            raise ConfigError(f"{source} {setting}: write SECTION.NAME=VALUE, as in adversary.count=16")
+        table = tables.setdefault(path[0], {}) if path else tables
+        try:
+            table[key] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            table[key] = value.strip()
+        except TypeError:
+            raise ConfigError(f"{source} {setting}: {path[0]} is not a section") from None
+    return _from_tables(tables, source)

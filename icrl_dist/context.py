@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
 from icrl_dist.types import Trajectory
+
+K = TypeVar("K", bound=Hashable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,55 @@ class Examples:
             history,
         )
 
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in (self.actions, self.observations, self.rewards, self.queries, self.labels))
+
+
+class Shelf(Generic[K]):
+    """Examples that are read when they are needed; the last used stay in memory, up to ``budget`` bytes."""
+
+    def __init__(self, budget: int, read: Callable[[K], Examples]) -> None:
+        self._budget, self._read = budget, read
+        self._kept: OrderedDict[K, Examples] = OrderedDict()
+        self.nbytes = 0
+
+    def put(self, key: K, examples: Examples) -> None:
+        """Keep what was read anyway, as long as there is room."""
+        self._kept[key] = examples
+        self.nbytes += examples.nbytes
+        while self.nbytes > self._budget and len(self._kept) > 1:
+            _, oldest = self._kept.popitem(last=False)
+            self.nbytes -= oldest.nbytes
+
+    def get(self, key: K) -> Examples:
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        else:
+            self.put(key, self._read(key))
+        return self._kept[key]
+
+
+class Shelved(Sequence[Examples], Generic[K]):
+    """A row of examples on a shelf."""
+
+    def __init__(self, shelf: Shelf[K], keys: Sequence[K]) -> None:
+        self._shelf, self._keys = shelf, keys
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @overload
+    def __getitem__(self, index: int) -> Examples: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Shelved[K]: ...
+
+    def __getitem__(self, index: int | slice) -> Examples | Shelved[K]:
+        if isinstance(index, slice):
+            return Shelved(self._shelf, self._keys[index])
+        return self._shelf.get(self._keys[index])
+
 
 @dataclass(frozen=True)
 class Pool:
@@ -84,7 +137,7 @@ def draw(rng: np.random.Generator, pools: Sequence[Pool], batch: int, queries: i
     count = int(rng.integers(1, episodes + 1))
     shares = np.array([pool.share for pool in pools])
     chosen = [pools[i].examples for i in rng.choice(len(pools), size=batch, p=shares / shares.sum())]
-    rows = [_context(rng, examples[rng.integers(0, len(examples))], count, queries) for examples in chosen]
+    rows = [_context(rng, examples[int(rng.integers(0, len(examples)))], count, queries) for examples in chosen]
     length = max(len(r[1]) for r in rows)
 
     def padded(column: int) -> np.ndarray:

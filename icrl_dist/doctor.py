@@ -18,6 +18,8 @@ import psutil
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from icrl_dist.config import ConfigError
+
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
 GIB = 1 << 30
 
@@ -187,6 +189,20 @@ def _ray_token() -> Finding:
     except OSError:
         ok = False
     return Finding("Ray token", ok, f"in {file}" if ok else f"none in {file}", "" if ok else "ray get-auth-token --generate")
+
+
+def need_ray_token(address: str) -> None:
+    """Raises ConfigError unless this process shows the Ray cluster at ``address`` a token.
+
+    Ray turns that on by itself only for clusters that it starts; an address given never does.
+    """
+    finding = _ray_token()
+    if os.environ.get("RAY_AUTH_MODE") != "token" or not finding.ok:
+        raise ConfigError(
+            f"--address {address}: without a token anyone who reaches Ray's ports can run code there "
+            f"(Ray token: {finding.value}); make one with `ray get-auth-token --generate`, copy it to every node, "
+            "and set RAY_AUTH_MODE=token there and here"
+        )
 
 
 def _gpu() -> Finding:

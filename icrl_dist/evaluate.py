@@ -15,7 +15,7 @@ from icrl_dist.envs import tasks
 from icrl_dist.envs.darkroom import ACTIONS
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, OptimalAgent, cell_numbers, optimal_returns, soft_labels
-from icrl_dist.recipes import Dataset, Phase, by_variation, self_labelled
+from icrl_dist.recipes import Dataset, Phase, self_labelled
 from icrl_dist.rollout import InContextPolicy, Policy, RandomPolicy, deploy_offline, deploy_online, episode
 from icrl_dist.stats import mean_and_error
 from icrl_dist.types import Identity, Variation
@@ -137,7 +137,7 @@ def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
     if phase.stage != "adapt":
         return {}
     agreement, early, late, best = [], [], [], []
-    for trials in by_variation(data.select(phase.stage, phase.round)):
+    for trials in map(data.trials, data.variations(phase.stage, phase.round)):
         hypotheses = Hypotheses.of([trials[0].variation])
         truth = soft_labels(hypotheses, run.darkroom.gamma, run.darkroom.label_slack)[0]
         own = self_labelled(run, trials)

@@ -11,8 +11,8 @@ from rich.console import Console
 from icrl_dist import evaluate, plots
 from icrl_dist.agent import checkpoint_file, model_of
 from icrl_dist.config import Run
+from icrl_dist.files import atomic_write, load_checkpoint
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.store import atomic_write, load_checkpoint
 from icrl_dist.terminal import Display, returns_table
 
 

@@ -22,7 +22,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from icrl_dist import endpoints
 from icrl_dist.config import ConfigError, Run, dumps, load
+from icrl_dist.doctor import need_ray_token
+from icrl_dist.files import atomic_write
+from icrl_dist.lineage import fork
+from icrl_dist.stream import security
 from icrl_dist.stream.link import Keys
 
 Report = Callable[[dict[str, Any]], None]
@@ -36,8 +41,8 @@ class TrainInterrupted(Exception):  # noqa: N818
     """The run was interrupted; a checkpoint has been written."""
 
 
-def prepare(run: Run, folder: Path, resume: bool, overwrite: bool) -> None:
-    """Make the run folder: ``run.toml`` and ``env.json``.
+def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> None:
+    """Make the run folder: ``run.toml``, ``env.json``, and with ``source`` what another run's version stands on.
 
     Raises ConfigError if the folder exists and is neither to be resumed nor overwritten, or
     is to be resumed with other numbers.
@@ -57,10 +62,21 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool) -> None:
         raise ConfigError(f"--resume: {file} has other numbers than asked for; resume with the run's own, or use another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file.write_text(dumps(run))
-        (folder / "env.json").write_text(json.dumps(environment(), indent=1) + "\n")
+        if source is not None and not resume:
+            fork(*source, run, folder)
+        if not resume:
+            file.write_text(dumps(run))
+        atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+def check_security(run: Run, address: str | None) -> None:
+    """Raises LinkError or ConfigError for certificates, or a token of Ray's, that would be missed later."""
+    for role in ("learner",) if address else ("learner", "worker"):
+        security.files(run.stream.certificates, role)
+    if address and not endpoints.parse(run.stream.endpoint).loopback:
+        need_ray_token(address)
 
 
 def environment() -> dict[str, Any]:
@@ -109,40 +125,48 @@ def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
                 service.close()
 
 
-def train_ray(run: Run, folder: Path, actors: int, address: str | None, report: Report) -> dict[str, Any]:
+def train_ray(
+    run: Run, folder: Path, actors: int, address: str | None, report: Report, oversubscribe: bool = False
+) -> dict[str, Any]:
     """The whole run with a learner process and Ray workers; returns the learner's result.
 
     Raises ConfigError, TrainFailed or TrainInterrupted; no process is left behind.
     """
     from actors.fleet import Fleet, FleetFailed
 
+    certificates = security.folder(run.stream.certificates)  # in full: workers have a working directory of their own
     interrupted = threading.Event()
     with contextlib.ExitStack() as stack:
         stack.enter_context(_on_signals(interrupted.set))
         learner = _Learner(folder, run.stream.endpoint, run.learner.restarts)
         stack.callback(learner.end)
-        fleet = Fleet(actors, run.learner.restarts, address)
+        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe)
         stack.callback(fleet.close)
         stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
         result: dict[str, Any] | None = None
         started = False
+        stored = given_up = 0
         while True:
             for event in learner.events():
                 report(event)
                 if event["event"] == "listening" and not started:
-                    fleet.start(learner.endpoint, folder.name)
+                    fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
+                elif event["event"] == "progress":
+                    stored = event["trajectories"]
+                elif event["event"] == "quarantine":
+                    given_up += 1
                 elif event["event"] == "finished":
                     result = {name: value for name, value in event.items() if name != "event"}
             if interrupted.is_set():
                 learner.interrupt(report)
                 raise TrainInterrupted
             if result is not None:
-                return result
+                return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
             learner.watch(report)
             if started:
                 try:
-                    working = fleet.watch(lambda text: report({"event": "note", "text": text}))
+                    working = fleet.watch(lambda text: report({"event": "note", "text": text}), stored + given_up)
                 except FleetFailed as error:
                     raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
                 if not working:
@@ -157,6 +181,8 @@ class _Learner:
         self._queue: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._error = ""
         self._finished = False
+        self.deaths = 0
+        """Times that it was killed and started again."""
         self._start()
 
     def _start(self) -> None:
@@ -207,6 +233,7 @@ class _Learner:
         if self._budget == 0:
             raise TrainFailed(f"the learner died too often (exit code {code}); its last words are in {self._log.name}")
         self._budget -= 1
+        self.deaths += 1
         report({"event": "note", "text": f"the learner died (exit code {code}); starting it again from its checkpoint"})
         self._log.close()
         self._start()

@@ -7,15 +7,14 @@ the trajectories.  The phase after which T^j exists produces weights version j.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Protocol
 
 import numpy as np
 
 from icrl_dist.config import Run
-from icrl_dist.context import Examples, Pool
+from icrl_dist.context import Examples, Pool, Shelf, Shelved
 from icrl_dist.envs import tasks
 from icrl_dist.types import Job, Params, Task, Trajectory, Variation
 
@@ -42,11 +41,19 @@ class Phase:
         return self.acting + 1
 
 
+Key = tuple[str, int, int, int]
+"""A variation's place in the dataset: stage, round, task, variation."""
+
+
 class Dataset(Protocol):
     """The trajectories collected so far."""
 
-    def select(self, stage: str, round: int) -> Iterator[Trajectory]:
-        """One stage and round, in canonical order."""
+    def variations(self, stage: str, round: int) -> Sequence[Key]:
+        """Those of one stage and round, in canonical order."""
+        ...
+
+    def trials(self, key: Key) -> list[Trajectory]:
+        """The trajectories of one variation, in order of trial."""
         ...
 
 
@@ -93,19 +100,22 @@ def _jobs(
     return tuple(jobs)
 
 
-def _labelled(trajectories: Iterable[Trajectory]) -> tuple[Examples, ...]:
-    """One Examples a variation: all its episodes, all its labelled queries."""
-    made = []
-    for episodes in by_variation(trajectories):
-        queries, labels = (np.concatenate([getattr(t, name) for t in episodes]) for name in ("queries", "labels"))
-        made.append(Examples.of(episodes, queries, labels))
-    return tuple(made)
+def _labelled(trials: Sequence[Trajectory]) -> Examples:
+    """A variation's episodes with the queries that were labelled when they were collected."""
+    queries, labels = (np.concatenate([getattr(t, name) for t in trials]) for name in ("queries", "labels"))
+    return Examples.of(trials, queries, labels)
 
 
-def by_variation(trajectories: Iterable[Trajectory]) -> Iterator[list[Trajectory]]:
-    """The trajectories of each variation, in order of trial."""
-    for _, group in groupby(trajectories, key=lambda t: t.identity[:4]):
-        yield list(group)
+def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
+    """Every variation's examples, read from the dataset when a batch needs them."""
+
+    def read(key: Key) -> Examples:
+        trials = data.trials(key)
+        examples = self_labelled(run, trials) if key[0] == "adapt" else _labelled(trials)
+        assert examples is not None, "only variations that give labels are asked for"
+        return examples
+
+    return Shelf(run.learner.cache_mb << 20, read)
 
 
 # DPT (section 2): tasks without disturbance, labels from each task's optimal policy.
@@ -116,7 +126,7 @@ def _dpt_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
 
 
 def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
-    return (Pool(1.0, _labelled(data.select("pretrain", 0))),)
+    return (Pool(1.0, Shelved(_shelf(run, data), data.variations("pretrain", 0))),)
 
 
 # ICAG (section 4.1, Algorithm 2): K variations of every task, labels from each variation's
@@ -149,15 +159,19 @@ def _icaa_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
 
 def _icaa_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
     """Lines 13 to 19: contexts from the first trials, labels from later ones, D_pre the union."""
-    pretrain = _pretrain_learn(run, phase, data)
-    if phase.stage == "pretrain":
-        return pretrain
-    groups = (group for j in range(phase.round + 1) for group in by_variation(data.select("adapt", j)))
-    own = [examples for group in groups if (examples := self_labelled(run, group)) is not None]
-    if not own:
-        return pretrain
+    shelf = _shelf(run, data)
+    pretrain = Shelved(shelf, data.variations("pretrain", 0))
+    labelling: list[Key] = []
+    if phase.stage == "adapt":
+        for key in (key for j in range(phase.round + 1) for key in data.variations("adapt", j)):
+            examples = self_labelled(run, data.trials(key))
+            if examples is not None:
+                labelling.append(key)
+                shelf.put(key, examples)
+    if not labelling:
+        return (Pool(1.0, pretrain),)
     share = run.icaa.new_fraction
-    return (Pool(1 - share, pretrain[0].examples), Pool(share, own))
+    return (Pool(1 - share, pretrain), Pool(share, Shelved(shelf, labelling)))
 
 
 def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:

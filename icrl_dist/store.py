@@ -1,7 +1,5 @@
-"""What a run leaves on disk: append-only trajectory segments and atomic checkpoints.
+"""A run's dataset: append-only segments on disk, mended when they are opened, and their ledger.
 
-A segment is a row of frames ``length, checksum, payload``, where a payload is the wire's own
-encoding of a trajectory.  The index is derived from the segments each time they are opened.
 Nothing here is pickled, so opening a stranger's run executes none of their code.
 """
 
@@ -9,218 +7,228 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
-import json
 import os
-import struct
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import threading
+from collections.abc import Iterator, Sequence
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import numpy as np
-
-from icrl_dist.stream import wire
+from icrl_dist import segment
+from icrl_dist.files import StoreError, atomic_write, sync_folder, unwritten
+from icrl_dist.ledger import Ledger, Row
 from icrl_dist.types import Identity, Trajectory
 
-_HEADER = struct.Struct("<II")
 _PATTERN = "segment-*.frames"
 
 
-class StoreError(RuntimeError):
-    """A run folder that cannot be used as asked: which file, what is wrong, the remedy."""
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """Where a trajectory lies, and the digest of what it holds."""
-
-    segment: Path
-    offset: int
-    length: int
-    digest: str
+class Damaged(StoreError):  # noqa: N818
+    """Bytes that changed after they were written; ``Store.repair`` takes them out."""
 
 
 class Store:
-    """A run's dataset: appended to by one process, durable when ``append`` returns."""
+    """A run's dataset: appended to by one process, durable when ``append`` returns.
 
-    def __init__(self, folder: Path, seal_bytes: int = 256 << 20, limit: int = 64 << 20) -> None:
-        """Opens ``folder``, reads its index, and cuts off a tail that a crash tore.
+    Opened to be written, it mends what a crash or a disk did to it; ``repaired`` says what.
+    """
 
-        ``repaired`` names what was cut.  Raises StoreError if a frame before the tail is
-        damaged.
+    def __init__(self, folder: Path, seal_bytes: int = 256 << 20, durable: bool = True, readonly: bool = False) -> None:
+        """``readonly`` changes nothing on disk; ``durable=False`` leaves the fsync out, to measure its cost.
+
+        Raises StoreError for files that are not of this system, or that cannot be written.
         """
-        folder.mkdir(parents=True, exist_ok=True)
-        self.folder, self._seal_bytes, self._limit = folder, seal_bytes, limit
-        self.index: dict[Identity, Entry] = {}
+        self.folder, self._seal_bytes, self._durable, self._readonly = folder, seal_bytes, durable, readonly
+        self._lock = threading.RLock()
+        self._open()
+
+    def _open(self) -> None:
+        if not self._readonly:
+            self.folder.mkdir(parents=True, exist_ok=True)
         self.repaired: list[str] = []
-        segments = sorted(folder.glob(_PATTERN))
-        for segment in segments:
-            self._scan(segment, last=segment == segments[-1])
-        self._count = len(segments)
-        self._file: BinaryIO | None = segments[-1].open("ab") if segments else None
+        self.ledger = Ledger()
+        self._names: dict[int, segment.Names] = {}
+        self._sealed: dict[int, str] = {}
+        self._readers: dict[int, int] = {}
+        self._file: FileIO | None = None
+        self._hash = hashlib.sha256()
+        paths = sorted(self.folder.glob(_PATTERN))
+        for path in paths:
+            self._take_up(path, last=path == paths[-1])
+        self._count = max(self._names, default=-1) + 1
+        last = self._path(self._count - 1)
+        if not self._readonly and self._count and self._count - 1 not in self._sealed:
+            self._file = last.open("ab", buffering=0)
+            self._hash = hashlib.sha256(last.read_bytes())
 
-    def __contains__(self, identity: Identity) -> bool:
-        return identity in self.index
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def append(self, items: Sequence[tuple[Trajectory, bytes]]) -> None:
-        """Append trajectories with their wire bytes; all are durable on return (one fsync).
-
-        Whoever acknowledges a trajectory to its sender calls this first.
-        """
-        if not items:
-            return
-        if self._file is None or self._file.tell() >= self._seal_bytes:
-            self._roll()
-        assert self._file is not None
-        offset = self._file.tell()
-        entries: dict[Identity, Entry] = {}
-        frames = io.BytesIO()
-        segment = Path(self._file.name)
-        for trajectory, payload in items:
-            frames.write(_HEADER.pack(len(payload), zlib.crc32(payload)))
-            at = offset + frames.tell()
-            entries[trajectory.identity] = Entry(segment, at, len(payload), wire.trajectory_digest(trajectory))
-            frames.write(payload)
+    def _take_up(self, path: Path, last: bool) -> None:
+        """Check a segment, mend it, and enter its trajectories into the ledger."""
         try:
-            self._file.write(frames.getbuffer())
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                self._file.truncate(offset)
-            raise StoreError(f"{segment}: could not be written ({error.strerror}): free space, then use --resume") from error
-        self.index.update(entries)
+            number = int(path.stem.removeprefix("segment-"))
+            found = segment.scan(path)
+            if found.damaged and not self._readonly:
+                torn = last and not found.sealed and [end for _, end in found.damaged] == [found.size]
+                for start, end in found.damaged:
+                    what = "cut a torn tail of" if torn else "took out a damaged range of"
+                    self.repaired.append(f"{path.name}: {what} {end - start} bytes at byte {start}")
+                found = self._mend(path, found, sealed=not last)
+            nameless = self._enter(path, number, found)
+            if nameless and not self._readonly:
+                self.repaired.append(f"{path.name}: took out {len(nameless)} trajectories whose names were damaged")
+                found = self._mend(path, found.without(nameless), sealed=not last)
+        except (ValueError, OSError) as error:
+            raise StoreError(
+                f"{path}: not a dataset of this version of icrl-dist ({error}): restore it, or begin anew"
+            ) from None
+        self._names[number] = found.names
+        if found.sealed:
+            self._sealed[number] = found.sealed
 
-    def read(self, identity: Identity) -> Trajectory:
-        """The trajectory of this identity.  Raises KeyError if there is none."""
-        entry = self.index[identity]
-        with entry.segment.open("rb") as file:
-            file.seek(entry.offset)
-            return wire.decode_trajectory(file.read(entry.length), self._limit)
+    def _mend(self, path: Path, found: segment.Scan, sealed: bool) -> segment.Scan:
+        atomic_write(path, lambda file: segment.copy(path, found.whole, file, sealed))
+        return segment.scan(path)
 
-    def select(self, stage: str, round: int) -> Iterator[Trajectory]:
-        """The trajectories of one stage and round in canonical order, whatever order they came in."""
-        chosen = sorted((i for i in self.index if i.stage == stage and i.round == round), key=Identity.key)
-        files: dict[Path, BinaryIO] = {}
-        with contextlib.ExitStack() as stack:
-            for identity in chosen:
-                entry = self.index[identity]
-                file = files.get(entry.segment) or files.setdefault(
-                    entry.segment, stack.enter_context(entry.segment.open("rb"))
-                )
-                file.seek(entry.offset)
-                yield wire.decode_trajectory(file.read(entry.length), self._limit)
+    def _enter(self, path: Path, number: int, found: segment.Scan) -> list[tuple[int, int]]:
+        """Enter a segment's trajectories; returns the frames that refer to names which are lost."""
+        nameless: list[tuple[int, int]] = []
 
-    def digest(self) -> str:
-        """One digest of the whole dataset: every array and label byte, in canonical order.
+        def rows() -> Iterator[Row]:
+            with path.open("rb") as file:
+                for offset, length in found.frames:
+                    file.seek(offset)
+                    try:
+                        yield Row.of(segment.decode(file.read(length), found.names), number, offset, length)
+                    except segment.MissingName:
+                        nameless.append((offset, length))
 
-        Equal for any number of workers, whatever died on the way.
+        self.ledger.enter(rows())
+        return nameless
+
+    def append(self, trajectories: Sequence[Trajectory]) -> None:
+        """Append trajectories; all are durable on return (one fsync).
+
+        Whoever acknowledges a trajectory to its sender calls this first.  Raises StoreError, and
+        keeps none of them, if they could not be written.
         """
-        total = hashlib.sha256()
-        for identity in sorted(self.index, key=Identity.key):
-            total.update(self.index[identity].digest.encode())
-        return total.hexdigest()
+        if not trajectories:
+            return
+        with self._lock:
+            if self._file is None or self._file.tell() >= self._seal_bytes:
+                self.seal()
+                self._begin()
+            assert self._file is not None
+            number = self._count - 1
+            start = at = self._file.tell()
+            parts: list[bytes] = []
+            rows: list[Row] = []
+            for trajectory in trajectories:
+                fresh, frame = segment.encode(trajectory, self._names[number])
+                parts += [fresh, frame]
+                at += len(fresh) + len(frame)
+                length = len(frame) - segment.HEADER_BYTES
+                rows.append(Row.of(trajectory, number, at - length, length))
+            self._write(b"".join(parts), start)
+            self.ledger.enter(rows)
 
-    def close(self) -> None:
-        if self._file is not None:
+    def seal(self) -> None:
+        """End the present segment: it will never change again, and says its own SHA-256."""
+        with self._lock:
+            if self._file is None:
+                return
+            sha256 = self._hash.digest()
+            self._write(segment.seal(sha256), self._file.tell())
+            self._sealed[self._count - 1] = sha256.hex()
             self._file.close()
             self._file = None
 
-    def _roll(self) -> None:
-        if self._file is not None:
-            self._file.close()
-        self._file = (self.folder / f"segment-{self._count:06d}.frames").open("ab")
+    def _write(self, content: bytes, start: int) -> None:
+        assert self._file is not None
+        try:
+            left = memoryview(content)
+            while left:
+                left = left[self._file.write(left) :]
+            if self._durable:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            path = self._path(self._count - 1)
+            with contextlib.suppress(OSError):
+                self._file.truncate(start)
+                self._names[self._count - 1] = segment.scan(path).names
+            raise unwritten(path, error) from error
+        self._hash.update(content)
+
+    def _begin(self) -> None:
+        path = self._path(self._count)
+        try:
+            self._file = path.open("ab", buffering=0)
+            sync_folder(self.folder)
+        except OSError as error:
+            raise unwritten(path, error) from error
+        self._names[self._count], self._hash = segment.Names(), hashlib.sha256()
         self._count += 1
-        _sync_folder(self.folder)
 
-    def _scan(self, segment: Path, last: bool) -> None:
-        size, offset = segment.stat().st_size, 0
-        with segment.open("rb") as file:
-            while offset < size:
-                head = file.read(_HEADER.size)
-                length, checksum = _HEADER.unpack(head) if len(head) == _HEADER.size else (0, None)
-                payload = file.read(length)
-                end = offset + _HEADER.size + length
-                if checksum is None or len(payload) < length or zlib.crc32(payload) != checksum:
-                    if last and (checksum is None or end >= size):
-                        self.repaired.append(f"{segment.name}: cut a torn tail of {size - offset} bytes at {offset}")
-                        os.truncate(segment, offset)
-                        return
-                    raise StoreError(f"{segment}: damaged at byte {offset}; restore the file, or start the run anew")
-                trajectory = wire.decode_trajectory(payload, self._limit)
-                digest = wire.trajectory_digest(trajectory)
-                self.index[trajectory.identity] = Entry(segment, offset + _HEADER.size, length, digest)
-                offset = end
+    def repair(self) -> list[str]:
+        """Check every byte again and take out what is damaged; says what that was."""
+        with self._lock:
+            self.close()
+            self._open()
+            return self.repaired
 
+    def close(self) -> None:
+        with self._lock:
+            if self._file is not None:
+                self._file.close()
+                self._file = None
+            while self._readers:
+                os.close(self._readers.popitem()[1])
+            self.ledger.close()
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """Arrays by name and a manifest of plain values."""
+    def __contains__(self, identity: Identity) -> bool:
+        with self._lock:
+            return identity in self.ledger
 
-    arrays: Mapping[str, np.ndarray]
-    manifest: Mapping[str, Any]
+    def __len__(self) -> int:
+        return len(self.ledger)
 
-    def part(self, prefix: str) -> dict[str, np.ndarray]:
-        """The arrays whose name begins with ``prefix/``, without it."""
-        return {k.removeprefix(prefix + "/"): v for k, v in self.arrays.items() if k.startswith(prefix + "/")}
+    def read(self, identity: Identity) -> Trajectory:
+        """The trajectory of this identity.  Raises KeyError if there is none, Damaged if its bytes changed."""
+        return self._read(self.ledger[identity])
 
+    def variations(self, stage: str, round: int) -> list[tuple[str, int, int, int]]:
+        """Which variations of one stage and round there are, in canonical order: (stage, round, task, variation)."""
+        return self.ledger.variations(stage, round)
 
-def version_file(folder: Path, version: int) -> Path:
-    """Where T^version lies."""
-    return folder / "checkpoints" / f"version-{version:04d}.npz"
+    def trials(self, key: tuple[str, int, int, int]) -> list[Trajectory]:
+        """The trajectories of one variation, in order of trial.  Raises Damaged at one whose bytes changed."""
+        return [self._read(row) for row in self.ledger.trials(key)]
 
+    def _read(self, row: Row) -> Trajectory:
+        if row.segment not in self._readers:
+            self._readers[row.segment] = os.open(self._path(row.segment), os.O_RDONLY)
+        whole = os.pread(self._readers[row.segment], segment.HEADER_BYTES + row.length, row.offset - segment.HEADER_BYTES)
+        payload = segment.payload(whole)
+        if payload is None:
+            path = self._path(row.segment)
+            raise Damaged(f"{path}: damaged at byte {row.offset}, where {row.identity} lies; --resume mends it")
+        return segment.decode(payload, self._names[row.segment])
 
-def newest_version(folder: Path) -> int:
-    """The newest complete version in a run folder; -1 if there is none."""
-    names = (folder / "checkpoints").glob("version-*.npz")
-    return max((int(name.stem.removeprefix("version-")) for name in names), default=-1)
+    def digest(self, version: int | None = None) -> str:
+        """One digest of the dataset: every array and label byte, in canonical order.
 
+        Of all of it, or of what T^version was fitted to.  Equal for any number of workers,
+        whatever died on the way.
+        """
+        total = hashlib.sha256()
+        for sha256 in self.ledger.digests(version):
+            total.update(sha256.encode())
+        return total.hexdigest()
 
-def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint so that ``path`` holds the old one or the new one, never half of one."""
-    manifest = np.frombuffer(json.dumps(checkpoint.manifest).encode(), dtype=np.uint8)
-    arrays: dict[str, Any] = {f"a/{name}": value for name, value in checkpoint.arrays.items()}
-    atomic_write(path, lambda file: np.savez(file, manifest=manifest, **arrays))
+    def manifest(self) -> list[dict[str, Any]]:
+        """The sealed segments: ``segment`` (its file's name), ``bytes``, and ``sha256`` of all before the seal."""
+        return [
+            {"segment": path.name, "bytes": path.stat().st_size, "sha256": self._sealed[number]}
+            for number in sorted(self._sealed)
+            for path in (self._path(number),)
+        ]
 
-
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Raises StoreError if the file is missing or is not a checkpoint; executes nothing in it."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            manifest = json.loads(file["manifest"].tobytes())
-            arrays = {name.removeprefix("a/"): file[name] for name in file.files if name.startswith("a/")}
-    except FileNotFoundError:
-        raise StoreError(f"{path}: no such checkpoint") from None
-    except Exception as error:
-        raise StoreError(f"{path}: not a checkpoint of this system ({error})") from None
-    return Checkpoint(arrays, manifest)
-
-
-def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Call ``write`` on a new file beside ``path``, make it durable, and put it in its place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        raise StoreError(f"{path}: could not be written ({error.strerror}): free space, then use --resume") from error
-    finally:
-        part.unlink(missing_ok=True)
-    _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    def _path(self, number: int) -> Path:
+        return self.folder / f"segment-{number:06d}.frames"

@@ -246,6 +246,8 @@ class Job:
     """Further numbers that the function needs, from the run's config."""
     tasks: int = 1
     """How many consecutive tasks."""
+    first: int = 0
+    """Number of the first variation within its task, for a job that holds only some of one task's."""
 
     def setting(self, name: str) -> Value:
         return _Named(self.kind, self.settings)[name]
@@ -253,7 +255,7 @@ class Job:
     def rows(self) -> list[tuple[int, int]]:
         """Number of the task, and of the variation within it, of each of ``variations``."""
         count = len(self.variations) // self.tasks
-        return [(self.task + row // count, row % count) for row in range(len(self.variations))]
+        return [(self.task + row // count, self.first + row % count) for row in range(len(self.variations))]
 
     def identities(self) -> Iterable[Identity]:
         """Every trajectory this job will deliver."""
@@ -264,13 +266,14 @@ class Job:
     def variation(self, identity: Identity) -> Variation:
         """The variation environment that a trajectory of this job comes from."""
         count = len(self.variations) // self.tasks
-        return self.variations[(identity.task - self.task) * count + identity.variation]
+        return self.variations[(identity.task - self.task) * count + identity.variation - self.first]
 
     @property
-    def name(self) -> tuple[str, int, int]:
-        return (self.stage, self.round, self.task)
+    def name(self) -> tuple[str, int, int, int]:
+        """Stage, round, first task, and first variation within it."""
+        return (self.stage, self.round, self.task, self.first)
 
     @property
     def label(self) -> str:
-        """The name for people: ``adapt/0/3``."""
-        return "/".join(map(str, self.name))
+        """The name for people: ``adapt/0/3``, or ``adapt/0/3/2`` if that one variation is all it holds."""
+        return "/".join(map(str, self.name if len(self.variations) == 1 else self.name[:3]))

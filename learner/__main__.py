@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config import ConfigError, load
-from icrl_dist.store import StoreError
+from icrl_dist.files import StoreError, explained
+from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner.service import Interrupted, RunFailed, Service
@@ -46,14 +47,17 @@ def main() -> int:
     except (ConfigError, LinkError) as error:
         report({"event": "error", "text": str(error)})
         return BAD_CONFIG
-    except (RunFailed, StoreError, FloatingPointError) as error:
-        report({"event": "error", "text": str(error)})
+    except (RunFailed, StoreError, FloatingPointError, OSError) as error:
+        told = explained(error)
+        if isinstance(told, OSError):  # which nobody foresaw
+            raise
+        report({"event": "error", "text": str(told)})
         return FAILED
 
 
 def _serve(folder: Path, endpoint: str, report: Any) -> int:
     run = load(str(folder / "run.toml"))
-    with ZenohLink.listen(endpoint) as link:
+    with ZenohLink.listen(endpoint, security.learner(run.stream.certificates, folder.name)) as link:
         service = Service(run, folder, link, report)
         for name in (signal.SIGINT, signal.SIGTERM):
             signal.signal(name, lambda *_: service.stop())

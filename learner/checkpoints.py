@@ -14,10 +14,10 @@ import torch
 from icrl_dist.agent import spec_from
 from icrl_dist.config import ConfigError, Run, dumps
 from icrl_dist.envs import tasks
+from icrl_dist.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
-from icrl_dist.store import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.stream.wire import weights_digest
-from icrl_dist.types import Spec
+from icrl_dist.types import Spec, Weights
 
 PARTIAL = "partial.npz"
 
@@ -74,3 +74,14 @@ def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: torch.opt
         state.setdefault(int(index), {})[key] = torch.from_numpy(np.array(value))
     opt.load_state_dict({"state": state, "param_groups": opt.state_dict()["param_groups"]})
     return checkpoint.manifest
+
+
+def given_up(folder: Path, version: int) -> dict[str, str]:
+    """The variations that were quarantined up to a version, and why."""
+    return dict(read_manifest(version_file(folder, version)).get("quarantined", {})) if version >= 0 else {}
+
+
+def weights_of_file(path: Path, version: int) -> Weights:
+    """The weights in a checkpoint, as they were broadcast.  Raises StoreError if there is none."""
+    arrays = load_checkpoint(path).part("model")
+    return Weights(version, arrays, weights_digest(arrays))

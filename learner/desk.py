@@ -5,13 +5,28 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import icrl_dist
+from icrl_dist import crashes
 from icrl_dist.config import Run, dumps
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link, Query
+from icrl_dist.stream.threads import Dispatcher
+from icrl_dist.types import Job
 from learner.work import Board
+
+HOPELESS = 8
+"""So many variations quarantined and nothing stored in a phase: the fault is in none of them, and the run ends."""
+
+_MOMENT_S = 0.3
+"""A vanished worker's stacks may be on their way, over a network's file system."""
+
+_LINES = 60
+"""So many of a worker's stacks are in its record, the newest call of the first thread first."""
+
+_COUNTS = ("episodes", "steps", "resent", "trajectories")
 
 
 class Desk:
@@ -20,39 +35,150 @@ class Desk:
     def __init__(
         self,
         run: Run,
+        folder: Path,
         link: Link,
         keys: Keys,
         board: Board,
         lock: threading.Lock,
         report: Callable[[dict[str, Any]], None],
         fail: Callable[[str], None],
+        acting: Callable[[Job], int] | None = None,
     ) -> None:
-        """``lock`` guards the Board; ``fail`` ends the run with a line for the user."""
+        """``lock`` guards the Board; ``fail`` ends the run with a line for the user.
+
+        Crash records go into the run's ``folder``.  ``acting`` as in ``Board.lease``; it is
+        called with the lock held.
+        """
         self._run, self._board, self._lock, self._report, self._fail = run, board, lock, report, fail
+        self._folder, self._acting = folder, acting
         self.workers: dict[str, bool] = {}
         """Every worker seen, and whether it is alive."""
+        self.counters: dict[str, dict[str, Any]] = {}
+        """The newest that each worker said of itself: episodes, steps, resent, memory_mb and so on."""
+        self._jobs: dict[str, Job] = {}
+        self._told: set[tuple[str, int, int, int]] = set()
         self._finished = threading.Event()
+        self._later = Dispatcher("crash records")
         link.serve(keys.work, self._work)
+        link.subscribe(keys.heartbeats, lambda _, payload: self._beat(payload))
         link.watch(keys.alive_all, self._watch)
+
+    @property
+    def resent(self) -> int:
+        """Times that a trajectory had to be sent again, by all workers so far."""
+        return sum(said["resent"] for said in list(self.counters.values()))
 
     def finish(self) -> None:
         """From now on, tell whoever asks to stop."""
         self._finished.set()
 
     def dismiss(self, timeout_s: float = 3.0) -> None:
-        """After the end: wait until every worker has been told to stop, or time is up."""
+        """After the end: wait until every worker has been told to stop, or time is up, and tidy up."""
         deadline = time.monotonic() + timeout_s
         while any(self.workers.values()) and time.monotonic() < deadline:
             time.sleep(0.02)
+        crashes.sweep(self._folder)
+
+    def close(self) -> None:
+        """Write no more crash records; the link stays open."""
+        self._later.close()
 
     def _watch(self, worker: str, alive: bool) -> None:
+        if alive:
+            self._join(worker)
+        else:
+            self._leave(worker)
+
+    def _join(self, worker: str) -> None:
         with self._lock:
-            self.workers[worker] = alive
-            freed = [] if alive else self._board.lost(worker)
-        text = f"worker {worker} joined" if alive else f"worker {worker} is gone"
+            again = self.workers.get(worker) is False
+            self.workers[worker] = True
+            self._board.back(worker)
+        text = f"worker {worker} {'is back' if again else 'joined'}"
+        self._report({"event": "worker", "worker": worker, "alive": True, "text": text})
+
+    def _leave(self, worker: str) -> None:
+        crashed = not self._finished.is_set()
+        cause = f"worker {worker} died"
+        if crashed and self._stacks(worker):
+            cause += f": {self._stacks(worker)[0]}"
+        with self._lock:
+            self.workers[worker] = False
+            job = self._jobs.pop(worker, None)
+            freed = self._board.lost(worker, time.monotonic(), cause)
+        text = f"worker {worker} is gone"
         if freed:
             text += "; its job goes to another: " + ", ".join(job.label for job in freed)
-        self._report({"event": "worker", "worker": worker, "alive": alive, "text": text})
+        self._report({"event": "worker", "worker": worker, "alive": False, "text": text})
+        if crashed:
+            self._later.post(lambda: self._vanished(worker, job), _MOMENT_S)
+        self._tell_quarantines()
+
+    def _vanished(self, worker: str, job: Job | None) -> None:
+        """The record of a worker that went without a word: killed, crashed in C, or stuck."""
+        if self.workers[worker]:
+            return  # it was cut off and is back
+        stacks = self._stacks(worker)
+        record = {
+            "what": "vanished",
+            "worker": worker,
+            "time": time.time(),
+            "job": job.label if job else "",
+            "seed": self._run.seed,
+            "last_said": self.counters.get(worker, {}),
+            "stacks": stacks,
+        }
+        why = stacks[0] if stacks else "without a word"
+        self._record(record, f"worker {worker} vanished ({why})")
+
+    def _stacks(self, worker: str) -> list[str]:
+        """First lines of what the worker's watchdog wrote, if anything."""
+        try:
+            with crashes.stacks_of(self._folder, worker).open(errors="replace") as file:
+                return [line.rstrip() for line, _ in zip(file, range(_LINES), strict=False)]
+        except FileNotFoundError:
+            return []
+
+    def _record(self, record: dict[str, Any], text: str) -> None:
+        try:
+            text += f"; {crashes.write(self._folder, record)}"
+        except OSError as error:
+            text += f"; its record cannot be written: {error}"
+        self._report({"event": "crash", "worker": record["worker"], "text": text})
+
+    def _tell_quarantines(self) -> None:
+        with self._lock:
+            new = {key: cause for key, cause in self._board.quarantined.items() if key not in self._told}
+            self._told.update(new)
+            phases = {key[:2] for key in new}
+            hopeless = [phase for phase in phases if self._hopeless(*phase)]
+        for key, cause in new.items():
+            name = "/".join(map(str, key))
+            text = f"variation {name} is quarantined, the run goes on without it: {cause}"
+            self._report({"event": "quarantine", "identity": name, "cause": cause, "text": text})
+        for stage, round_ in hopeless:
+            found = self._board.blamed(stage, round_)
+            self._fail(
+                f"{stage}/{round_}: not one trajectory was stored, and {len(found)} of its variations are quarantined; "
+                f"first: {found[0][1]}"
+            )
+
+    def _hopeless(self, stage: str, round_: int) -> bool:
+        arrived, expected = self._board.progress(stage, round_)
+        return not arrived and (not expected or len(self._board.blamed(stage, round_)) >= HOPELESS)
+
+    def _beat(self, payload: bytes) -> None:
+        kind, fields = wire.decode_message(payload)
+        if kind == "worker":
+            self._hear(fields)
+
+    def _hear(self, fields: dict[str, Any]) -> None:
+        """What a worker says of itself; a heartbeat may be overtaken, so counts never fall."""
+        worker = str(fields["worker"])
+        with self._lock:
+            before = self.counters.get(worker, {})
+            counts = {name: max(int(fields[name]), before.get(name, 0)) for name in _COUNTS}
+            self.counters[worker] = {**before, **fields, **counts}
 
     def _work(self, query: Query) -> None:
         try:
@@ -68,21 +194,32 @@ class Desk:
                 raise ValueError(f"worker {worker} runs icrl-dist {fields['version']}, the learner {icrl_dist.__version__}")
             return wire.encode_message("hello", run=dumps(self._run))
         if kind == "ask":
-            if self._finished.is_set():
-                return wire.encode_message("stop")
-            with self._lock:
-                job = self._board.lease(worker, time.monotonic())
-            return (
-                wire.encode_message("wait", seconds=0.1)
-                if job is None
-                else wire.encode_message("job", job=wire.encode_job(job))
-            )
+            self._hear(fields)
+            return self._lease(worker)
         if kind == "failed":
-            stage, round_, task = fields["job"]
-            self._report({"event": "note", "text": f"worker {worker}: job {stage}/{round_}/{task} failed: {fields['error']}"})
-            with self._lock:
-                final = self._board.failed((stage, round_, task), str(fields["error"]))
-            if final:
-                self._fail(final)
+            stage, round_, task, first = fields["job"]
+            self._failed(worker, (stage, round_, task, first), fields["record"], fields["file"])
             return wire.encode_message("noted")
         raise ValueError(f"message kind {kind!r}: expected hello, ask or failed")
+
+    def _lease(self, worker: str) -> bytes:
+        if self._finished.is_set():
+            return wire.encode_message("stop")
+        with self._lock:
+            lease = self._board.lease(worker, time.monotonic(), self._acting)
+            if lease is None:
+                self._jobs.pop(worker, None)
+                return wire.encode_message("wait", seconds=0.1)
+            self._jobs[worker] = lease.job
+        return wire.encode_message("job", job=wire.encode_job(lease.job), deadline_s=lease.deadline_s)
+
+    def _failed(self, worker: str, name: tuple[str, int, int, int], record: dict[str, Any], file: str) -> None:
+        with self._lock:
+            self._board.failed(worker, name, str(record["exception"]))
+        text = f"worker {worker}: job {record['job']} failed: {record['exception']}"
+        kept = crashes.folder_of(self._folder) / Path(file).name
+        if file and kept.is_file():
+            self._report({"event": "crash", "worker": worker, "text": f"{text}; {kept}"})
+        else:
+            self._record({**record, "worker": Path(worker).name}, text)
+        self._tell_quarantines()

@@ -2,17 +2,17 @@
 
 Zenoh's thread only puts a query into a bounded queue.  One thread takes whole groups out,
 checks them, appends them with one fsync, and only then replies: a reply is the promise that
-the trajectory will be there after any crash.
+the trajectory will be there after any crash.  (Checking one group on a second thread while
+another waits for its fsync was slower: the threads wait for each other's interpreter lock.)
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import queue
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -44,12 +44,17 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
         raise Rejected("spec", f"{identity}: queries {trajectory.queries.shape}, labels {trajectory.labels.shape}")
     if trajectory.actions.min() < 0 or trajectory.actions.max() >= spec.actions:
         raise Rejected("spec", f"{identity}: an action lies outside 0..{spec.actions - 1}")
-    if not all(np.isfinite(a).all() for a in trajectory.arrays().values()):
+    if not all(map(_finite, trajectory.arrays().values())):
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
     if trajectory.variation != job.variation(identity):
         raise Rejected("unexpected", f"{identity}: comes from another variation than its job's")
     if (trajectory.weights, trajectory.digest) != (job.weights, digest):
         raise Rejected("stale-weights", f"{identity}: weights {trajectory.weights} acted, the job names {job.weights}")
+
+
+def _finite(array: np.ndarray) -> bool:
+    """Whether every value is; a sum of squares that is finite, the quick way, says so too."""
+    return bool(np.isfinite(np.vdot(array, array)) or np.isfinite(array).all())
 
 
 class Inbox:
@@ -65,25 +70,30 @@ class Inbox:
         stored: Callable[[Trajectory], None],
         failed: Callable[[BaseException], None],
         capacity: int = 256,
+        capacity_bytes: int = 64 << 20,
     ) -> None:
+        """What comes beyond ``capacity`` messages, or ``capacity_bytes`` of them, is answered ``busy``; one always fits."""
         self.drops: Counter[str] = Counter()
+        self.commits = 0
+        """Groups stored, an fsync each."""
         self._store, self._spec, self._limit = store, spec, limit
         self._wants, self._digest_of, self._stored, self._failed = wants, digest_of, stored, failed
-        self._queue: queue.Queue[Query | None] = queue.Queue(capacity)
+        self._room = _Room(capacity, capacity_bytes)
+        self._queue: queue.SimpleQueue[Query | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="inbox", daemon=True)
         self._thread.start()
 
     def put(self, query: Query) -> None:
-        """Accept a request without ever blocking; a full queue answers ``busy``: send it again."""
+        """Accept a request without ever blocking; a full inbox answers ``busy``: send it again."""
         try:
             trajectories = batch.split(query, self._limit)
         except wire.WireError as error:
             self._refuse(query, error)
             return
         for one in trajectories:
-            try:
-                self._queue.put_nowait(one)
-            except queue.Full:
+            if self._room.enter(len(one.payload)):
+                self._queue.put(one)
+            else:
                 self.drops["busy"] += 1
                 one.refuse("busy")
 
@@ -94,37 +104,39 @@ class Inbox:
 
     def close(self) -> None:
         """Take in what is queued, then stop."""
-        while self._thread.is_alive():
-            with contextlib.suppress(queue.Full):
-                self._queue.put(None, timeout=0.1)
-                break
+        self._queue.put(None)
         self._thread.join()
 
     def _run(self) -> None:
         while (first := self._queue.get()) is not None:
-            group: list[Query] = [first]
-            stop = False
-            while not self._queue.empty():
-                following = self._queue.get()
-                if following is None:
-                    stop = True
-                    break
+            group, following = [first], self._next()
+            while following is not None:
                 group.append(following)
+                following = self._next()
             try:
                 self.take(group)
             except Exception as error:  # the run ends; unanswered, what was sent will be sent again
                 _log.exception("the inbox cannot go on")
                 self._failed(error)
                 return
-            if stop:
-                return
+            self._room.leave(group)
+
+    def _next(self) -> Query | None:
+        """What waits next; None if nothing does, or if the inbox is closing."""
+        try:
+            found = self._queue.get_nowait()
+        except queue.Empty:
+            return None
+        if found is None:
+            self._queue.put(None)  # for the next time around
+        return found
 
     def take(self, group: list[Query]) -> None:
         """Check a group of messages, refuse the bad ones, store the good ones, then acknowledge those.
 
         Raises StoreError if they could not be stored; none of them is acknowledged then.
         """
-        good: dict[Identity, tuple[Trajectory, bytes]] = {}
+        good: dict[Identity, Trajectory] = {}
         taken: list[Query] = []
         for query in group:
             try:
@@ -137,13 +149,40 @@ class Inbox:
                     raise Rejected("unexpected", f"{identity}: nobody asked for it")
                 else:
                     check(trajectory, job, self._spec, self._digest_of(job.weights))
-                    good[identity] = (trajectory, query.payload)
+                    good[identity] = trajectory
             except (wire.WireError, Rejected) as error:
                 self._refuse(query, error)
             else:
                 taken.append(query)
-        self._store.append(list(good.values()))
-        for trajectory, _ in good.values():
+        if good:
+            self._store.append(list(good.values()))
+            self.commits += 1
+        for trajectory in good.values():
             self._stored(trajectory)
         for query in taken:
             query.reply(b"stored")
+
+
+class _Room:
+    """Messages taken in and not yet done with: so many, of so many bytes together."""
+
+    def __init__(self, count: int, size: int) -> None:
+        self._lock = threading.Lock()
+        self._count = self._size = 0
+        self._most = (count, size)
+
+    def enter(self, size: int) -> bool:
+        """Whether there was room for a message of this size, which is now in."""
+        with self._lock:
+            count, total = self._most
+            if self._count and (self._count >= count or self._size + size > total):
+                return False
+            self._count += 1
+            self._size += size
+            return True
+
+    def leave(self, group: Sequence[Query]) -> None:
+        """These are done with."""
+        with self._lock:
+            self._count -= len(group)
+            self._size -= sum(len(query.payload) for query in group)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -12,14 +13,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist import context, pretrain
+from icrl_dist import context, files, pretrain
 from icrl_dist.config import Run
 from icrl_dist.envs import tasks
 from icrl_dist.evaluate import label_quality
+from icrl_dist.lineage import Lineage
 from icrl_dist.metrics import Metrics
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
-from icrl_dist.recipes import METHODS, Phase
-from icrl_dist.store import Store, newest_version, version_file
+from icrl_dist.recipes import Phase
+from icrl_dist.store import Damaged, Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link
 from icrl_dist.types import Identity, Job, Trajectory, Weights
@@ -27,6 +29,7 @@ from learner import checkpoints
 from learner.broadcast import Broadcast
 from learner.desk import Desk
 from learner.inbox import Inbox
+from learner.plan import Plan
 from learner.work import Board
 
 Report = Callable[[dict[str, Any]], None]
@@ -50,9 +53,18 @@ class Service:
     """One run's learner.  ``report`` receives what happens as plain dicts, for a terminal."""
 
     def __init__(self, run: Run, folder: Path, link: Link, report: Report) -> None:
-        """Opens the run folder and takes up where its checkpoints and dataset end."""
+        """Opens the run folder and takes up where its checkpoints and dataset end.
+
+        Raises StoreError if another learner is at work there, or if it cannot be used.
+        """
         self._run, self._folder, self._link, self._report = run, folder, link, report
-        self._method = METHODS[run.method]
+        with contextlib.ExitStack() as closing:
+            closing.enter_context(files.hold(folder))
+            self._begin(closing)
+            self._closing = closing.pop_all()
+
+    def _begin(self, closing: contextlib.ExitStack) -> None:
+        run, folder, link, report = self._run, self._folder, self._link, self._report
         self._keys = Keys(folder.name)
         self._spec = tasks.spec(run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
@@ -60,7 +72,7 @@ class Service:
         torch.use_deterministic_algorithms(True)
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
         self._opt = pretrain.optimiser(self.model, run.optim)
-        self.version = newest_version(folder)
+        self.version = files.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder)
         self._lock = threading.Lock()
@@ -70,10 +82,14 @@ class Service:
         self._error: BaseException | None = None
         self._shown = -np.inf
         self._lag = 0
+        self._mended = 0
         self.store = Store(folder / "dataset")
-        for note in self.store.repaired:
-            report({"event": "note", "text": note})
-        self._broadcast = Broadcast(link, self._keys)
+        closing.callback(self.store.close)
+        self._tell_repairs()
+        self._plan = Plan(run, Lineage.of(folder, run), self.store, {})
+        self._plan.give_up(checkpoints.given_up(folder, self.version))
+        self._opened: set[Phase] = set()
+        self._broadcast = Broadcast(link, self._keys, self._older)
         self.inbox = Inbox(
             self.store,
             self._spec,
@@ -83,7 +99,12 @@ class Service:
             self._stored,
             self.fail,
         )
-        self.desk = Desk(run, link, self._keys, self._board, self._lock, report, lambda line: self.fail(RunFailed(line)))
+        closing.callback(self.inbox.close)
+        acting = lambda job: self._plan.acting(job, self.version)  # noqa: E731
+        self.desk = Desk(
+            run, folder, link, self._keys, self._board, self._lock, report, lambda line: self.fail(RunFailed(line)), acting
+        )
+        closing.callback(self.desk.close)
         self._taking = False
         self._take_up()
 
@@ -94,22 +115,30 @@ class Service:
         self._stop.set()
         self._changed.set()
 
-    def _wants(self, identity: Identity) -> Job | None:
-        with self._lock:
-            return self._board.wants(identity)
-
-    def _stored(self, trajectory: Trajectory) -> None:
-        with self._lock:
-            self._board.received(trajectory.identity, time.monotonic())
-            self._lag = self.version - trajectory.weights
-            done = self._board.done
-        if done:
-            self._changed.set()
-
     def fail(self, error: BaseException) -> None:
         """End the run with this error."""
         self._error = error
         self._changed.set()
+
+    def _wants(self, identity: Identity) -> Job | None:
+        with self._lock:
+            job = self._board.wants(identity)
+            if job is None:
+                self._board.repeated(identity, time.monotonic())
+            return job
+
+    def _stored(self, trajectory: Trajectory) -> None:
+        identity = trajectory.identity
+        with self._lock:
+            self._board.received(identity, time.monotonic())
+            done = self._board.done(identity.stage, identity.round)
+        if identity.stage == "adapt":
+            self._lag = identity.round - trajectory.weights
+        if done:
+            self._changed.set()
+
+    def _older(self, version: int) -> Weights:
+        return checkpoints.weights_of_file(files.version_file(self._folder, version), version)
 
     # The run, on the caller's thread.
 
@@ -120,16 +149,32 @@ class Service:
         StoreError if the run cannot go on.
         """
         try:
-            for phase in self._method.phases(self._run):
-                if phase.produces > self.version:
+            while (phase := self._plan.next(self.version)) is not None:
+                if phase.produces <= self.version:
+                    lost = ", ".join(job.label for job in self._plan.incomplete(phase))
+                    self._report({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
+                try:
                     self._collect(phase)
-                    self._fit(phase)
+                    if phase.produces > self.version:
+                        self._fit(phase)
+                except Damaged as error:
+                    self._report({"event": "note", "text": str(error)})
+                    self.store.repair()
+                    self._tell_repairs()
+                    self._plan.give_up({})
+                    self._plan.look_again()
+            self.store.seal()
             result = {
                 "dataset_digest": self.store.digest(),
                 "weights_digest": self._broadcast.digest_of(self.version),
                 "version": self.version,
                 "trajectories": len(self.store),
                 "drops": dict(self.inbox.drops),
+                "resent": self.desk.resent,
+                "repaired": self._mended,
+                "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
+                "staleness": self._run.stream.staleness,
+                "lag": {str(lag): count for lag, count in self.store.ledger.lags().items()},
                 "threads": self._threads,
                 "instruction_set": torch.backends.cpu.get_cpu_capability(),
             }
@@ -140,21 +185,29 @@ class Service:
 
     def close(self) -> None:
         """Stop taking in and let go of the files."""
-        self.inbox.close()
-        self.store.close()
+        self._closing.close()
+
+    def _open(self, phase: Phase) -> None:
+        """Put a phase's work on the Board, and that of phases which may run ahead of it."""
+        for one in (phase, *self._plan.ahead(phase, self.version)):
+            if one not in self._opened:
+                jobs = self._plan.ask(one)
+                with self._lock:
+                    self._board.open(jobs, self._plan.have)
+                self._opened.add(one)
 
     def _collect(self, phase: Phase) -> None:
-        jobs = self._method.ask(self._run, phase)
+        self._open(phase)
         with self._lock:
-            self._board.open(jobs, self.store.index)
-            already = self._board.arrived
+            already, _ = self._board.progress(phase.stage, phase.round)
         if not self._taking:  # earlier, nothing was expected yet: what comes meanwhile is sent again
             self._link.serve(self._keys.data, self.inbox.put)
             self._taking = True
         began = time.monotonic()
         while True:
             with self._lock:
-                arrived, expected, done = self._board.arrived, self._board.expected, self._board.done
+                arrived, expected = self._board.progress(phase.stage, phase.round)
+                done = self._board.done(phase.stage, phase.round)
             per_s = (arrived - already) / max(1e-3, time.monotonic() - began)
             self._progress("collect", phase, arrived, expected, per_s=per_s, force=done)
             if done:
@@ -162,14 +215,22 @@ class Service:
             self._check()
             self._changed.wait(0.2)
             self._changed.clear()
-        self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=self._board.leases)
-        quality = label_quality(self._run, phase, self.store)
+        with self._lock:
+            leases, blamed = self._board.leases(phase.stage, phase.round), dict(self._board.blamed(phase.stage, phase.round))
+            self._board.close(phase.stage, phase.round)
+            self._opened.discard(phase)
+        self._plan.give_up(blamed)
+        if not self.store.ledger.count(phase.stage, phase.round):
+            causes = "; ".join(f"{name}: {cause}" for name, cause in blamed.items())
+            raise RunFailed(f"{phase.stage}/{phase.round}: every variation was given up ({causes})")
+        self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
+        quality = label_quality(self._run, phase, self.store) if phase.produces > self.version else {}
         if quality:
             self._metrics.write(phase.round, "labels", **quality)
             self._report({"event": "labels", "round": phase.round, **quality})
 
     def _fit(self, phase: Phase) -> None:
-        pools = self._method.learn(self._run, phase, self.store)
+        pools = self._plan.method.learn(self._run, phase, self.store)
         optim, torch_threads = self._run.optim, torch.get_num_threads()
         torch.set_num_threads(self._threads)
         began = time.monotonic()
@@ -182,6 +243,7 @@ class Service:
             return context.draw(rng, pools, optim.batch, optim.queries, optim.episodes)
 
         def progress(step: int, loss: float) -> None:
+            self._partial = step  # damage may end this fit: it is taken up from here
             self._progress("fit", phase, step, phase.steps, loss=loss, force=step == phase.steps)
             if step % 50 == 0 or step == phase.steps:
                 self._metrics.write(step, f"fit/{phase.produces}", loss=loss)
@@ -189,11 +251,20 @@ class Service:
                 self._save(partial, produces=phase.produces, step=step)
             self._check()
 
-        loss = pretrain.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, batch, progress, self._partial)
-        torch.set_num_threads(torch_threads)
+        first = self._partial
+        try:
+            loss = pretrain.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, batch, progress, first)
+        finally:
+            torch.set_num_threads(torch_threads)
         self._partial = 0
         self.version = phase.produces
-        self._save(version_file(self._folder, self.version), loss=loss, dataset_digest=self.store.digest())
+        self.store.seal()
+        where = {
+            "dataset": self.store.manifest(),
+            "dataset_digest": self.store.digest(self.version),
+            "quarantined": self._plan.given_up,
+        }
+        self._save(files.version_file(self._folder, self.version), loss=loss, **where)
         partial.unlink(missing_ok=True)
         self._publish()
         self._metrics.write(self.version, "version", loss=loss, seconds=time.monotonic() - began)
@@ -209,11 +280,16 @@ class Service:
     def _take_up(self) -> None:
         """Go on from the newest version, and from the fit that was under way, if there are any."""
         if self.version >= 0:
-            checkpoints.restore(version_file(self._folder, self.version), self._spec, self.model, self._opt)
+            checkpoints.restore(files.version_file(self._folder, self.version), self._spec, self.model, self._opt)
             self._publish()
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
         if partial.exists() and checkpoints.read_manifest(partial)["produces"] == self.version + 1:
             self._partial = checkpoints.restore(partial, self._spec, self.model, self._opt)["step"]
+
+    def _tell_repairs(self) -> None:
+        self._mended += len(self.store.repaired)
+        for note in self.store.repaired:
+            self._report({"event": "repaired", "text": note})
 
     def _check(self) -> None:
         if self._error is not None:

@@ -1,97 +1,269 @@
-"""The Board: which jobs the present phase still needs, and who holds them.
+"""The Board: which jobs the open phases still need, who holds them, and who is to blame.
 
-A pure state machine: the clock is an argument.  It leases only what this phase needs, for a
+A pure state machine: the clock is an argument.  It leases only what the open phases need, for a
 quick worker would otherwise drain later phases on stale weights.
+
+A job whose worker died goes out whole again, and only after its second death in parts: the shape
+of its batch is part of the floating-point result, and workers killed from outside must not change
+the run's digests.  In parts, one variation each, the culprit is found and the others finish.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from icrl_dist.types import Identity, Job
+from icrl_dist.types import STAGES, Identity, Job
+
+DEATHS = 3
+"""A variation that has ended so many workers, or raised so often, is quarantined."""
+
+_DOUBLINGS = 10
 
 
-@dataclass
+@dataclass(frozen=True)
+class Lease:
+    """A job for a worker, and how long its next trajectory may take."""
+
+    job: Job
+    deadline_s: float
+
+
+@dataclass(slots=True, eq=False)
 class _Slot:
     job: Job
-    missing: set[Identity]
+    missing: set[int]
+    """Trajectories not stored yet, numbered by row and trial; empty: nothing is left to do."""
     worker: str = ""
-    deadline: float = 0.0
-    failures: list[str] = field(default_factory=list)
+    since: float = 0.0
+    allowed: float = 0.0
+    expired: int = 0
+    blame: int = 0
+    pinned: bool = False
+
+    def number(self, identity: Identity) -> int:
+        """Place among the job's of a trajectory in its variations; -1 for a trial that it has not."""
+        job = self.job
+        if identity.trial >= job.trials:
+            return -1
+        row = (identity.task - job.task) * (len(job.variations) // job.tasks) + identity.variation - job.first
+        return row * job.trials + identity.trial
+
+    def parts(self) -> Iterator[_Slot]:
+        """A slot for each variation that something is missing of."""
+        trials = self.job.trials
+        for row, (task, variation) in enumerate(self.job.rows()):
+            missing = {n - row * trials for n in self.missing if n // trials == row}
+            if missing:
+                one = (self.job.variations[row],)
+                job = dataclasses.replace(self.job, task=task, variations=one, tasks=1, first=variation)
+                yield _Slot(job, missing, expired=self.expired, blame=DEATHS - 1, pinned=self.pinned)
+
+
+@dataclass(slots=True)
+class _Phase:
+    slots: dict[tuple[str, int, int, int], _Slot]
+    """What is not finished, in the order of leasing."""
+    slot_of: dict[tuple[int, int], _Slot] = field(default_factory=dict)
+    """The slot of each task and variation."""
+    expected: int = 0
+    arrived: int = 0
+    leases: int = 0
+
+    def put(self, slot: _Slot) -> None:
+        self.slots[slot.job.name] = slot
+        self.slot_of.update(dict.fromkeys(slot.job.rows(), slot))
 
 
 class Board:
-    """Jobs of one phase after another; a job is done when every trajectory of it is stored."""
+    """The jobs of the open phases; a job is done when every trajectory of it is stored."""
 
-    def __init__(self, lease_s: float, max_failures: int = 3) -> None:
-        self._lease_s, self._max_failures = lease_s, max_failures
-        self._slots: dict[tuple[str, int, int], _Slot] = {}
-        self._slot_of: dict[tuple[str, int, int], _Slot] = {}
-        self.expected = 0
-        self.arrived = 0
-        self.leases = 0
-        """Leases given in this phase, repeats included."""
+    def __init__(self, lease_s: float, floor_s: float = 5.0, factor: float = 10.0) -> None:
+        """A lease runs out ``factor`` times the longest gap between trajectories after the last one.
 
-    def open(self, jobs: Sequence[Job], stored: Iterable[Identity]) -> None:
-        """Begin a phase; what is ``stored`` already is not asked for again."""
-        have = set(stored)
-        self._slots = {job.name: _Slot(job, set(job.identities()) - have) for job in jobs}
-        self._slot_of = {i[:3]: slot for slot in self._slots.values() for i in slot.job.identities()}
-        self.expected = sum(len(job.variations) * job.trials for job in jobs)
-        self.arrived = self.expected - sum(len(slot.missing) for slot in self._slots.values())
-        self.leases = 0
+        Never sooner than ``floor_s``, never later than ``lease_s``, which holds while nothing has
+        been measured; twice as late for a job each time that it came back unfinished.
+        """
+        self._lease_s, self._floor_s, self._factor = lease_s, floor_s, factor
+        self._phases: dict[tuple[str, int], _Phase] = {}
+        self._holding: dict[str, _Slot] = {}
+        self._deaths: dict[str, _Slot] = {}
+        self._longest: dict[str, float] = {}
+        self.quarantined: dict[tuple[str, int, int, int], str] = {}
+        """Variations given up, as (stage, round, task, variation), and why."""
 
-    @property
-    def done(self) -> bool:
-        return self.arrived == self.expected
+    def open(self, jobs: Sequence[Job], have: Callable[[Job], Collection[Identity]]) -> None:
+        """Begin a phase, or begin it anew, beside those that are open.
 
-    def lease(self, worker: str, now: float) -> Job | None:
+        ``have`` tells what is stored of a job, which is not asked for again.  Raises ValueError
+        if the jobs belong to several phases.
+        """
+        names = {(job.stage, job.round) for job in jobs}
+        if len(names) > 1:
+            raise ValueError(f"jobs of {len(names)} phases, {sorted(names)}: open one phase at a time")
+        for name in names:
+            self.close(*name)
+            phase = self._phases[name] = _Phase({})
+            self.quarantined = {key: cause for key, cause in self.quarantined.items() if key[:2] != name}
+            for job in jobs:
+                slot = _Slot(job, set(range(len(job.variations) * job.trials)))
+                slot.missing.difference_update([slot.number(i) for i in have(job)])
+                phase.put(slot)
+                phase.expected += len(job.variations) * job.trials
+                phase.arrived += len(job.variations) * job.trials - len(slot.missing)
+                if not slot.missing:
+                    del phase.slots[job.name]
+
+    def close(self, stage: str, round: int) -> None:
+        """Forget what a phase still needs; what is quarantined of it stays known."""
+        self._phases.pop((stage, round), None)
+
+    def progress(self, stage: str, round: int) -> tuple[int, int]:
+        """Trajectories stored and expected; what is quarantined is not expected any more."""
+        phase = self._phases.get((stage, round))
+        return (phase.arrived, phase.expected) if phase else (0, 0)
+
+    def done(self, stage: str, round: int) -> bool:
+        """Whether nothing of this phase is missing."""
+        phase = self._phases.get((stage, round))
+        return phase is None or not phase.slots
+
+    def leases(self, stage: str, round: int) -> int:
+        """Leases given in a phase, repeats included."""
+        phase = self._phases.get((stage, round))
+        return phase.leases if phase else 0
+
+    def blamed(self, stage: str | None = None, round: int | None = None) -> list[tuple[str, str]]:
+        """What is quarantined in a phase, or in all: ``adapt/0/3/1`` and why, in canonical order."""
+        found = sorted(self.quarantined.items(), key=lambda item: (STAGES.index(item[0][0]), *item[0][1:]))
+        return [("/".join(map(str, key)), cause) for key, cause in found if stage in (None, key[0]) and round in (None, key[1])]
+
+    def lease(self, worker: str, now: float, acting: Callable[[Job], int] | None = None) -> Lease | None:
         """The first job that nobody holds or whose lease ran out; None if there is none now.
 
         A worker asks only when it holds nothing, so what it held before comes back first.
+        ``acting`` gives the weights version of a job that goes out for the first time; it keeps
+        it, so that whoever repeats the job acts with the same T^j.
         """
-        self.lost(worker)
-        for slot in self._slots.values():
-            if slot.missing and (not slot.worker or now >= slot.deadline):
-                slot.worker, slot.deadline = worker, now + self._lease_s
-                self.leases += 1
-                return slot.job
-        return None
+        self.back(worker)
+        self._release(worker)
+        found = next(
+            (
+                (phase, slot)
+                for phase in self._phases.values()
+                for slot in phase.slots.values()
+                if not slot.worker or now >= slot.since + slot.allowed
+            ),
+            None,
+        )
+        if found is None:
+            return None
+        phase, slot = found
+        slot.expired += bool(slot.worker)
+        if slot.blame >= DEATHS - 1 and len(slot.job.variations) > 1:
+            slot = self._split(phase, slot)
+        if acting is not None and not slot.pinned:
+            slot.job = dataclasses.replace(slot.job, weights=acting(slot.job))
+        slot.pinned = True
+        slot.worker, slot.since, slot.allowed = worker, now, self._allowed(slot)
+        self._holding[worker] = slot
+        phase.leases += 1
+        return Lease(slot.job, slot.allowed)
 
     def wants(self, identity: Identity) -> Job | None:
         """The job that still needs this trajectory, if any."""
-        slot = self._slot_of.get(identity[:3])
-        return slot.job if slot and identity in slot.missing else None
+        slot = self._slot(identity)
+        return slot.job if slot and slot.number(identity) in slot.missing else None
 
     def received(self, identity: Identity, now: float) -> None:
-        """A trajectory is stored; its job's lease is extended, for its holder is at work."""
-        slot = self._slot_of.get(identity[:3])
-        if slot and identity in slot.missing:
-            slot.missing.remove(identity)
-            slot.deadline = max(slot.deadline, now + self._lease_s)
-            self.arrived += 1
+        """A trajectory is stored; its job's lease runs from now, for its holder is at work."""
+        slot = self._slot(identity)
+        if slot is None or (number := slot.number(identity)) not in slot.missing:
+            return
+        if slot.worker:
+            gap = now - slot.since
+            self._longest[slot.job.kind] = max(gap, self._longest.get(slot.job.kind, 0.0))
+        slot.since = now
+        slot.missing.remove(number)
+        phase = self._phases[identity.stage, identity.round]
+        phase.arrived += 1
+        if not slot.missing:
+            del phase.slots[slot.job.name]
 
-    def lost(self, worker: str) -> list[Job]:
-        """The worker is gone: its unfinished jobs go to the next who ask."""
-        freed = []
-        for slot in self._slots.values():
-            if slot.worker == worker:
-                slot.worker = ""
-                if slot.missing:
-                    freed.append(slot.job)
-        return freed
+    def repeated(self, identity: Identity, now: float) -> None:
+        """A trajectory came that was stored before: whoever repeats its job is at work."""
+        slot = self._slot(identity)
+        if slot is not None:
+            slot.since = now
 
-    def failed(self, name: tuple[str, int, int], error: str) -> str | None:
-        """A worker reports that the job raised.
+    def lost(self, worker: str, now: float, cause: str = "its worker died") -> list[Job]:
+        """The worker is gone: its unfinished job is to blame, and goes to the next who asks.
 
-        Returns None while it may be tried again, else one line that says why it may not.
+        That holds even if its lease had run out before and another has the job now.  Returns
+        what is free again.
         """
-        slot = self._slots.get(name)
+        slot = self._holding.get(worker)
+        if slot is None or not self._release(worker):
+            return []
+        self._deaths[worker] = slot
+        self._accuse(slot, cause)
+        return [slot.job] if slot.missing and not slot.worker else []
+
+    def back(self, worker: str) -> None:
+        """A worker that was lost is heard of: it was cut off, not dead, and still holds its job.
+
+        The death is taken back, unless it has split or quarantined the job already.
+        """
+        slot = self._deaths.pop(worker, None)
+        if slot is not None and self._open(slot):
+            slot.blame -= 1
+            slot.worker = slot.worker or worker
+            self._holding[worker] = slot
+
+    def failed(self, worker: str, name: tuple[str, int, int, int], cause: str) -> None:
+        """The worker reports that its job raised; one that it does not hold (any more) is no news."""
+        slot = self._holding.get(worker)
+        if slot is not None and slot.job.name == name and self._release(worker):
+            self._accuse(slot, cause)
+
+    def _slot(self, identity: Identity) -> _Slot | None:
+        phase = self._phases.get((identity.stage, identity.round))
+        return phase.slot_of.get((identity.task, identity.variation)) if phase else None
+
+    def _open(self, slot: _Slot) -> bool:
+        """Whether the job is still to be done, and by this slot: phases close, jobs are split."""
+        phase = self._phases.get((slot.job.stage, slot.job.round))
+        return phase is not None and phase.slots.get(slot.job.name) is slot
+
+    def _release(self, worker: str) -> bool:
+        """The worker holds nothing any more; whether what it held is still to be done."""
+        slot = self._holding.pop(worker, None)
         if slot is None:
-            return None
-        slot.worker = ""
-        slot.failures.append(error)
-        if len(slot.failures) < self._max_failures:
-            return None
-        return f"job {slot.job.label} failed {len(slot.failures)} times, last: {error}"
+            return False
+        if slot.worker == worker:
+            slot.worker = ""
+        return self._open(slot)
+
+    def _allowed(self, slot: _Slot) -> float:
+        longest = self._longest.get(slot.job.kind)
+        base = self._lease_s if longest is None else min(self._lease_s, max(self._floor_s, self._factor * longest))
+        return base * 2.0 ** min(_DOUBLINGS, slot.expired + slot.blame)
+
+    def _accuse(self, slot: _Slot, cause: str) -> None:
+        slot.blame += 1
+        if slot.blame < DEATHS or len(slot.job.variations) > 1:
+            return
+        phase = self._phases[slot.job.stage, slot.job.round]
+        phase.expected -= len(slot.missing)
+        slot.missing.clear()
+        del phase.slots[slot.job.name]
+        self.quarantined[slot.job.name] = cause
+
+    def _split(self, phase: _Phase, slot: _Slot) -> _Slot:
+        """The job in parts, behind everything else; returns the first part."""
+        parts = list(slot.parts())
+        del phase.slots[slot.job.name]
+        for part in parts:
+            phase.put(part)
+        return parts[0]

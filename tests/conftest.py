@@ -46,8 +46,14 @@ def room() -> Callable[[int, int], tuple[Task, ...]]:
 
 
 @pytest.fixture
-def small_run() -> Run:
+def small_run(module_run: Run) -> Run:
     """A whole run in a 3x3 room, every part of it small enough for a test."""
+    return module_run
+
+
+@pytest.fixture(scope="session")
+def module_run() -> Run:
+    """The same for fixtures that live longer than a test."""
     return Run(
         method="icaa",
         darkroom=DarkRoomConfig(size=3, horizon=8),

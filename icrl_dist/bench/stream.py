@@ -201,6 +201,13 @@ class _RayActor:
 
 @contextlib.contextmanager
 def _ray() -> Iterator[_RayActor]:
+    with local_ray() as ray:
+        yield _RayActor(ray)
+
+
+@contextlib.contextmanager
+def local_ray() -> Iterator[Any]:
+    """Ray, started on this machine for a benchmark's time.  Raises RuntimeError if one runs in this process."""
     import ray
 
     if ray.is_initialized():
@@ -214,6 +221,6 @@ def _ray() -> Iterator[_RayActor]:
         configure_logging=False,
     )
     try:
-        yield _RayActor(ray)
+        yield ray
     finally:
         ray.shutdown()

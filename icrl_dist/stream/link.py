@@ -50,6 +50,11 @@ class Keys:
         return f"icrl/{self.run}/mon/**"
 
     @property
+    def heartbeats(self) -> str:
+        """Every worker's heartbeat on the monitor plane."""
+        return f"icrl/{self.run}/mon/worker/*"
+
+    @property
     def alive_all(self) -> str:
         """The liveliness of every worker."""
         return f"icrl/{self.run}/alive/*"

@@ -5,7 +5,8 @@ Whatever is wrong raises :class:`WireError` with one of the reasons in ``REASONS
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Set
+import reprlib
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any, NoReturn, TypeVar
 
 import msgpack
@@ -33,6 +34,7 @@ WEIGHT_DTYPES = frozenset({"<f2", "<f4", "<f8", "<i4", "<i8", "|u1"})
 """Dtypes that a model's parameters may have."""
 
 _ITEMS = 1 << 14
+_VALUES = 1 << 16
 DEPTH = 8
 _CELLS = 1 << 31
 _TEXT = 1 << 16
@@ -62,28 +64,59 @@ def unpack(data: bytes, limit: int) -> dict[str, Any]:
     """The one msgpack map that ``data`` is, of this version and within ``limit`` bytes."""
     if len(data) > limit:
         raise WireError("oversized", f"{len(data)} bytes, the limit is {limit}")
+    message = as_map(parse(data), "message")
+    version = message.get("v")
+    if type(version) is not int or version != VERSION:
+        raise WireError(
+            "version", f"version {show(version)}, this side reads {VERSION}: install the same release on both sides"
+        )
+    return message
+
+
+def parse(data: bytes) -> object:
+    """The one msgpack value that ``data`` is.  Takes at most 16 times its length and 8 MiB of memory."""
+    # msgpack makes room for as many entries as an array claims, before it looks for them: a thousand
+    # arrays within each other, 3 KB, claim 130 MB.  Skipping builds nothing and finds them missing.
+    reader = msgpack.Unpacker(max_buffer_size=max(1, len(data)), read_size=max(1, len(data)))
+    # An empty list takes 64 bytes of memory and one of the message.
+    count = _counter(_VALUES + len(data) // 8) if len(data) > _VALUES else None
     try:
-        message = msgpack.unpackb(
+        reader.feed(data)
+        reader.skip()
+        return msgpack.unpackb(
             data,
             raw=False,
             strict_map_key=True,
-            ext_hook=_no_extension,
+            list_hook=count,
+            object_hook=count,
+            ext_hook=no_extension,
             max_str_len=min(len(data), _TEXT),
             max_bin_len=len(data),
             max_array_len=min(len(data), _ITEMS),
             max_map_len=min(len(data), _ITEMS),
             max_ext_len=0,
         )
+    except WireError:
+        raise
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError("not-msgpack", f"{type(error).__name__}: {error}") from error
-    message = as_map(message, "message")
-    version = message.get("v")
-    if type(version) is not int or version != VERSION:
-        raise WireError("version", f"version {version!r}, this side reads {VERSION}: install the same release on both sides")
-    return message
 
 
-def _no_extension(code: int, data: bytes) -> NoReturn:
+def _counter(most: int) -> Callable[[Any], Any]:
+    left = most
+
+    def count(found: Any) -> Any:
+        nonlocal left
+        left -= len(found) * (2 if isinstance(found, dict) else 1)
+        if left < 0:
+            raise WireError("oversized", f"more than {most} values")
+        return found
+
+    return count
+
+
+def no_extension(code: int, data: bytes) -> NoReturn:
+    """What msgpack is to do with an extension type: refuse it."""
     raise ValueError(f"extension type {code}")
 
 
@@ -97,9 +130,21 @@ def exactly(value: object, what: str, names: Set[str]) -> dict[str, Any]:
 
 
 def show(value: object) -> str:
-    """A value for an error message, cut to fit a line."""
-    text = repr(value)
+    """A value for an error message, cut to fit a line, however large it is."""
+    text = _BRIEF.repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+class _Brief(reprlib.Repr):
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxlist, self.maxdict, self.maxstring, self.maxother = 3, 16, 16, 80, 80
+
+    def repr_bytes(self, value: bytes, level: int) -> str:
+        return repr(value[: self.maxstring])
+
+
+_BRIEF = _Brief()
 
 
 def typed(value: object, kind: type[_T], what: str) -> _T:
@@ -132,11 +177,13 @@ def text(value: object, what: str) -> str:
     return typed(value, str, what)
 
 
-def integer(value: object, what: str, low: int) -> int:
-    """``value`` as a whole number, at least ``low``."""
+def integer(value: object, what: str, low: int, high: int | None = None) -> int:
+    """``value`` as a whole number, at least ``low`` and at most ``high``."""
     found = typed(value, int, what)
     if found < low:
         raise WireError("schema", f"{what} is {found}, expected at least {low}")
+    if high is not None and found > high:
+        raise WireError("schema", f"{what} is {found}, expected at most {high}")
     return found
 
 

@@ -38,6 +38,9 @@ __all__ = ["REASONS", "VERSION", "WireError"]
 SMALL = 1 << 20
 """Default limit of jobs and messages, bytes."""
 
+_LARGEST = (1 << 31) - 1
+"""What store and ledger can hold of an identity's numbers and of weights versions."""
+
 
 def encode_trajectory(trajectory: Trajectory) -> bytes:
     """The trajectory as bytes.  The producer's mistakes are refused here, as the reader would refuse them."""
@@ -49,7 +52,7 @@ def encode_trajectory(trajectory: Trajectory) -> bytes:
         "trajectory",
         {
             "identity": list(trajectory.identity),
-            "variation": _from_variation(trajectory.variation),
+            "variation": from_variation(trajectory.variation),
             "weights": trajectory.weights,
             "digest": trajectory.digest,
             "worker": trajectory.worker,
@@ -72,8 +75,8 @@ def decode_trajectory(data: bytes, limit: int) -> Trajectory:
     _check_lengths(arrays)
     return Trajectory(
         identity=_to_identity(fields["identity"]),
-        variation=_to_variation(fields["variation"]),
-        weights=integer(fields["weights"], "weights", -1),
+        variation=to_variation(fields["variation"]),
+        weights=integer(fields["weights"], "weights", -1, _LARGEST),
         digest=text(fields["digest"], "digest"),
         worker=text(fields["worker"], "worker"),
         origin=text(fields["origin"], "origin"),
@@ -85,7 +88,7 @@ def trajectory_digest(trajectory: Trajectory) -> str:
     """SHA-256 of all that a trajectory says, hexadecimal; the same whichever worker made it."""
     head = [
         list(trajectory.identity),
-        _from_variation(trajectory.variation),
+        from_variation(trajectory.variation),
         trajectory.weights,
         trajectory.digest,
         trajectory.origin,
@@ -120,7 +123,7 @@ def decode_weights(data: bytes, limit: int) -> Weights:
     arrays = {text(n, "arrays"): to_array(n, a, WEIGHT_DTYPES, None) for n, a in as_map(fields["arrays"], "arrays").items()}
     digest = text(fields["digest"], "digest")
     _check_digest(digest, arrays)
-    return Weights(integer(fields["version"], "version", 0), arrays, digest)
+    return Weights(integer(fields["version"], "version", 0, _LARGEST), arrays, digest)
 
 
 def encode_job(job: Job) -> bytes:
@@ -132,12 +135,13 @@ def encode_job(job: Job) -> bytes:
             "stage": job.stage,
             "round": job.round,
             "task": job.task,
-            "variations": [_from_variation(v) for v in job.variations],
+            "variations": [from_variation(v) for v in job.variations],
             "trials": job.trials,
             "weights": job.weights,
             "seed": job.seed,
             "settings": _from_params(job.settings),
             "tasks": job.tasks,
+            "first": job.first,
         },
     )
 
@@ -150,12 +154,13 @@ def decode_job(data: bytes, limit: int = SMALL) -> Job:
         stage=_stage(fields["stage"]),
         round=integer(fields["round"], "round", 0),
         task=integer(fields["task"], "task", 0),
-        variations=tuple(_to_variation(v) for v in as_list(fields["variations"], "variations")),
+        variations=tuple(to_variation(v) for v in as_list(fields["variations"], "variations")),
         trials=integer(fields["trials"], "trials", 0),
         weights=integer(fields["weights"], "weights", -1),
         seed=integer(fields["seed"], "seed", 0),
         settings=_to_params(fields["settings"], "settings"),
         tasks=integer(fields["tasks"], "tasks", 1),
+        first=integer(fields["first"], "first", 0),
     )
 
 
@@ -196,7 +201,7 @@ def monitor_trajectory(trajectory: Trajectory, time: float) -> bytes:
 _ALWAYS = {"v", "kind"}
 _TRAJECTORY = _ALWAYS | {"identity", "variation", "weights", "digest", "worker", "origin", "arrays"}
 _WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}
-_JOB = _ALWAYS | {"job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings", "tasks"}
+_JOB = _ALWAYS | {"job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings", "tasks", "first"}
 
 
 def _fields(data: bytes, limit: int, kind: str, names: Set[str]) -> dict[str, Any]:
@@ -214,7 +219,7 @@ def _stage(value: object) -> str:
 
 def _to_identity(value: object) -> Identity:
     stage, *numbers = as_list(value, "identity", 5)
-    return Identity(_stage(stage), *(integer(n, "identity", 0) for n in numbers))
+    return Identity(_stage(stage), *(integer(n, "identity", 0, _LARGEST) for n in numbers))
 
 
 def _from_params(params: Params) -> list[object]:
@@ -240,11 +245,13 @@ def _to_value(value: object, what: str) -> Value:
     return tuple(numbers)
 
 
-def _from_variation(variation: Variation) -> list[object]:
+def from_variation(variation: Variation) -> list[object]:
+    """A variation as plain lists."""
     return [[named.kind, _from_params(named.params)] for named in (variation.task, variation.adversary)]
 
 
-def _to_variation(value: object) -> Variation:
+def to_variation(value: object) -> Variation:
+    """The inverse of ``from_variation``, checked."""
     (task, of_task), (adversary, of_adversary) = (as_list(named, "variation", 2) for named in as_list(value, "variation", 2))
     return Variation(
         Task(text(task, "task"), _to_params(of_task, "task")),

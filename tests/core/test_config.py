@@ -28,7 +28,7 @@ def test_defaults_are_a_possible_run() -> None:
 def test_dumps_is_read_back(small_run: Run) -> None:
     changed = dataclasses.replace(
         small_run,
-        stream=StreamConfig(endpoint='tcp/"quoted" \\ back\nslash\té:0'),
+        stream=StreamConfig(endpoint="tls/[::1]:0", certificates='"quoted" \\ back\nslash\té'),
         optim=dataclasses.replace(small_run.optim, learning_rate=1e-05, clip=1e16),
         evaluate=dataclasses.replace(small_run.evaluate, p=(0.0, 0.125, 1.0)),
     )

@@ -10,10 +10,10 @@ from icrl_dist import InContextAgent, evaluate, make
 from icrl_dist.agent import load_agent
 from icrl_dist.config import ConfigError, ContextConfig
 from icrl_dist.envs import spec, tasks
+from icrl_dist.files import StoreError
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, optimal_returns
 from icrl_dist.stats import mean_and_error
-from icrl_dist.store import StoreError
 
 
 @pytest.fixture

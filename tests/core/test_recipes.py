@@ -9,7 +9,7 @@ from icrl_dist import jobs
 from icrl_dist.envs import tasks
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, cell_numbers, soft_labels
-from icrl_dist.recipes import METHODS, by_variation, self_labelled
+from icrl_dist.recipes import METHODS, self_labelled
 from icrl_dist.types import NULL, Identity
 
 
@@ -19,9 +19,11 @@ class Kept:
     def __init__(self, trajectories):
         self.trajectories = list(trajectories)
 
-    def select(self, stage, round_):
-        chosen = [t for t in self.trajectories if t.identity[:2] == (stage, round_)]
-        return iter(sorted(chosen, key=lambda t: t.identity.key()))
+    def variations(self, stage, round_):
+        return sorted({t.identity[:4] for t in self.trajectories if t.identity[:2] == (stage, round_)})
+
+    def trials(self, key):
+        return sorted((t for t in self.trajectories if t.identity[:4] == key), key=lambda t: t.identity.trial)
 
 
 class Fixed:
@@ -139,8 +141,8 @@ def test_sampled_labels_are_single_optimal_actions(small_run):
 
 
 def test_labels_come_from_strictly_later_trials_than_contexts(small_run, collected):
-    adapt = [t for t in collected[0] if t.identity[:2] == ("adapt", 0)]
-    for trials in by_variation(sorted(adapt, key=lambda t: t.identity.key())):
+    data = Kept(collected[0])
+    for trials in map(data.trials, data.variations("adapt", 0)):
         made = self_labelled(small_run, trials)
         cut = small_run.icaa.context_trials + 1
         np.testing.assert_array_equal(made.actions, np.stack([t.actions for t in trials[:cut]]))
@@ -150,8 +152,7 @@ def test_labels_come_from_strictly_later_trials_than_contexts(small_run, collect
 
 def test_top_return_takes_the_better_half_of_the_later_trials(small_run, collected):
     run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, label_trials="top_return"))
-    adapt = [t for t in collected[0] if t.identity[:2] == ("adapt", 0)]
-    trials = next(by_variation(sorted(adapt, key=lambda t: t.identity.key())))
+    trials = Kept(collected[0]).trials(("adapt", 0, 0, 0))
     better = []
     for n, t in enumerate(trials):
         rewards = np.full(8, float(n == 3), np.float32)

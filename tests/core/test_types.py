@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from icrl_dist.oracle import cell_numbers
-from icrl_dist.types import ARRAYS, NULL, STAGES, Identity, Job, Spec, Task, Trajectory, Variation
+from icrl_dist.types import ARRAYS, NULL, STAGES, Adversary, Identity, Job, Spec, Task, Trajectory, Variation
 
 
 def trajectory(horizon: int = 3, **changes: Any) -> Trajectory:
@@ -121,9 +122,22 @@ def test_a_job_names_every_trajectory_it_will_deliver() -> None:
     names = list(job.identities())
     assert names == [Identity("adapt", 2, 5, v, t) for v in range(3) for t in range(4)]
     assert job.setting("rate") == 0.5
-    assert job.name == ("adapt", 2, 5)
+    assert (job.name, job.label) == (("adapt", 2, 5, 0), "adapt/2/5")
     with pytest.raises(KeyError, match=r"'speed'.*rate"):
         job.setting("speed")
+
+
+def test_a_job_of_one_variation_keeps_that_variations_number() -> None:
+    tasks = tuple(
+        Variation(Task.of("darkroom", goal=(g, g)), Adversary.of("uniform", p=p)) for g in range(2) for p in (0.0, 0.5)
+    )
+    whole = Job("adapt", "adapt", 0, 4, tasks, 2, 0, 0, tasks=2)
+    for row, (task, variation) in enumerate(whole.rows()):
+        one = dataclasses.replace(whole, task=task, variations=(tasks[row],), tasks=1, first=variation)
+        assert list(one.identities()) == [Identity("adapt", 0, task, variation, trial) for trial in range(2)]
+        assert {one.variation(identity) for identity in one.identities()} == {tasks[row]}
+        assert all(whole.variation(identity) == tasks[row] for identity in one.identities())
+        assert (one.name, one.label) == (("adapt", 0, task, variation), f"adapt/0/{task}/{variation}")
 
 
 def test_spec_counts_components() -> None:

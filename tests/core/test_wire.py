@@ -54,7 +54,7 @@ def weights() -> Weights:
     return Weights(3, arrays, wire.weights_digest(arrays))
 
 
-JOB = Job("adapt", "adapt", 1, 2, VARIATIONS, 4, 0, 2**40, (("beta", 1.0), ("count", 1), ("name", "x")), tasks=2)
+JOB = Job("adapt", "adapt", 1, 2, VARIATIONS, 4, 0, 2**40, (("beta", 1.0), ("count", 1), ("name", "x")), tasks=1, first=3)
 
 ENCODED: dict[str, tuple[bytes, Callable[[bytes], object]]] = {
     "weights": (wire.encode_weights(weights()), lambda data: wire.decode_weights(data, LIMIT)),

@@ -7,8 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,64 +16,21 @@ import pytest
 from icrl_dist import recipes
 from icrl_dist.agent import load_agent
 from icrl_dist.config import load
-from icrl_dist.store import Store, version_file
-from icrl_dist.stream import wire
+from icrl_dist.files import version_file
+from icrl_dist.store import Store
 from icrl_dist.stream.link import Refused
-from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import checkpoints
-
-CLI = [sys.executable, "-m", "icrl_dist.cli"]
-# Rounds long enough to be disturbed in the middle.
-LONGER = ["--icaa.trials", "40", "--icaa.context-trials", "10"]
-
-
-def start(*arguments, **options):
-    return subprocess.Popen(
-        [*CLI, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
-    )
-
-
-def finish(process, timeout=90):
-    output, _ = process.communicate(timeout=timeout)
-    return output
-
-
-def result_of(folder):
-    return json.loads((folder / "result.json").read_text())
-
-
-def wait_for(condition, what, timeout=60):
-    deadline = time.monotonic() + timeout
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
-        time.sleep(0.02)
-    return value
-
-
-def endpoint_of(folder):
-    file = folder / "endpoint"
-    return wait_for(lambda: file.exists() and file.read_text().strip(), "the learner listening")
-
-
-@contextlib.contextmanager
-def on_first_adapt_trajectory(folder, act):
-    """Calls ``act`` once, when a trajectory of round 0 shows on the monitor plane."""
-    acted = threading.Event()
-
-    def hear(key, payload):
-        _, fields = wire.decode_message(payload)
-        if fields["identity"].startswith("adapt/0") and not acted.is_set():
-            acted.set()
-            act()
-
-    with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
-        link.subscribe(f"icrl/{folder.name}/mon/trajectory/**", hear)
-        acted.link = link
-        yield acted
-
-
-def workers_of(process):
-    return [p for p in psutil.Process(process.pid).children(recursive=True) if "_Host" in " ".join(p.cmdline())]
+from tests.e2e.training import (
+    CLI,
+    LONGER,
+    endpoint_of,
+    equal,
+    finish,
+    on_first_adapt_trajectory,
+    result_of,
+    start,
+    workers_of,
+)
 
 
 @pytest.fixture(scope="module")
@@ -107,27 +62,13 @@ def undisturbed(tmp_path_factory):
     return folder, output, lines
 
 
-@pytest.fixture(scope="module")
-def longer(tmp_path_factory):
-    """The longer run in one process: what every disturbed one must equal."""
-    folder = tmp_path_factory.mktemp("runs") / "inline"
-    process = start("train", "smoke", *LONGER, "--engine", "inline", "--out", folder)
-    output = finish(process)
-    assert process.returncode == 0, output
-    return result_of(folder)
-
-
-def equal(result, other):
-    return all(result[name] == other[name] for name in ("dataset_digest", "weights_digest", "trajectories"))
-
-
 def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undisturbed):
     folder, _, _ = undisturbed
     run = load(str(folder / "run.toml"))
     method = recipes.METHODS[run.method]
     wanted = {i for phase in method.phases(run) for job in method.ask(run, phase) for i in job.identities()}
     store = Store(folder / "dataset")
-    trajectories = [store.read(identity) for identity in store.index]
+    trajectories = [store.read(row.identity) for row in store.ledger]
     store.close()
     assert {t.identity for t in trajectories} == wanted and len(trajectories) == len(wanted)
     assert {t.worker for t in trajectories} == {"w0", "w1"}
@@ -171,14 +112,14 @@ def test_acting_with_zeroed_weights_changes_the_actions(undisturbed):
 def test_tap_and_the_documented_script_print_a_line_a_trajectory(undisturbed):
     folder, _, lines = undisturbed
     store = Store(folder / "dataset")
-    stored = {str(identity) for identity in store.index}
+    stored = {str(row.identity) for row in store.ledger}
     store.close()
     for name in ("tap", "documented"):
         heard = [json.loads(line) for line in lines[name]]
         identities = [fields["identity"] for fields in heard]
         assert identities and set(identities) <= stored, name
         # Connected before the first round began, and nobody was slow: all of the last round.
-        assert sum(i.startswith("adapt/1") for i in identities) == 84, name
+        assert sum(i.startswith("adapt/1") for i in identities) == 434, name
 
 
 def test_evaluate_prints_returns_beside_the_oracles(undisturbed):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from icrl_dist import envs, jobs
+from icrl_dist.files import StoreError
 from icrl_dist.recipes import METHODS
-from icrl_dist.store import Store, StoreError
+from icrl_dist.store import Store
 from icrl_dist.stream import batch, wire
 from icrl_dist.types import Identity
 from learner.inbox import REASONS, Inbox
@@ -186,6 +187,42 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
     assert all(q.answered.wait(5) for q in queries)
     inbox.close()
     store.close()
+
+
+def test_the_queue_is_bounded_in_bytes_and_lets_one_in_however_large(tmp_path, small_run, job, trajectories):
+    gate = threading.Event()
+    store = Store(tmp_path / "gated")
+    spec = envs.spec(job.variations[0].task)
+    payloads = [wire.encode_trajectory(t) for t in trajectories[:4]]
+    size = len(payloads[0])
+    for room, expected in ((2 * size + size // 2, 2), (size // 2, 1)):
+        gate.clear()
+        inbox = Inbox(
+            store, spec, 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity_bytes=room
+        )
+        query = Asked(batch.join(payloads))
+        inbox.put(query)
+        assert inbox.drops == {"busy": 4 - expected}
+        gate.set()
+        assert query.answered.wait(5)
+        assert batch.reasons(query.answer, 4) == [""] * expected + ["busy"] * (4 - expected)
+        inbox.close()  # what was taken in is done with, so there is room again
+        assert inbox._room._count == inbox._room._size == 0
+    store.close()
+
+
+def test_numbers_that_the_ledger_cannot_hold_are_refused_and_harm_nothing(inbox, trajectories):
+    message = msgpack.unpackb(wire.encode_trajectory(trajectories[0]))
+    for number in (1 << 31, (1 << 64) - 1):
+        message["identity"][4] = number
+        assert put(inbox, msgpack.packb(message)).startswith("schema: identity")
+    assert put(inbox, wire.encode_trajectory(trajectories[0])) == "" and inbox.failures == []
+
+
+def test_large_numbers_are_finite(inbox, trajectories):
+    rewards = np.full_like(trajectories[0].rewards, 3e38)
+    assert put(inbox, wire.encode_trajectory(dataclasses.replace(trajectories[0], rewards=rewards))) == ""
+    assert inbox.commits == 1
 
 
 def test_a_full_disk_acknowledges_nothing_and_is_reported(inbox, trajectories, monkeypatch):

@@ -9,7 +9,8 @@ import pytest
 from icrl_dist import launch
 from icrl_dist.agent import load_agent
 from icrl_dist.config import ConfigError
-from icrl_dist.store import Store, version_file
+from icrl_dist.files import version_file
+from icrl_dist.store import Store
 from learner import checkpoints, service
 
 
@@ -40,15 +41,15 @@ def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small
     folder = tmp_path / "undisturbed"
     store = Store(folder / "dataset")
     versions = [checkpoints.read_manifest(version_file(folder, v)) for v in range(3)]
-    for identity in store.index:
+    for identity in [row.identity for row in store.ledger]:
         t = store.read(identity)
         if identity.stage == "adapt":
             assert (t.weights, t.digest) == (identity.round, versions[identity.round]["weights_digest"])
         else:
             assert (t.weights, t.digest) == (-1, "")
-    store.close()
     adapt = 7 * 3 * (small_run.icaa.trials + 1)
     assert undisturbed["trajectories"] == len(store) == 42 + 2 * adapt
+    store.close()
     assert undisturbed["weights_digest"] == versions[2]["weights_digest"]
     assert undisturbed["version"] == 2 and undisturbed["drops"] == {}
 
@@ -120,5 +121,5 @@ def test_a_job_that_always_fails_ends_the_run_with_its_cause(small_run, tmp_path
         raise ZeroDivisionError("the environment broke")
 
     monkeypatch.setattr(jobs, "random_context", broken)
-    with pytest.raises(launch.TrainFailed, match=r"failed 3 times, last: ZeroDivisionError: the environment broke"):
+    with pytest.raises(launch.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"):
         run_inline(small_run, tmp_path / "broken")

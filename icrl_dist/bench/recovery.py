@@ -1,0 +1,209 @@
+"""How soon a run is at work again: a worker killed, then the learner, with many trajectories stored.
+
+The run is real, through Ray workers and Zenoh; times are from the SIGKILL on.  What the dataset
+takes on disk beside the bytes of its arrays is measured on the way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from icrl_dist.config import ConfigError
+from icrl_dist.store import Store
+from icrl_dist.stream import wire
+from icrl_dist.stream.link import Keys, Refused, Unanswered
+from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.types import Identity
+
+_TASKS = 39  # to train on in a 7x7 room
+_TOGETHER = 4  # of them in a job
+
+
+def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3) -> dict[str, Any]:
+    """Kill a worker ``kills`` times, then the learner once ``trajectories`` are stored.
+
+    ``worker_s``: until another sends the first trajectory of the killed worker's job, the median;
+    ``learner_s``: until the learner answers a worker again.  Raises ConfigError for numbers that
+    are not above 0, RuntimeError if the run ended before.
+    """
+    if trajectories < 1 or kills < 1:
+        raise ConfigError(f"bench recovery: trajectories = {trajectories}, kills = {kills}: must be above 0")
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix="recovery-") as scratch:
+        out = Path(scratch) / "recovery"
+        with _training(out, trajectories) as process:
+            endpoint = _wait(lambda: _endpoint(out), process)
+            with ZenohLink.connect(endpoint, 60.0) as link:
+                heard = _Heard(link, out.name, process)
+                waits = [heard.kill_a_worker((n + 1) * trajectories // (2 * kills + 2)) for n in range(kills)]
+                heard.until(trajectories)
+                learner_s, stored = _kill_the_learner(process, link, out)
+        used = sum(file.stat().st_size for file in (out / "dataset").iterdir())
+        store = Store(out / "dataset", readonly=True)
+        raw = sum(a.nbytes for row in store.ledger for a in store.read(row.identity).arrays().values())
+        found = len(store)
+        store.close()
+    return {
+        "worker_s": round(statistics.median(waits), 3),
+        "worker_worst_s": round(max(waits), 3),
+        "learner_s": round(learner_s, 2),
+        "trajectories": stored,
+        "disk_ratio": round(used / raw, 3),
+        "bytes_a_trajectory": round(used / found, 1),
+    }
+
+
+def describe(result: dict[str, Any]) -> str:
+    """The result as three lines."""
+    return (
+        f"a killed worker's job ran again after {result['worker_s']:.2f} s (worst {result['worker_worst_s']:.2f} s)\n"
+        f"a killed learner with {result['trajectories']} trajectories answered again after {result['learner_s']:.1f} s\n"
+        f"the dataset takes {result['disk_ratio']:.3f} times its arrays' bytes, {result['bytes_a_trajectory']:.0f} a trajectory"
+    )
+
+
+class _Heard:
+    """What the run says: the trajectories that are sent, how many are stored, whose job goes to another."""
+
+    def __init__(self, link: ZenohLink, name: str, process: subprocess.Popen[str]) -> None:
+        self._process = process
+        self._changed = threading.Condition()
+        self._stored = 0
+        self._sent: list[tuple[float, str, Identity]] = []
+        self._freed: list[tuple[str, str]] = []
+        link.subscribe(Keys(name).monitor_all, self._hear)
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        kind, fields = wire.decode_message(payload)
+        with self._changed:
+            if kind == "learner":
+                self._stored = fields["trajectories"]
+            elif kind == "trajectory":
+                self._sent.append((time.monotonic(), fields["worker"], Identity.parse(fields["identity"])))
+            self._changed.notify_all()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if found := re.match(r"worker (\S+) is gone; its job goes to another: (\S+)", line):
+                with self._changed:
+                    self._freed.append((found[1], found[2]))
+                    self._changed.notify_all()
+
+    def until(self, stored: int) -> None:
+        """Wait until so many trajectories are stored."""
+        while self._stored < stored:
+            _alive(self._process)
+            with self._changed:
+                self._changed.wait(0.1)
+
+    def kill_a_worker(self, stored: int) -> float:
+        """SIGKILL a worker that is at work; seconds until another sends a trajectory of its job."""
+        self.until(stored)
+        for _ in range(10):
+            with self._changed:
+                self._freed.clear()
+                self._sent.clear()
+            family = psutil.Process(self._process.pid).children(recursive=True)
+            os.kill(min(host.pid for host in family if "_Host" in _words(host)), signal.SIGKILL)
+            began = time.monotonic()
+            if (when := self._done_again()) is not None:
+                return when - began
+        raise RuntimeError("ten workers were killed, and none held a job")
+
+    def _done_again(self) -> float | None:
+        """When a trajectory of the job that was freed was sent; None if none was freed."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._freed, 10):
+                return None
+            dead, label = self._freed[0]
+            stage, round_, task = label.split("/")[:3]
+
+            def again() -> float | None:
+                wanted = (stage, int(round_), range(int(task), int(task) + _TOGETHER))
+                hits = (
+                    when for when, worker, i in self._sent if worker != dead and i[:2] == wanted[:2] and i.task in wanted[2]
+                )
+                return next(hits, None)
+
+            if not self._changed.wait_for(lambda: again() is not None, 60):
+                raise RuntimeError(f"job {label} of the killed worker {dead} did not run again within 60 s")
+            return again()
+
+
+@contextlib.contextmanager
+def _training(out: Path, trajectories: int) -> Iterator[subprocess.Popen[str]]:
+    contexts = 2 * trajectories // _TASKS * _TASKS
+    numbers = ("--method", "dpt", "--stream.job-tasks", str(_TOGETHER), "--pretrain.contexts", str(contexts))
+    command = [sys.executable, "-u", "-m", "icrl_dist.cli", "train", "demo", "--out", str(out), *numbers]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, start_new_session=True)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(60)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path) -> tuple[float, int]:
+    (learner,) = [child for child in psutil.Process(process.pid).children() if "-m learner" in _words(child)]
+    learner.kill()
+    learner.wait(10)
+    began = time.monotonic()
+    hello = wire.encode_message("ask-nothing", worker="bench")
+    while time.monotonic() < began + 120:
+        _alive(process)
+        try:
+            link.request(Keys(out.name).work, hello, timeout_s=0.5)
+        except Refused:  # it answers: it knows no such message
+            break
+        except Unanswered:
+            time.sleep(0.02)
+    answered = time.monotonic() - began
+    store = Store(out / "dataset", readonly=True)
+    try:
+        return answered, len(store)
+    finally:
+        store.close()
+
+
+def _endpoint(out: Path) -> str:
+    with contextlib.suppress(FileNotFoundError):
+        return (out / "endpoint").read_text().strip()
+    return ""
+
+
+def _wait(condition: Callable[[], str], process: subprocess.Popen[str]) -> str:
+    while not (found := condition()):
+        _alive(process)
+        time.sleep(0.05)
+    return found
+
+
+def _alive(process: subprocess.Popen[str]) -> None:
+    if process.poll() is not None:
+        raise RuntimeError(f"the run ended, exit code {process.returncode}; `icrl-dist doctor` may say why")
+
+
+def _words(process: psutil.Process) -> str:
+    with contextlib.suppress(psutil.Error):
+        return " ".join(process.cmdline())
+    return ""

@@ -1,0 +1,164 @@
+"""Does anything grow?  The memory of every process of a long run, and the slope of each.
+
+The run is real: short ICAA rounds without end, through Ray workers, Zenoh and the store, with a
+fit, a checkpoint and a broadcast every few seconds, under a small memory of the dataset.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from icrl_dist.config import ConfigError
+
+_NUMBERS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
+_PERIOD_S = 1.0
+WARM_UP = 0.4
+"""Share of the time that is not measured: imports, first batches and caches fill up in it."""
+
+Report = Callable[[float, str], None]
+
+
+def run(seconds: float = 600.0, folder: Path = Path("runs"), report: Report = lambda elapsed, text: None) -> dict[str, Any]:
+    """Run for ``seconds`` and measure; ``folder`` takes a temporary run folder and ``soak.png``.
+
+    ``worst_mb_per_min`` is the largest slope of private memory (RssAnon) after the warm-up, by
+    the median of all slopes between two samples.  Raises ConfigError for a time too short to
+    measure a slope in, RuntimeError if the run ended before.
+    """
+    if seconds < 30:
+        raise ConfigError(f"bench soak: seconds = {seconds:g}: a slope needs at least 30")
+    folder.mkdir(parents=True, exist_ok=True)
+    samples: dict[str, list[tuple[float, float]]] = {}
+    with tempfile.TemporaryDirectory(dir=folder, prefix="soak-") as scratch, _training(Path(scratch) / "soak") as process:
+        began = _until_it_works(process, Path(scratch) / "soak")
+        while (elapsed := time.monotonic() - began) < seconds:
+            if process.poll() is not None:
+                raise RuntimeError(f"the run ended after {elapsed:.0f} s, exit code {process.returncode}")
+            for name, mb in _memory(process.pid):
+                samples.setdefault(name, []).append((elapsed, mb))
+            report(elapsed, _progress(Path(scratch) / "soak"))
+            time.sleep(_PERIOD_S)
+        done = json.loads(_progress(Path(scratch) / "soak"))
+    whole = {name: points for name, points in samples.items() if points[-1][0] - points[0][0] > 0.95 * seconds}
+    rows = [
+        {"process": name, "mb_per_min": round(_slope(points, seconds), 3), "mb": round(points[-1][1], 1)}
+        for name, points in sorted(whole.items())
+    ]
+    return {
+        "worst_mb_per_min": max(float(str(row["mb_per_min"])) for row in rows),
+        "seconds": seconds,
+        "warm_up_s": WARM_UP * seconds,
+        "processes": rows,
+        "short_lived": sorted(samples.keys() - whole.keys()),
+        **done,
+        "figure": str(_plot(whole, seconds, folder / "soak.png")),
+    }
+
+
+def describe(result: dict[str, Any]) -> str:
+    """A line a process, the steepest first."""
+    rows = sorted(result["processes"], key=lambda row: -row["mb_per_min"])
+    lines = [f"{'process':<28}{'MB/min':>8}{'MB':>8}"]
+    lines += [f"{row['process']:<28}{row['mb_per_min']:>8.2f}{row['mb']:>8.1f}" for row in rows]
+    lines += [f"{result['trajectories']} trajectories, weights version {result['version']}, {result['seconds']:.0f} s"]
+    return "\n".join([*lines, f"worst {result['worst_mb_per_min']:.2f} MB/min; figure {result['figure']}"])
+
+
+@contextlib.contextmanager
+def _training(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "icrl_dist.cli", "train", "smoke", "--out", str(folder), *_NUMBERS]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(60)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _until_it_works(process: subprocess.Popen[bytes], folder: Path, timeout_s: float = 120.0) -> float:
+    deadline = time.monotonic() + timeout_s
+    while json.loads(_progress(folder))["version"] < 1:
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise RuntimeError(f"the run did not begin: exit code {process.returncode}; `icrl-dist doctor` may say why")
+        time.sleep(0.2)
+    return time.monotonic()
+
+
+def _progress(folder: Path) -> str:
+    """How far the run is, from its metrics: trajectories and newest version, as JSON."""
+    trajectories, version = 0, -1
+    with contextlib.suppress(FileNotFoundError):
+        for line in (folder / "metrics.jsonl").read_text().splitlines():
+            row = json.loads(line)
+            if row["stage"] == "collect":
+                trajectories += row["trajectories"]
+            elif row["stage"] == "version":
+                version = row["step"]
+    return json.dumps({"trajectories": trajectories, "version": version})
+
+
+def _memory(pid: int) -> Iterator[tuple[str, float]]:
+    """Name and private memory, MB, of a process and all that it started."""
+    with contextlib.suppress(psutil.Error):
+        root = psutil.Process(pid)
+        for process in (root, *root.children(recursive=True)):
+            with contextlib.suppress(psutil.Error, OSError):
+                status = Path(f"/proc/{process.pid}/status").read_text()
+                found = re.search(r"RssAnon:\s+(\d+) kB", status)
+                if found:
+                    yield f"{_name(process, root)} {process.pid}", int(found[1]) / 1024
+
+
+def _name(process: psutil.Process, root: psutil.Process) -> str:
+    words = " ".join(process.cmdline())
+    if process == root:
+        return "icrl-dist train"
+    if "-m learner" in words:
+        return "learner"
+    return "worker" if "_Host" in words else process.name()[:20]
+
+
+def _slope(points: list[tuple[float, float]], seconds: float) -> float:
+    """MB a minute by Theil and Sen: the median slope between any two samples after the warm-up."""
+    from scipy.stats import theilslopes
+
+    after = np.array([point for point in points if point[0] > WARM_UP * seconds])
+    return float(theilslopes(after[:, 1], after[:, 0] / 60)[0])
+
+
+def _plot(samples: dict[str, list[tuple[float, float]]], seconds: float, path: Path) -> Path:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axis = pyplot.subplots(figsize=(8, 4.2))
+    for name, points in sorted(samples.items(), key=lambda item: -item[1][-1][1])[:8]:
+        minutes, mb = np.array(points).T
+        axis.plot(minutes / 60, mb, label=f"{name.rsplit(' ', 1)[0]}: {_slope(points, seconds):+.2f} MB/min", linewidth=1.4)
+    axis.axvspan(0, WARM_UP * seconds / 60, color="black", alpha=0.06, linewidth=0)
+    axis.set(xlabel="minutes (grey: warm-up, not measured)", ylabel="private memory, MB", ylim=(0, None))
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axis.grid(alpha=0.25)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+    return path

@@ -1,0 +1,241 @@
+"""The eight faults: each disturbs one training, lets it finish, and says what shows that it landed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from icrl_dist import segment
+from icrl_dist.chaos.disk import PAGE, Disk
+from icrl_dist.chaos.proxy import Proxy
+from icrl_dist.chaos.schedule import Strike
+from icrl_dist.chaos.training import Broken, Training, gone
+from icrl_dist.store import Store
+
+STOP_S, CUT_S = 15.0, 12.0
+"""How long the learner is stopped, and the link cut: beyond ``stream.reply_timeout_s``."""
+
+
+@dataclass(frozen=True)
+class Struck:
+    """What a fault did."""
+
+    where: str
+    """How far the run was."""
+    landed: bool
+    evidence: str
+    result: dict[str, Any]
+    """The run's, at its end."""
+
+
+class Missed(Exception):  # noqa: N818
+    """The strike found nothing to hit; the message says why."""
+
+
+def kill_worker(training: Training, strike: Strike, room: int) -> Struck:
+    """SIGKILL of a drawn worker; another takes its place."""
+    training.start()
+    where = _reach(training, strike)
+    workers = training.workers()
+    if not workers:
+        raise Missed("there was no worker")
+    victim = workers[strike.worker % len(workers)]
+    victim.kill()
+    result = training.result()
+    deaths = result["worker_deaths"]
+    return Struck(where, bool(deaths) and gone(victim), f"process {victim.pid} is gone, worker deaths: {deaths}", result)
+
+
+def kill_learner(training: Training, strike: Strike, room: int) -> Struck:
+    """SIGKILL of the learner, while it collects or fits; it starts again from its checkpoint and its dataset."""
+    training.start()
+    where = _reach(training, strike)
+    victim = _learner(training)
+    victim.kill()
+    result = training.result()
+    deaths = result["learner_deaths"]
+    return Struck(where, bool(deaths) and gone(victim), f"process {victim.pid} is gone, learner deaths: {deaths}", result)
+
+
+def kill_tree(training: Training, strike: Strike, room: int) -> Struck:
+    """SIGKILL of every process at once, then ``--resume``."""
+    where, killed = _kill_all(training, strike)
+    result = _resume(training)
+    return Struck(where, True, f"all of {killed} processes gone, resumed", result)
+
+
+def stop_learner(training: Training, strike: Strike, room: int) -> Struck:
+    """SIGSTOP of the learner for 15 s: longer than a worker waits for an answer."""
+    training.start()
+    where = _reach(training, strike)
+    learner = _learner(training)
+    learner.suspend()
+    try:
+        time.sleep(STOP_S)
+        stood = learner.status() == psutil.STATUS_STOPPED
+    finally:
+        learner.resume()
+    result = training.result()
+    return Struck(
+        where, stood and result["resent"] > 0, f"stopped: {stood}, trajectories sent again: {result['resent']}", result
+    )
+
+
+def cut_link(training: Training, strike: Strike, room: int) -> Struck:
+    """Nothing passes between workers and learner for 12 s, and neither side is told."""
+    with Proxy(training.target) as proxy:
+        training.start("--stream.connect", f"tcp/127.0.0.1:{proxy.port}")
+        where = _reach(training, strike)
+        before, printed = proxy.forwarded, len(training.output)
+        proxy.cut()
+        time.sleep(CUT_S)
+        proxy.mend()
+        result = training.result()
+        after = training.output[printed:]
+    back, resent = after.count("is back"), result["resent"]
+    evidence = f"{before >> 10} KiB passed before; sent again: {resent}, workers seen gone and back: {back}"
+    return Struck(where, before > 0 and (resent > 0 or back > 0), evidence, result)
+
+
+def torn_tail(training: Training, strike: Strike, room: int) -> Struck:
+    """A power cut amid an append: everything dies, and the newest segment ends in half a frame."""
+    where, _ = _kill_all(training, strike)
+    path = training.segments()[-1] if training.segments() else training.folder
+    found = segment.scan(path) if path.is_file() else segment.Scan()
+    if found.sealed or not found.frames:
+        raise Missed(f"{path.name} had no open end")
+    offset, length = found.frames[-1]
+    start = offset - segment.HEADER_BYTES
+    whole = path.read_bytes()
+    cut = 1 + int(strike.place * (segment.HEADER_BYTES + length - 2))
+    if strike.odd:
+        path.write_bytes(whole + whole[start : start + cut])
+        did = f"{path.name}: {cut} bytes of a frame added"
+    else:
+        os.truncate(path, len(whole) - cut)
+        did = f"{path.name}: {cut} bytes of the last frame cut off"
+    result = _resume(training)
+    landed = f"{path.name}: cut a torn tail of" in training.output and result["repaired"] > 0
+    return Struck(where, landed, f"{did}, repaired: {result['repaired']}", result)
+
+
+def flip_byte(training: Training, strike: Strike, room: int) -> Struck:
+    """One byte of a sealed segment changes, in a killed run that is resumed, or under a run that is on."""
+    if strike.odd:
+        training.start()
+        where = _reach(training, strike)
+    else:
+        where, _ = _kill_all(training, strike)
+    did, path = _flip(training, strike)
+    result = training.result() if strike.odd else _resume(training)
+    landed = f"{path.name}: took out" in training.output and result["repaired"] > 0
+    how = "while the run was on" if strike.odd else "then resumed"
+    return Struck(where, landed, f"{did} {how}, repaired: {result['repaired']}", result)
+
+
+def _flip(training: Training, strike: Strike) -> tuple[str, Path]:
+    """Change one byte of a sealed segment; says which."""
+    sealed = [(path, found) for path in training.segments() if (found := segment.scan(path)).sealed]
+    if not sealed:
+        raise Missed("no segment was sealed yet")
+    path, found = sealed[strike.worker % len(sealed)]
+    first = found.frames[0][0] - segment.HEADER_BYTES if strike.odd else 0  # what a run that is on reads again
+    place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.odd else 0) - first))
+    with path.open("r+b") as file:
+        file.seek(place)
+        (byte,) = file.read(1)
+        file.seek(place)
+        file.write(bytes([byte ^ 1 << strike.worker % 8]))
+    lost = len(found.frames) - _readable(path)
+    return f"{path.name}: byte {place} of {found.size} changed, which costs {lost} of {len(found.frames)} trajectories", path
+
+
+def _readable(path: Path) -> int:
+    """How many trajectories of a segment are whole, and their names too."""
+    found, count = segment.scan(path), 0
+    with path.open("rb") as file:
+        for offset, length in found.frames:
+            file.seek(offset)
+            with contextlib.suppress(segment.MissingName):
+                segment.decode(file.read(length), found.names)
+                count += 1
+    return count
+
+
+def full_disk(training: Training, strike: Strike, room: int) -> Struck:
+    """The run folder is a disk that fills up; the run ends with the remedy, which is then followed."""
+    size = int((0.1 + 0.9 * strike.place) * room) // PAGE * PAGE
+    with Disk(training.folder, size) as disk:
+        training.prefix, training.view = disk.prefix, disk.view
+        try:
+            training.start()
+            code = training.wait()
+            words = training.output
+            lines = [line for line in words.splitlines() if "No space left on device" in line]
+            if code == 0:
+                raise Missed(f"the run fitted on a disk of {size >> 10} KiB")
+            if code != 1 or len(lines) != 1 or "free space, then use --resume" not in lines[0] or "Traceback" in words:
+                raise Broken(
+                    f"on a full disk: exit code {code}, {len(lines)} lines on it, and at last: {words.splitlines()[-1]}"
+                )
+            store = Store(training.view / "dataset", readonly=True)
+            stored = len(store)
+            store.close()
+            where = f"disk of {size >> 10} KiB, {stored} trajectories stored"
+            disk.grow(4 * room + (64 << 20))
+            result = _resume(training)
+        finally:
+            training.kill()
+            training.prefix, training.view = [], training.folder
+    return Struck(
+        where, True, f"exit code 1: {lines[0].removeprefix('icrl-dist: ').replace(f'{training.folder}/', '')}", result
+    )
+
+
+FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
+    "kill-worker": kill_worker,
+    "kill-learner": kill_learner,
+    "kill-tree": kill_tree,
+    "stop-learner": stop_learner,
+    "cut-link": cut_link,
+    "torn-tail": torn_tail,
+    "flip-byte": flip_byte,
+    "full-disk": full_disk,
+}
+
+
+def _reach(training: Training, strike: Strike) -> str:
+    where = training.reach(strike)
+    if not where:
+        raise Missed(f"the run ended before {strike}")
+    return where
+
+
+def _learner(training: Training) -> psutil.Process:
+    found = training.learner()
+    if found is None:
+        raise Missed("the learner had ended")
+    return found
+
+
+def _kill_all(training: Training, strike: Strike) -> tuple[str, int]:
+    training.start()
+    where = _reach(training, strike)
+    count = len(training.tree())
+    if left := training.kill():
+        raise Broken(f"{len(left)} processes outlived SIGKILL, such as {left[0].pid}")
+    if training.finished():
+        raise Missed("the run had ended")
+    return where, count
+
+
+def _resume(training: Training) -> dict[str, Any]:
+    training.start("--resume")
+    return training.result()

@@ -1,0 +1,81 @@
+"""What a run's numbers may be: well typed is not enough."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from icrl_dist import endpoints
+from icrl_dist.tables import ConfigError
+
+if TYPE_CHECKING:
+    from icrl_dist.config import Run
+
+
+def validate(run: Run, source: str) -> None:
+    """Raises ConfigError for values that are well typed but impossible."""
+
+    def need(condition: bool, where: str, value: object, remedy: str) -> None:
+        if not condition:
+            raise ConfigError(f"{source}: {where} = {value!r}: {remedy}")
+
+    room, icaa, optim = run.darkroom, run.icaa, run.optim
+    need(room.size >= 2, "darkroom.size", room.size, "a room has at least 2 cells a side")
+    need(room.horizon >= 1, "darkroom.horizon", room.horizon, "an episode has at least 1 step")
+    need(0 < room.train_fraction < 1, "darkroom.train_fraction", room.train_fraction, "use a share between 0 and 1")
+    need(0 < room.gamma <= 1, "darkroom.gamma", room.gamma, "a discount lies in (0, 1]")
+    train = round(room.train_fraction * room.size**2)
+    need(0 < train < room.size**2, "darkroom.train_fraction", room.train_fraction, "leave goals to train and to test")
+    need(0 <= run.adversary.p_max <= 1, "adversary.p_max", run.adversary.p_max, "a probability lies in [0, 1]")
+    need(run.adversary.count >= 1, "adversary.count", run.adversary.count, "at least 1, the null adversary")
+    need(run.seed >= 0, "seed", run.seed, "seeds are not negative")
+    for p in run.evaluate.p:
+        need(0 <= p <= 1, "evaluate.p", p, "a probability lies in [0, 1]")
+    need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
+    need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
+    need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
+    need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
+    need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
+    need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
+    need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
+    need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
+    need(run.context.max >= room.horizon, "context.max", run.context.max, "must hold at least one episode")
+    need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
+    need(run.learner.device in ("auto", "cpu", "cuda"), "learner.device", run.learner.device, "use auto, cpu or cuda")
+    for name, endpoint, remedy in endpoints.objections(run.stream.endpoint, run.stream.connect, run.stream.certificates):
+        need(False, f"stream.{name}", endpoint, remedy)
+    positive = {
+        "pretrain.queries": run.pretrain.queries,
+        "pretrain.steps": run.pretrain.steps,
+        "icaa.steps": icaa.steps,
+        "model.layers": run.model.layers,
+        "model.width": run.model.width,
+        "optim.learning_rate": optim.learning_rate,
+        "icaa.learning_rate": icaa.learning_rate,
+        "optim.batch": optim.batch,
+        "optim.queries": optim.queries,
+        "optim.episodes": optim.episodes,
+        "optim.clip": optim.clip,
+        "evaluate.episodes": run.evaluate.episodes,
+        "evaluate.seeds": run.evaluate.seeds,
+        "stream.credits": run.stream.credits,
+        "stream.job_tasks": run.stream.job_tasks,
+        "stream.lease_s": run.stream.lease_s,
+        "stream.reply_timeout_s": run.stream.reply_timeout_s,
+        "stream.max_message_bytes": run.stream.max_message_bytes,
+    }
+    for where, value in positive.items():
+        need(0 < value < math.inf, where, value, "must be above 0 and finite")
+    not_negative = {
+        "darkroom.split_seed": room.split_seed,
+        "darkroom.label_slack": room.label_slack,
+        "model.fourier": run.model.fourier,
+        "optim.weight_decay": optim.weight_decay,
+        "optim.warmup": optim.warmup,
+        "learner.threads": run.learner.threads,
+        "learner.restarts": run.learner.restarts,
+        "stream.staleness": run.stream.staleness,
+        "learner.cache_mb": run.learner.cache_mb,
+    }
+    for where, value in not_negative.items():
+        need(0 <= value < math.inf, where, value, "must not be negative, and be finite")

@@ -1,0 +1,233 @@
+"""Real worker processes and an environment that is hostile to them: in one variation it raises, dies or hangs."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from actors.fleet import Fleet, FleetFailed
+from icrl_dist.recipes import METHODS
+from icrl_dist.stream import batch, wire
+from icrl_dist.stream.link import Keys
+from icrl_dist.stream.zenoh_link import ZenohLink
+from learner.desk import Desk
+from learner.work import Board
+
+KEYS = Keys("test")
+HOSTILE = Path(__file__).parent / "hostile"
+WORKER = """  # hostile-worker
+import sys
+from pathlib import Path
+import torch
+from actors.worker import Worker
+from icrl_dist.stream.zenoh_link import ZenohLink
+torch.set_num_threads(1)
+endpoint, name, folder = sys.argv[1:]
+with ZenohLink.connect(endpoint, timeout_s=30.0) as link:
+    Worker(link, "test", name, folder=Path(folder)).run()
+"""
+
+
+class Learner:
+    """A Board and a Desk on a real link; what arrives is kept by identity."""
+
+    def __init__(self, run, folder, lease_s):
+        self.run, self.folder, self.stored, self.events, self.failures = run, folder, {}, [], []
+        self.jobs = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])[:2]
+        self.everything = {i for job in self.jobs for i in job.identities()}
+        self.lock = threading.Lock()
+        self.board = Board(lease_s, floor_s=lease_s)
+        self.board.open(self.jobs, lambda job: ())
+        self.link = ZenohLink.listen("tcp/127.0.0.1:0")
+        arguments = self.link, KEYS, self.board, self.lock, self.events.append, self.failures.append
+        self.desk = Desk(run, folder, *arguments)
+        self.link.serve(KEYS.data, self.take)
+
+    @property
+    def endpoint(self):
+        return self.link.endpoints[0]
+
+    def take(self, query):
+        for one in batch.split(query, 1 << 20):
+            identity = wire.decode_trajectory(one.payload, 1 << 20).identity
+            with self.lock:
+                if self.board.wants(identity):
+                    assert identity not in self.stored
+                    self.stored[identity] = one.payload
+                    self.board.received(identity, time.monotonic())
+                    done = self.board.done("pretrain", 0)
+                else:
+                    self.board.repeated(identity, time.monotonic())
+                    done = False
+            one.reply(b"stored")
+            if done:
+                self.desk.finish()
+
+    def done(self):
+        with self.lock:
+            done = self.board.done("pretrain", 0)
+        if done:
+            self.desk.finish()
+        return done
+
+    def events_of(self, kind):
+        return [event for event in list(self.events) if event["event"] == kind]
+
+    def records(self):
+        return [json.loads(path.read_text()) for path in sorted((self.folder / "crashes").glob("*.json"))]
+
+    def close(self):
+        self.desk.close()
+        self.link.close()
+
+
+@pytest.fixture
+def learner(small_run, tmp_path):
+    """``learner(lease_s)``: the learner's side of a phase of two jobs."""
+    with contextlib.ExitStack() as stack:
+
+        def made(lease_s):
+            one = Learner(small_run, tmp_path, lease_s)
+            stack.callback(one.close)
+            return one
+
+        yield made
+
+
+@pytest.fixture
+def hostile(small_run, monkeypatch):
+    """``hostile(deed)``: from now on, processes that are started find the second task's second variation hostile."""
+
+    def begin(deed):
+        job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
+        monkeypatch.setenv("HOSTILE", deed)
+        monkeypatch.setenv("HOSTILE_VARIATION", repr(job.variations[4]))
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HOSTILE), str(HOSTILE.parents[2])]))
+
+    return begin
+
+
+CULPRIT = "pretrain/0/1/1"
+
+
+@pytest.fixture
+def worker(learner):
+    """``worker(learner, name)``: a worker in a process of its own; none outlives the test."""
+    with contextlib.ExitStack() as stack:
+
+        def start(learner, name):
+            process = subprocess.Popen(
+                [sys.executable, "-c", WORKER, learner.endpoint, name, str(learner.folder)], stderr=subprocess.PIPE, text=True
+            )
+            stack.callback(process.communicate)
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+def wait_for(condition, what, timeout=60):
+    deadline = time.monotonic() + timeout
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
+        time.sleep(0.02)
+    return value
+
+
+def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(learner, hostile, worker):
+    hostile("raise")
+    learner = learner(60.0)
+    process = worker(learner, "w0")
+    wait_for(learner.done, "the rest of the phase")
+    _, log = process.communicate(timeout=30)
+    assert process.returncode == 0, log
+    assert {i for i in learner.everything if i not in learner.stored} == {
+        i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")
+    }
+    ((name, cause),) = learner.board.blamed()
+    assert name == CULPRIT and cause.startswith("ZeroDivisionError: the room broke (sitecustomize.py:")
+    assert [event["identity"] for event in learner.events_of("quarantine")] == [CULPRIT]
+    assert [record["job"] for record in learner.records()] == ["pretrain/0/0"] * 2 + [CULPRIT]
+    assert learner.records()[2]["identity"] == f"{CULPRIT}/0" and "raise_an_error" in learner.records()[2]["traceback"]
+    assert sorted(path.name for path in (learner.folder / "crashes").iterdir()) == [f"w0-{n}.json" for n in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(("deed", "function"), [("sleep", "sleep_for_ever"), ("hold", "hold_the_interpreter_in_c")])
+def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, hostile, worker, monkeypatch, deed, function):
+    hostile(deed)
+    learner = learner(2.0)
+    process = worker(learner, "w0")
+    _, log = process.communicate(timeout=60)
+    assert process.returncode == 1, log
+    stacks = (learner.folder / "crashes" / "w0.stacks").read_text()
+    assert stacks.startswith("Timeout (0:00:0") and f" in {function}" in stacks and " in random_context" in stacks
+    wait_for(lambda: learner.events_of("crash"), "the record")
+    (record,) = learner.records()
+    assert (record["what"], record["job"]) == ("vanished", "pretrain/0/0")
+    assert record["last_said"]["episodes"] == 0
+    if deed == "sleep":  # the heartbeat went on; nothing does while the interpreter's lock is held
+        assert record["last_said"]["job"] == "pretrain/0/0" and record["last_said"]["memory_mb"] > 10
+    assert any(function in line for line in record["stacks"])
+    monkeypatch.delenv("HOSTILE")
+    process = worker(learner, "w0-1")
+    wait_for(learner.done, "the phase")
+    _, log = process.communicate(timeout=30)
+    assert process.returncode == 0, log
+    assert set(learner.stored) == learner.everything and not learner.board.quarantined
+    assert not (learner.folder / "crashes" / "w0-1.stacks").exists(), "nothing stood in it"
+
+
+def test_a_crash_in_c_leaves_its_stacks(learner, hostile, worker):
+    hostile("segfault")
+    learner = learner(60.0)
+    process = worker(learner, "w0")
+    process.communicate(timeout=60)
+    assert process.returncode < 0
+    wait_for(lambda: learner.events_of("crash"), "the record")
+    (record,) = learner.records()
+    assert record["stacks"][0] == "Fatal Python error: Segmentation fault"
+    assert any("random_context" in line for line in record["stacks"])
+
+
+@pytest.fixture
+def fleet():
+    """``fleet(actors, restarts)``: a real one, on as many cores as there are."""
+    with contextlib.ExitStack() as stack:
+
+        def made(actors, restarts):
+            one = Fleet(actors, restarts, oversubscribe=True)
+            stack.callback(one.close)
+            return one
+
+        yield made
+
+
+def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_others_finish(learner, hostile, fleet):
+    hostile("kill")
+    learner, fleet, notes = learner(60.0), fleet(1, 3), []
+    fleet.start(learner.endpoint, "test", learner.folder)
+    wait_for(lambda: fleet.watch(notes.append, 0) and learner.done(), "the rest of the phase", 100)
+    wait_for(lambda: not fleet.watch(notes.append, 0), "the worker's end")
+    assert (fleet.deaths, len(notes)) == (3, 3) and all("starting it again" in note for note in notes)
+    missing = learner.everything - set(learner.stored)
+    assert missing == {i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")}
+    ((name, cause),) = learner.board.blamed()
+    assert (name, cause) == (CULPRIT, "worker w0-2 died")
+    assert [event["identity"] for event in learner.events_of("quarantine")] == [CULPRIT]
+    wait_for(lambda: len(learner.events_of("crash")) == 3, "the records")
+    assert sorted(record["job"] for record in learner.records()) == ["pretrain/0/0", "pretrain/0/0", CULPRIT]
+
+
+def test_a_fleet_gives_up_on_a_worker_that_keeps_dying_while_nothing_gets_on(learner, hostile, fleet):
+    hostile("exit")
+    learner, fleet, notes = learner(60.0), fleet(1, 1), []
+    fleet.start(learner.endpoint, "test", learner.folder)
+    with pytest.raises(FleetFailed, match="worker w0 died 2 times without progress"):
+        wait_for(lambda: fleet.watch(notes.append, 7) and False, "giving up", 100)
+    assert (fleet.deaths, len(notes)) == (2, 1)

@@ -1,0 +1,170 @@
+"""Faults on purpose: they land, the digests stay, and a fault that does not land fails the command."""
+
+import contextlib
+import dataclasses
+import errno
+import itertools
+import json
+import os
+import select
+import socket
+
+import psutil
+import pytest
+
+from icrl_dist import cli
+from icrl_dist.chaos import campaign, disk, proxy, schedule
+from icrl_dist.chaos.faults import FAULTS, Struck
+from icrl_dist.chaos.outcome import Outcome, verdict
+from icrl_dist.config import ConfigError, load, override
+from icrl_dist.files import StoreError
+from icrl_dist.metrics import Metrics
+
+SMALL = ["--set", "icaa.rounds=0", "--set", "pretrain.steps=20"]
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """The undisturbed run, in one process."""
+    folder = tmp_path_factory.mktemp("chaos") / "undisturbed"
+    assert cli.main(["train", "smoke", *SMALL, "--evaluate.episodes", "1", "--engine", "inline", "--out", str(folder)]) == 0
+    return folder
+
+
+def chaos(capsys, reference, out, *arguments):
+    against = ["--reference", str(reference), "--out", str(out)]
+    code = cli.main(["chaos", "smoke", *SMALL, "--actors", "1", *against, "--json", *arguments])
+    printed = capsys.readouterr()
+    answer = json.loads(printed.out.splitlines()[-1])
+    assert answer["ok"] is (code == 0), printed.err
+    return code, answer["faults"], printed.err
+
+
+def mine():
+    return [p.pid for p in psutil.Process().children(recursive=True)]
+
+
+@pytest.mark.parametrize("fault", ["kill-worker", "torn-tail"])
+def test_a_fault_lands_and_changes_no_digest(capsys, reference, tmp_path, fault):
+    before = mine()
+    code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", fault)
+    assert code == 0 and row["landed"] and row["equal"], text
+    assert {"kill-worker": "worker deaths: 1", "torn-tail": "segment-"}[fault] in row["evidence"]
+    assert row["struck"] and fault in text and "all 1 faults landed" in text
+    assert not list((tmp_path / "seed-0").iterdir()) and mine() == before
+
+
+def test_a_fault_that_does_not_land_fails_the_command(capsys, reference, tmp_path, monkeypatch):
+    draw = schedule.draw
+    late = lambda *drawn: dataclasses.replace(draw(*drawn), phase=1, fit=True, after=10**6)  # noqa: E731
+    monkeypatch.setattr(schedule, "draw", late)
+    monkeypatch.setattr(campaign, "TRIES", 1)
+    code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", "kill-worker")
+    assert code == 1 and not row["landed"] and "the run ended before" in row["evidence"]
+    assert "it did not land" in text and (tmp_path / "seed-0" / "kill-worker" / "result.json").exists()
+
+
+def test_an_unequal_digest_fails_the_command(capsys, reference, tmp_path, monkeypatch):
+    result = json.loads((reference / "result.json").read_text())
+    for name, code in (("dataset_digest", 1), ("weights_digest", 1), ("seconds", 0)):
+        struck = Struck("adapt/0, 7 heard", True, "it died", result | {name: "0" * 64})
+        monkeypatch.setitem(FAULTS, "kill-worker", lambda *_, struck=struck: struck)
+        ended, (row,), text = chaos(capsys, reference, tmp_path, "--faults", "kill-worker")
+        assert ended == code and row["landed"] and row["equal"] is (code == 0) and row["attempts"] == 1
+        assert ("unequal digests" in text) is bool(code)
+
+
+@pytest.mark.parametrize(("landed", "equal"), [(True, True), (True, False), (False, True), (False, False)])
+def test_the_verdict_needs_both(landed, equal):
+    outcome = Outcome(0, "kill-tree", "adapt/0", landed, "", equal)
+    assert outcome.ok is (landed and equal)
+    assert ("every digest equals" in verdict([outcome])) is outcome.ok
+
+
+def test_the_schedule_is_a_function_of_the_seed():
+    run = load("smoke")
+    keys = list(itertools.product(range(20), schedule.FAULTS, (0, 1)))
+    drawn = {key: schedule.draw(run, *key) for key in keys}
+    assert drawn == {key: schedule.draw(run, *key) for key in keys}
+    assert len(set(drawn.values())) == len(drawn)
+    assert all(0 < strike.after <= strike.of / 2 + 1 for strike in drawn.values())
+    for fault in schedule.FAULTS:
+        phases = {strike.name for key, strike in drawn.items() if key[1] == fault}
+        assert phases == {"adapt/0", "adapt/1"} | ({"pretrain/0"} if fault != "flip-byte" else set())
+    assert {strike.fit for strike in drawn.values()} == {False, True}
+
+
+def test_a_run_without_a_sealed_segment_is_told_so():
+    with pytest.raises(ConfigError, match="--faults flip-byte: dpt has one phase"):
+        schedule.draw(override(load("smoke"), ["method=dpt"], "test"), 0, "flip-byte")
+
+
+def test_what_cannot_be_asked_for(capsys, reference, tmp_path):
+    def refused(*arguments):
+        assert cli.main(["chaos", "smoke", "--out", str(tmp_path / "out"), *arguments]) == 2
+        return capsys.readouterr().err
+
+    assert "no such fault; there are kill-worker" in refused("--faults", "kill-all")
+    assert "run of other numbers" in refused("--reference", str(reference), "--set", "seed=1")
+    assert "holds no result" in refused("--reference", str(tmp_path))
+    assert "at least 1" in refused("--seeds", "0")
+
+
+def test_a_cut_link_is_silent_and_loses_nothing():
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        cable = stack.enter_context(proxy.Proxy(server.getsockname))
+        near = stack.enter_context(socket.create_connection(("127.0.0.1", cable.port), timeout=10))
+        far = stack.enter_context(server.accept()[0])
+        near.sendall(b"one")
+        assert far.recv(8) == b"one"
+        cable.cut()
+        near.sendall(b"two")
+        assert not select.select([far], [], [], 0.3)[0]
+        with socket.create_connection(("127.0.0.1", cable.port), timeout=10):
+            server.settimeout(0.3)
+            with pytest.raises(TimeoutError):
+                server.accept()
+            cable.mend()
+            server.settimeout(10)
+            server.accept()[0].close()
+        far.settimeout(10)
+        assert far.recv(8) == b"two"
+        near.shutdown(socket.SHUT_WR)
+        assert far.recv(8) == b""
+
+
+def test_a_disk_is_full_then_larger_and_what_it_held_stays(tmp_path):
+    try:
+        held = disk.Disk(tmp_path / "disk", 8 * disk.PAGE)
+    except disk.NoDisk as error:
+        pytest.skip(f"nothing can be mounted here: {error}")
+    with held:
+        with pytest.raises(OSError) as caught:
+            (held.view / "large").write_bytes(bytes(9 * disk.PAGE))
+        assert caught.value.errno == errno.ENOSPC
+        held.grow(16 * disk.PAGE)
+        (held.view / "large").write_bytes(bytes(9 * disk.PAGE))
+        assert disk.allocated(held.view) == 9 * disk.PAGE
+    assert not os.path.ismount(tmp_path / "disk")
+    assert (tmp_path / "disk" / "large").read_bytes() == bytes(9 * disk.PAGE)
+
+
+def test_metrics_on_a_full_disk_name_the_remedy(tmp_path):
+    (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
+    metrics = Metrics(tmp_path, tensorboard=False)
+    remedy = r"metrics.jsonl: could not be written \(No space left on device\): free space, then use --resume"
+    with pytest.raises(StoreError, match=remedy):
+        metrics.write(1, "fit", loss=1.0)
+    with pytest.raises(StoreError, match=remedy):
+        metrics.close()  # what it holds cannot be written either
+
+
+def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "runs/smoke/report/adaptation.png")
+
+    monkeypatch.setitem(cli.COMMANDS, "doctor", (cli.Doctor, full))
+    assert cli.main(["doctor"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "adaptation.png: could not be written" in line and "free space, then use --resume" in line

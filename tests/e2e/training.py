@@ -1,0 +1,70 @@
+"""Driving real runs from a test: start them, wait for the right moment, hold their results together."""
+
+import contextlib
+import json
+import subprocess
+import sys
+import threading
+import time
+
+import psutil
+
+from icrl_dist.stream import wire
+from icrl_dist.stream.zenoh_link import ZenohLink
+
+CLI = [sys.executable, "-m", "icrl_dist.cli"]
+# Rounds long enough to be disturbed in the middle.
+LONGER = ["--icaa.trials", "40", "--icaa.context-trials", "10"]
+
+
+def start(*arguments, **options):
+    return subprocess.Popen(
+        [*CLI, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
+    )
+
+
+def finish(process, timeout=90):
+    output, _ = process.communicate(timeout=timeout)
+    return output
+
+
+def result_of(folder):
+    return json.loads((folder / "result.json").read_text())
+
+
+def wait_for(condition, what, timeout=60):
+    deadline = time.monotonic() + timeout
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
+        time.sleep(0.02)
+    return value
+
+
+def endpoint_of(folder):
+    file = folder / "endpoint"
+    return wait_for(lambda: file.exists() and file.read_text().strip(), "the learner listening")
+
+
+@contextlib.contextmanager
+def on_first_adapt_trajectory(folder, act):
+    """Calls ``act`` once, when a trajectory of round 0 shows on the monitor plane."""
+    acted = threading.Event()
+
+    def hear(key, payload):
+        _, fields = wire.decode_message(payload)
+        if fields["identity"].startswith("adapt/0") and not acted.is_set():
+            acted.set()
+            act()
+
+    with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
+        link.subscribe(f"icrl/{folder.name}/mon/trajectory/**", hear)
+        acted.link = link
+        yield acted
+
+
+def workers_of(process):
+    return [p for p in psutil.Process(process.pid).children(recursive=True) if "_Host.work" in " ".join(p.cmdline())]
+
+
+def equal(result, other):
+    return all(result[name] == other[name] for name in ("dataset_digest", "weights_digest", "trajectories"))

@@ -1,0 +1,217 @@
+"""Damage, forks and overlapping rounds, whole runs in one process: what is lost is made again, to the byte."""
+
+import dataclasses
+import json
+
+import pytest
+
+from icrl_dist import explain, jobs, launch
+from icrl_dist.config import ConfigError, override
+from icrl_dist.files import StoreError, hold
+from icrl_dist.lineage import parse_source
+from icrl_dist.store import Store
+from icrl_dist.types import Identity
+from learner import service
+from tests.learner.test_service import METRICS, run_inline, same
+
+
+@pytest.fixture(autouse=True)
+def no_tensorboard(monkeypatch):
+    monkeypatch.setattr(service, "Metrics", lambda folder: METRICS(folder, tensorboard=False))
+
+
+@pytest.fixture(scope="module")
+def parent(tmp_path_factory, request):
+    """An undisturbed run that nobody changes: its folder and its result."""
+    run = request.getfixturevalue("module_run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service, "Metrics", lambda folder: METRICS(folder, tensorboard=False))
+        folder = tmp_path_factory.mktemp("runs") / "parent"
+        return folder, run_inline(run, folder), run
+
+
+def copy_of(parent, folder):
+    """The run once more, by itself, to be damaged."""
+    _, result, run = parent
+    assert same(run_inline(run, folder), result)
+    return sorted((folder / "dataset").glob("segment-*"))
+
+
+def flip(path, at):
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("segment", [0, 1])
+def test_a_changed_byte_in_data_of_any_round_is_named_and_collected_again(parent, tmp_path, segment):
+    folder, events = tmp_path / "run", []
+    segments = copy_of(parent, folder)
+    flip(segments[segment], segments[segment].stat().st_size // 2)
+    result = run_inline(parent[2], folder, events.append, resume=True)
+    assert same(result, parent[1]) and result["repaired"] == 1
+    texts = [event["text"] for event in events if "text" in event]
+    assert any(segments[segment].name in text and "damaged range" in text for text in texts)
+    assert any("are missing: collecting them again" in text for text in texts)
+    assert Store(folder / "dataset").digest() == parent[1]["dataset_digest"]
+
+
+def test_a_segment_that_is_gone_is_collected_again_with_the_weights_of_its_round(parent, tmp_path):
+    folder = tmp_path / "run"
+    copy_of(parent, folder)[1].unlink()
+    assert same(run_inline(parent[2], folder, resume=True), parent[1])
+
+
+def test_damage_while_the_run_is_on_is_found_before_it_is_learned_from(parent, tmp_path):
+    folder, struck = tmp_path / "run", []
+
+    def strike(event):
+        if event.get("stage") == "collect" and event.get("phase") == "adapt" and not struck:
+            struck.append(folder / "dataset" / "segment-000000.frames")
+            flip(struck[0], struck[0].stat().st_size // 2)
+        if event["event"] == "repaired":
+            struck.append(event["text"])
+
+    result = run_inline(parent[2], folder, strike)
+    assert len(struck) == 2 and "segment-000000.frames: took out a damaged range" in struck[1]
+    assert same(result, parent[1])
+
+
+def test_one_learner_a_folder(parent, monkeypatch):
+    monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
+    with hold(parent[0]), pytest.raises(StoreError, match="another learner is at work"):
+        run_inline(parent[2], parent[0], resume=True)
+
+
+def test_a_fork_with_the_same_numbers_ends_where_its_parent_did(parent, tmp_path):
+    folder = tmp_path / "fork"
+    assert same(run_inline(parent[2], folder, source=(parent[0], 1)), parent[1])
+    names = [path.name for path in sorted((folder / "dataset").iterdir())]
+    shared = [(folder / "dataset" / n).samefile(parent[0] / "dataset" / n) for n in names]
+    assert shared == [True, True, False]
+    assert (folder / "checkpoints" / "version-0001.npz").samefile(parent[0] / "checkpoints" / "version-0001.npz")
+
+
+def test_a_fork_with_other_numbers_keeps_the_data_that_it_began_with(parent, tmp_path):
+    folder, before = tmp_path / "fork", parent[1]["dataset_digest"]
+    run = override(parent[2], ["adversary.count=2"], "--set")
+    result = run_inline(run, folder, source=(parent[0], 1))
+    counts = [7 * 3 * (run.icaa.trials + 1), 7 * 2 * (run.icaa.trials + 1)]
+    assert result["trajectories"] == 42 + sum(counts) and result["weights_digest"] != parent[1]["weights_digest"]
+    record = json.loads((folder / "fork.json").read_text())
+    assert (record["from"], record["version"]) == (str(parent[0]), 1)
+    assert explain.explain(folder, Identity("adapt", 0, 0, 2, 0))["from_ancestor"]
+    flip(folder / "dataset" / "segment-000002.frames", 60)
+    (folder / "dataset" / "segment-000001.frames").unlink()
+    again = run_inline(run, folder, resume=True)
+    assert same(again, result), "an ancestor's data is asked for with the ancestor's numbers"
+    assert Store(parent[0] / "dataset", readonly=True).digest() == before
+    grandchild = run_inline(run, tmp_path / "grandchild", source=(folder, 2))
+    assert same(grandchild, result)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"), [(["model.width=32"], "its parent's model"), (["darkroom.horizon=9"], "its parent's darkroom")]
+)
+def test_a_fork_that_does_not_fit_is_refused(parent, tmp_path, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        launch.prepare(override(parent[2], settings, "--set"), tmp_path / "fork", False, False, (parent[0], 0))
+    assert not (tmp_path / "fork" / "run.toml").exists()
+
+
+def test_what_to_fork_from_is_checked(parent, tmp_path):
+    assert parse_source(f"{parent[0]}@1") == (parent[0], 1)
+    assert parse_source(str(parent[0])) == (parent[0], 2)
+    for text, message in (
+        (f"{parent[0]}@7", "holds the versions up to 2"),
+        (f"{parent[0]}@x", "RUN_DIR@ROUND"),
+        (f"{tmp_path}@0", "holds no run"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            parse_source(text)
+
+
+def test_rounds_that_overlap_name_weights_one_version_old_at_most(parent, tmp_path):
+    folder = tmp_path / "async"
+    result = run_inline(override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set"), folder)
+    store = Store(folder / "dataset", readonly=True)
+    adapt = 7 * 3 * (parent[2].icaa.trials + 1)
+    assert result["trajectories"] == 42 + 3 * adapt == len(store)
+    lags = {int(lag): count for lag, count in result["lag"].items()}
+    assert set(lags) == {0, 1} and sum(lags.values()) == 3 * adapt, "round 1's first jobs go out before T^1 is there"
+    for task in range(7):
+        for round_ in range(3):
+            acted = store.ledger.acted("adapt", round_, (task - task % 2, task - task % 2 + 2))
+            assert len(acted) == 1 and round_ - 1 <= acted[0] <= round_, "one T^j in all trials of a job"
+    assert parent[1]["lag"] == {"0": 2 * adapt} and parent[1]["staleness"] == 0
+
+
+def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began_with(parent, tmp_path, monkeypatch):
+    run = override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set")
+    made, real = [], service.Service.run
+    monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
+    monkeypatch.setattr(service, "PERIOD_S", 0.0)
+
+    def stop(event):
+        if event.get("stage") == "fit" and event["version"] == 0:
+            made[0].stop()
+
+    with pytest.raises(launch.TrainInterrupted):
+        run_inline(run, tmp_path / "run", stop)
+    result = run_inline(run, tmp_path / "run", resume=True)
+    assert result["trajectories"] == 42 + 3 * 7 * 3 * (run.icaa.trials + 1)
+    store = Store(tmp_path / "run" / "dataset", readonly=True)
+    for round_ in range(3):
+        for first in range(0, 7, 2):
+            assert len(store.ledger.acted("adapt", round_, (first, first + 2))) == 1
+
+
+def test_explain_checks_everything_that_is_left(parent):
+    folder, result, run = parent
+    answer = explain.explain(folder, Identity("adapt", 1, 3, 2, 1), rerun=True)
+    assert answer["rerun_equal"] and answer["intact"] and answer["weights_intact"] and not answer["from_ancestor"]
+    assert (answer["weights"], answer["worker"], answer["label_origin"]) == (1, "w0", "self")
+    assert answer["learned_by"] == ["T^2"] and answer["spawn_key"] == [1, 1, 3, 2, 1] and answer["seed"] == run.seed
+    early = explain.explain(folder, Identity("pretrain", 0, 3, 0, 1), rerun=True)
+    assert early["learned_by"] == ["T^0", "T^1", "T^2"] and early["label_origin"] == "optimal" and early["rerun_equal"]
+    assert "made again  the same bytes" in explain.describe(early)
+    lines = list(explain.ledger(folder))
+    assert len(lines) == result["trajectories"] and lines[0]["identity"] == "pretrain/0/0/0/0"
+    with pytest.raises(ConfigError, match="has no trajectory adapt/9/0/0/0"):
+        explain.explain(folder, Identity("adapt", 9, 0, 0, 0))
+
+
+def test_a_rerun_that_comes_out_otherwise_is_said(parent, monkeypatch):
+    real = jobs.adapt
+
+    def other(job, policies, worker):
+        for trajectory in real(job, policies, worker):
+            yield dataclasses.replace(trajectory, rewards=trajectory.rewards + 1)
+
+    monkeypatch.setattr(jobs, "adapt", other)
+    answer = explain.explain(parent[0], Identity("adapt", 1, 3, 2, 1), rerun=True)
+    assert answer["rerun_equal"] is False and "OTHER bytes" in explain.describe(answer)
+
+
+def test_a_variation_that_cannot_be_run_is_left_out_and_listed(parent, tmp_path, monkeypatch):
+    run, real, broken = parent[2], jobs.adapt, []
+
+    def failing(job, policies, worker):
+        if not broken:
+            broken.append(job.variations[4])  # of the first job: the second task's second variation
+        for trajectory in real(job, policies, worker):
+            if broken[0] in job.variations and trajectory.identity.trial == 1:
+                raise ZeroDivisionError("this one breaks")
+            yield trajectory
+
+    monkeypatch.setattr(jobs, "adapt", failing)
+    folder, events = tmp_path / "run", []
+    result = run_inline(run, folder, events.append)
+    ((quarantined,)) = result["quarantined"]
+    assert quarantined["variation"] == "adapt/0/1/1" and "ZeroDivisionError: this one breaks" in quarantined["cause"]
+    adapt = 7 * 3 * (run.icaa.trials + 1)
+    assert result["trajectories"] == 42 + 2 * adapt - (run.icaa.trials + 1) and result["version"] == 2
+    assert [e["identity"] for e in events if e["event"] == "quarantine"] == ["adapt/0/1/1"]
+    assert list((folder / "crashes").glob("*.json"))
+    assert same(run_inline(run, folder, resume=True), result), "what is quarantined stays left out"
+    assert same(run_inline(run, tmp_path / "again"), result), "how many of its trials were stored makes no difference"
