@@ -75,6 +75,7 @@ class Service:
         self.version = files.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder)
+        closing.callback(self._metrics.close)
         self._lock = threading.Lock()
         self._board = Board(run.stream.lease_s)
         self._stop = threading.Event()
@@ -148,40 +149,37 @@ class Service:
         Raises Interrupted after ``stop`` (a checkpoint has been written), RunFailed or
         StoreError if the run cannot go on.
         """
-        try:
-            while (phase := self._plan.next(self.version)) is not None:
-                if phase.produces <= self.version:
-                    lost = ", ".join(job.label for job in self._plan.incomplete(phase))
-                    self._report({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
-                try:
-                    self._collect(phase)
-                    if phase.produces > self.version:
-                        self._fit(phase)
-                except Damaged as error:
-                    self._report({"event": "note", "text": str(error)})
-                    self.store.repair()
-                    self._tell_repairs()
-                    self._plan.give_up({})
-                    self._plan.look_again()
-            self.store.seal()
-            result = {
-                "dataset_digest": self.store.digest(),
-                "weights_digest": self._broadcast.digest_of(self.version),
-                "version": self.version,
-                "trajectories": len(self.store),
-                "drops": dict(self.inbox.drops),
-                "resent": self.desk.resent,
-                "repaired": self._mended,
-                "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
-                "staleness": self._run.stream.staleness,
-                "lag": {str(lag): count for lag, count in self.store.ledger.lags().items()},
-                "threads": self._threads,
-                "instruction_set": torch.backends.cpu.get_cpu_capability(),
-            }
-            self.desk.finish()
-            return result
-        finally:
-            self._metrics.close()
+        while (phase := self._plan.next(self.version)) is not None:
+            if phase.produces <= self.version:
+                lost = ", ".join(job.label for job in self._plan.incomplete(phase))
+                self._report({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
+            try:
+                self._collect(phase)
+                if phase.produces > self.version:
+                    self._fit(phase)
+            except Damaged as error:
+                self._report({"event": "note", "text": str(error)})
+                self.store.repair()
+                self._tell_repairs()
+                self._plan.give_up({})
+                self._plan.look_again()
+        self.store.seal()
+        result = {
+            "dataset_digest": self.store.digest(),
+            "weights_digest": self._broadcast.digest_of(self.version),
+            "version": self.version,
+            "trajectories": len(self.store),
+            "drops": dict(self.inbox.drops),
+            "resent": self.desk.resent,
+            "repaired": self._mended,
+            "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
+            "staleness": self._run.stream.staleness,
+            "lag": {str(lag): count for lag, count in self.store.ledger.lags().items()},
+            "threads": self._threads,
+            "instruction_set": torch.backends.cpu.get_cpu_capability(),
+        }
+        self.desk.finish()
+        return result
 
     def close(self) -> None:
         """Stop taking in and let go of the files."""
@@ -221,8 +219,10 @@ class Service:
             self._opened.discard(phase)
         self._plan.give_up(blamed)
         if not self.store.ledger.count(phase.stage, phase.round):
-            causes = "; ".join(f"{name}: {cause}" for name, cause in blamed.items())
-            raise RunFailed(f"{phase.stage}/{phase.round}: every variation was given up ({causes})")
+            raise RunFailed(
+                f"{phase.stage}/{phase.round}: not one trajectory was stored, and {len(blamed)} of its variations are "
+                f"quarantined; first: {next(iter(blamed.values()))}"
+            )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         quality = label_quality(self._run, phase, self.store) if phase.produces > self.version else {}
         if quality:
