@@ -171,7 +171,7 @@ class StreamConfig:
     job_tasks: int = 4
     """Tasks a job: their variations are stepped as one batch.  Larger batches decide faster,
     smaller ones spread better over workers; the digests depend on it."""
-    credits: int = 8
+    credits: int = 16
     """W: trajectories a worker may have unanswered."""
     reply_timeout_s: float = 10.0
     """A trajectory without a reply for so long is sent again."""

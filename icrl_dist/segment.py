@@ -29,6 +29,7 @@ from icrl_dist.stream import strict, wire
 from icrl_dist.types import ARRAYS, STAGES, Identity, Trajectory, Variation
 
 _HEADER = struct.Struct("<4sIII")
+_HEAD, _CHECKSUM = struct.Struct("<4sII"), struct.Struct("<I")
 _PREFIX = b"icr"
 NAME, TRAJECTORY, SEAL = b"icrN", b"icrT", b"icrS"
 HEADER_BYTES = _HEADER.size
@@ -37,13 +38,10 @@ _NUMBERS = 14
 _DTYPES = {name: np.dtype(dtype) for name, (dtype, _) in ARRAYS.items()}
 
 
-def frame(magic: bytes, *parts: bytes | memoryview) -> bytes:
+def frame(magic: bytes, payload: bytes) -> bytes:
     """One frame."""
-    checksum = 0
-    for part in parts:
-        checksum = zlib.crc32(part, checksum)
-    head = struct.pack("<4sII", magic, sum(map(len, parts)), checksum)
-    return b"".join((head, struct.pack("<I", zlib.crc32(head)), *parts))
+    head = _HEAD.pack(magic, len(payload), zlib.crc32(payload))
+    return head + _CHECKSUM.pack(zlib.crc32(head)) + payload
 
 
 class MissingName(ValueError):  # noqa: N818
@@ -55,17 +53,19 @@ class Names:
     """The names of one segment: each is written once and referred to by its number."""
 
     values: dict[int, Variation | str] = field(default_factory=dict)
-    _numbers: dict[bytes, int] = field(default_factory=dict)
+    _numbers: dict[bytes | str, int] = field(default_factory=dict)
+    _next: int = 0
 
     def number(self, value: Variation | str) -> tuple[int, bytes]:
         """The value's number, and the frame that must be written first if it is new."""
-        packed = msgpack.packb(wire.from_variation(value) if isinstance(value, Variation) else value)
-        known = self._numbers.get(packed)
+        # Packed, a variation is told from one that Python holds equal: 0 from 0.0.
+        key = value if isinstance(value, str) else msgpack.packb(wire.from_variation(value))
+        known = self._numbers.get(key)
         if known is not None:
             return known, b""
-        number = max(self.values, default=-1) + 1
-        self.values[number], self._numbers[packed] = value, number
-        return number, frame(NAME, msgpack.packb(number), packed)
+        number = self._next
+        self._set(number, value, key)
+        return number, frame(NAME, msgpack.packb(number) + (msgpack.packb(key) if isinstance(key, str) else key))
 
     def read(self, payload: bytes) -> None:
         """Take up a name frame.  Raises ValueError for a payload that is none."""
@@ -73,8 +73,12 @@ class Names:
         number = strict.integer(_next(reader), "name", 0)
         packed = payload[reader.tell() :]
         plain = strict.parse(packed)
-        self.values[number] = plain if isinstance(plain, str) else wire.to_variation(plain)
-        self._numbers[packed] = number
+        value = plain if isinstance(plain, str) else wire.to_variation(plain)
+        self._set(number, value, value if isinstance(value, str) else packed)
+
+    def _set(self, number: int, value: Variation | str, key: bytes | str) -> None:
+        self.values[number], self._numbers[key] = value, number
+        self._next = max(self._next, number + 1)
 
     def variation(self, number: int) -> Variation:
         """Raises MissingName if there is none of this number."""
@@ -100,8 +104,7 @@ def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
         fresh.append(new)
     shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1])
     head = msgpack.packb([*t.identity.key(), t.weights, *numbers, *shape])
-    arrays = [np.ascontiguousarray(array).data.cast("B") if array.size else b"" for array in t.arrays().values()]
-    return b"".join(fresh), frame(TRAJECTORY, head, *arrays)
+    return b"".join(fresh), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
 
 
 def decode(payload: bytes, names: Names) -> Trajectory:

@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 
-from icrl_dist import segment
+from icrl_dist import endpoints, segment
 from icrl_dist.chaos.disk import PAGE, Disk
 from icrl_dist.chaos.proxy import Proxy
 from icrl_dist.chaos.schedule import Strike
@@ -90,8 +90,9 @@ def stop_learner(training: Training, strike: Strike, room: int) -> Struck:
 
 def cut_link(training: Training, strike: Strike, room: int) -> Struck:
     """Nothing passes between workers and learner for 12 s, and neither side is told."""
+    protocol = endpoints.parse(training.run.stream.endpoint).protocol
     with Proxy(training.target) as proxy:
-        training.start("--stream.connect", f"tcp/127.0.0.1:{proxy.port}")
+        training.start("--stream.connect", f"{protocol}/127.0.0.1:{proxy.port}")
         where = _reach(training, strike)
         before, printed = proxy.forwarded, len(training.output)
         proxy.cut()

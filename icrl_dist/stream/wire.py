@@ -6,6 +6,7 @@ raises :class:`WireError` with one of the reasons in ``REASONS``; nothing else i
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable, Mapping, Set
 from typing import Any
@@ -287,6 +288,12 @@ def _check_digest(digest: str, arrays: Mapping[str, np.ndarray]) -> None:
 def _hash(head: list[object], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
     found = hashlib.sha256(msgpack.packb(head))
     for name, array in arrays:
-        found.update(msgpack.packb([name, array.dtype.str, list(array.shape)]))
+        found.update(_title(name, array.dtype.str, array.shape))
         found.update(np.ascontiguousarray(array).data)
     return found.hexdigest()
+
+
+@functools.lru_cache(maxsize=1024)
+def _title(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
+    packed: bytes = msgpack.packb([name, dtype, shape])
+    return packed
