@@ -2,14 +2,14 @@
 
 import pytest
 
-from tests.e2e.training import LONGER, finish, result_of, start
+from tests.e2e.training import SMOKE, finish, result_of, start
 
 
 @pytest.fixture(scope="session")
-def longer(tmp_path_factory):
-    """The longer run in one process: what every disturbed one must equal."""
+def reference(tmp_path_factory):
+    """Smoke in one process: what every disturbed run must equal."""
     folder = tmp_path_factory.mktemp("runs") / "inline"
-    process = start("train", "smoke", *LONGER, "--engine", "inline", "--out", folder)
+    process = start("train", *SMOKE, "--engine", "inline", "--out", folder)
     output = finish(process)
     assert process.returncode == 0, output
     return result_of(folder)

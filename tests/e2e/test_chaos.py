@@ -18,7 +18,9 @@ from icrl_dist.chaos.faults import FAULTS, Struck
 from icrl_dist.chaos.outcome import Outcome, verdict
 from icrl_dist.config import ConfigError, load, override
 from icrl_dist.files import StoreError
+from icrl_dist.launch import prepare
 from icrl_dist.metrics import Metrics
+from learner import __main__ as learner
 
 SMALL = ["--set", "icaa.rounds=0", "--set", "pretrain.steps=20"]
 
@@ -168,3 +170,26 @@ def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "adaptation.png: could not be written" in line and "free space, then use --resume" in line
+
+
+def test_a_learner_on_a_full_disk_tells_the_remedy_and_an_unforeseen_error_keeps_its_trace(capsys, monkeypatch, tmp_path):
+    def fails(code):
+        monkeypatch.setattr(learner, "_serve", lambda *_: (_ for _ in ()).throw(OSError(code, os.strerror(code), "endpoint")))
+        return learner.main()
+
+    monkeypatch.setattr("sys.argv", ["learner", str(tmp_path), "--endpoint", "tcp/127.0.0.1:0"])
+    assert fails(errno.ENOSPC) == learner.FAILED
+    event = json.loads(capsys.readouterr().out)
+    assert event["event"] == "error" and "endpoint: could not be written" in event["text"] and "--resume" in event["text"]
+    with pytest.raises(OSError, match="Input/output error"):
+        fails(errno.EIO)
+
+
+def test_resuming_leaves_the_run_file_alone(tmp_path):
+    run, folder = load("smoke"), tmp_path / "run"
+    prepare(run, folder, resume=False, overwrite=False)
+    (folder / "run.toml").chmod(0o444)
+    before = (folder / "run.toml").stat()
+    prepare(run, folder, resume=True, overwrite=False)
+    after = (folder / "run.toml").stat()
+    assert (after.st_mtime_ns, after.st_ino) == (before.st_mtime_ns, before.st_ino)

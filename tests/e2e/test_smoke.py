@@ -22,7 +22,7 @@ from icrl_dist.stream.link import Refused
 from learner import checkpoints
 from tests.e2e.training import (
     CLI,
-    LONGER,
+    SMOKE,
     endpoint_of,
     equal,
     finish,
@@ -79,11 +79,8 @@ def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undi
     assert {t.weights for t in trajectories} == {-1, 0, 1}
 
 
-def test_ray_and_inline_end_with_the_same_bytes(undisturbed, tmp_path):
-    process = start("train", "smoke", "--engine", "inline", "--out", tmp_path / "inline")
-    output = finish(process)
-    assert process.returncode == 0, output
-    assert equal(result_of(tmp_path / "inline"), result_of(undisturbed[0]))
+def test_ray_and_inline_end_with_the_same_bytes(undisturbed, reference):
+    assert equal(result_of(undisturbed[0]), reference)
 
 
 def test_the_result_is_on_the_last_line_and_in_the_folder(undisturbed):
@@ -132,9 +129,9 @@ def test_evaluate_prints_returns_beside_the_oracles(undisturbed):
     assert next(row for row in rows if row["agent"] == "oracle")["episodes"] == [9.0, 9.0]
 
 
-def test_kill_9_of_a_worker_midway_changes_nothing(longer, tmp_path):
+def test_kill_9_of_a_worker_midway_changes_nothing(reference, tmp_path):
     folder = tmp_path / "killed"
-    process = start("train", "smoke", *LONGER, "--out", folder)
+    process = start("train", *SMOKE, "--out", folder)
     with on_first_adapt_trajectory(folder, lambda: os.kill(workers_of(process)[0].pid, signal.SIGKILL)) as killed:
         assert killed.wait(60)
         with pytest.raises(Refused, match="not-msgpack"):
@@ -142,13 +139,13 @@ def test_kill_9_of_a_worker_midway_changes_nothing(longer, tmp_path):
     output = finish(process)
     assert process.returncode == 0, output
     assert "died" in output and "starting it again" in output
-    assert equal(result_of(folder), longer)
+    assert equal(result_of(folder), reference)
     assert result_of(folder)["drops"]["not-msgpack"] == 1
 
 
-def test_kill_9_of_the_learner_midway_changes_nothing(longer, tmp_path):
+def test_kill_9_of_the_learner_midway_changes_nothing(reference, tmp_path):
     folder = tmp_path / "learner"
-    process = start("train", "smoke", *LONGER, "--out", folder)
+    process = start("train", *SMOKE, "--out", folder)
 
     def kill():
         (learner,) = [p for p in psutil.Process(process.pid).children() if "learner" in p.cmdline()]
@@ -159,12 +156,12 @@ def test_kill_9_of_the_learner_midway_changes_nothing(longer, tmp_path):
     output = finish(process)
     assert process.returncode == 0, output
     assert "the learner died (exit code -9)" in output
-    assert equal(result_of(folder), longer)
+    assert equal(result_of(folder), reference)
 
 
 def test_a_polite_kill_is_a_ctrl_c(tmp_path):
     folder = tmp_path / "terminated"
-    process = start("train", "smoke", *LONGER, "--out", folder)
+    process = start("train", *SMOKE, "--out", folder)
     with on_first_adapt_trajectory(folder, process.terminate) as terminated:
         family = psutil.Process(process.pid).children(recursive=True)
         assert terminated.wait(60)
@@ -175,9 +172,9 @@ def test_a_polite_kill_is_a_ctrl_c(tmp_path):
     assert not [p.cmdline() for p in alive]
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(longer, tmp_path):
+def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(reference, tmp_path):
     folder = tmp_path / "interrupted"
-    process = start("train", "smoke", *LONGER, "--out", folder, start_new_session=True)
+    process = start("train", *SMOKE, "--out", folder, start_new_session=True)
     with on_first_adapt_trajectory(folder, lambda: os.killpg(process.pid, signal.SIGINT)) as interrupted:
         family = psutil.Process(process.pid).children(recursive=True)
         assert interrupted.wait(60)
@@ -187,7 +184,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(longer, tm
     assert "--resume" in output and (folder / "checkpoints" / "version-0000.npz").exists()
     _, alive = psutil.wait_procs(family, timeout=15)
     assert not [p.cmdline() for p in alive]
-    again = start("train", "smoke", *LONGER, "--out", folder, "--resume")
+    again = start("train", *SMOKE, "--out", folder, "--resume")
     output = finish(again)
     assert again.returncode == 0, output
-    assert equal(result_of(folder), longer)
+    assert equal(result_of(folder), reference)

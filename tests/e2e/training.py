@@ -13,8 +13,8 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
-# Rounds long enough to be disturbed in the middle.
-LONGER = ["--icaa.trials", "40", "--icaa.context-trials", "10"]
+# The whole training of smoke, hardly an evaluation.
+SMOKE = ["smoke", "--evaluate.episodes", "1", "--evaluate.seeds", "1"]
 
 
 def start(*arguments, **options):
