@@ -63,12 +63,20 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if source is not None and not resume:
-            fork(*source, run, folder)
+            _fork(*source, run, folder)
         if not resume:
             file.write_text(dumps(run))
         atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+def _fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
+    try:
+        fork(theirs, version, run, folder)
+    except BaseException:
+        shutil.rmtree(folder)  # it was made just now, and half a fork is no run
+        raise
 
 
 def check_security(run: Run, address: str | None) -> None:

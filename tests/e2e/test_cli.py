@@ -76,6 +76,33 @@ def test_a_port_in_use(capsys, tmp_path):
     assert f"tcp/127.0.0.1:{port}" in line and "free that port" in line
 
 
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("adversary.cuont=3", "unknown key adversary.cuont; did you mean 'count'?"),
+        ("adversary.count", "SECTION.NAME=VALUE"),
+        ("a.b.c=1", "SECTION.NAME=VALUE"),
+        ("seed.x=1", "seed is not a section"),
+        ("adversary.count=two", "adversary.count = 'two': expected int"),
+        ("stream.staleness=-1", "stream.staleness = -1: must not be negative"),
+    ],
+)
+def test_an_impossible_setting(capsys, tmp_path, setting, expected):
+    assert expected in refused(capsys, "train", "smoke", "--set", setting, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_to_train_must_be_said_and_what_to_go_on_from_must_be_there(capsys, tmp_path):
+    assert "name a RUN" in refused(capsys, "train", "--out", tmp_path / "out")
+    assert "holds no run" in refused(capsys, "train", "--from", f"{tmp_path}@0", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_to_explain(capsys, tmp_path):
+    assert "no such run folder" in refused(capsys, "explain", tmp_path)
+    assert "STAGE/ROUND/TASK/VARIATION/TRIAL" in refused(capsys, "explain", tmp_path, "adapt/0")
+
+
 def test_nothing_to_evaluate_or_to_listen_to(capsys, tmp_path, monkeypatch):
     assert "no such run folder" in refused(capsys, "evaluate", tmp_path / "none")
     assert "holds no checkpoint" in refused(capsys, "evaluate", tmp_path)

@@ -121,5 +121,7 @@ def test_a_job_that_always_fails_ends_the_run_with_its_cause(small_run, tmp_path
         raise ZeroDivisionError("the environment broke")
 
     monkeypatch.setattr(jobs, "random_context", broken)
-    with pytest.raises(launch.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"):
+    with pytest.raises(
+        launch.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"
+    ):
         run_inline(small_run, tmp_path / "broken")
