@@ -9,8 +9,8 @@ READY := $(VENV)/.ready
 demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
 	$(BIN)/icrl-dist train demo --overwrite
 
-test: env ## every test
-	$(BIN)/python -m pytest
+test: env ## every test, file by file in two processes: many of them wait for others
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: env ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

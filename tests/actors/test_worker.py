@@ -128,6 +128,7 @@ def test_the_record_names_the_trajectory_that_was_under_way(hub, small_run, monk
     monkeypatch.setattr(jobs, "do", breaks_at_the_third)
     learner = Learner(hub(), small_run, [job_message(job), STOP])
     monkeypatch.setattr(worker_module, "Watchdog", lambda run, name: Watchdog(None, name))  # pytest's process has one
+    monkeypatch.setattr(worker_module._log, "exception", lambda *words: None)  # not every log can hold such words
     Worker(hub(), "test", "w3", folder=tmp_path).run()
     (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
     assert [t.identity for t in learner.stored] == list(job.identities())[:2]
