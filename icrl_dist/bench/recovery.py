@@ -12,16 +12,16 @@ import re
 import signal
 import statistics
 import subprocess
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import psutil
 
+from icrl_dist.bench.training import need_alive, training, words
 from icrl_dist.config import ConfigError
 from icrl_dist.store import Store
 from icrl_dist.stream import wire
@@ -45,7 +45,7 @@ def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix="recovery-") as scratch:
         out = Path(scratch) / "recovery"
-        with _training(out, trajectories) as process:
+        with training("demo", out, *_settings(trajectories)) as process:
             endpoint = _wait(lambda: _endpoint(out), process)
             with ZenohLink.connect(endpoint, 60.0) as link:
                 heard = _Heard(link, out.name, process)
@@ -108,7 +108,7 @@ class _Heard:
     def until(self, stored: int) -> None:
         """Wait until so many trajectories are stored."""
         while self._stored < stored:
-            _alive(self._process)
+            need_alive(self._process)
             with self._changed:
                 self._changed.wait(0.1)
 
@@ -120,7 +120,7 @@ class _Heard:
                 self._freed.clear()
                 self._sent.clear()
             family = psutil.Process(self._process.pid).children(recursive=True)
-            os.kill(min(host.pid for host in family if "_Host" in _words(host)), signal.SIGKILL)
+            os.kill(min(host.pid for host in family if "_Host" in words(host)), signal.SIGKILL)
             began = time.monotonic()
             if (when := self._done_again()) is not None:
                 return when - began
@@ -146,31 +146,19 @@ class _Heard:
             return again()
 
 
-@contextlib.contextmanager
-def _training(out: Path, trajectories: int) -> Iterator[subprocess.Popen[str]]:
+def _settings(trajectories: int) -> tuple[str, ...]:
     contexts = 2 * trajectories // _TASKS * _TASKS
-    numbers = ("--method", "dpt", "--stream.job-tasks", str(_TOGETHER), "--pretrain.contexts", str(contexts))
-    command = [sys.executable, "-u", "-m", "icrl_dist.cli", "train", "demo", "--out", str(out), *numbers]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, start_new_session=True)
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(60)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    return "--method", "dpt", "--stream.job-tasks", str(_TOGETHER), "--pretrain.contexts", str(contexts)
 
 
 def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path) -> tuple[float, int]:
-    (learner,) = [child for child in psutil.Process(process.pid).children() if "-m learner" in _words(child)]
+    (learner,) = [child for child in psutil.Process(process.pid).children() if "-m learner" in words(child)]
     learner.kill()
     learner.wait(10)
     began = time.monotonic()
     hello = wire.encode_message("ask-nothing", worker="bench")
     while time.monotonic() < began + 120:
-        _alive(process)
+        need_alive(process)
         try:
             link.request(Keys(out.name).work, hello, timeout_s=0.5)
         except Refused:  # it answers: it knows no such message
@@ -193,17 +181,6 @@ def _endpoint(out: Path) -> str:
 
 def _wait(condition: Callable[[], str], process: subprocess.Popen[str]) -> str:
     while not (found := condition()):
-        _alive(process)
+        need_alive(process)
         time.sleep(0.05)
     return found
-
-
-def _alive(process: subprocess.Popen[str]) -> None:
-    if process.poll() is not None:
-        raise RuntimeError(f"the run ended, exit code {process.returncode}; `icrl-dist doctor` may say why")
-
-
-def _words(process: psutil.Process) -> str:
-    with contextlib.suppress(psutil.Error):
-        return " ".join(process.cmdline())
-    return ""

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
-import signal
 import subprocess
-import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +20,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from icrl_dist.bench.training import need_alive, training, words
 from icrl_dist.config import ConfigError
 
 _NUMBERS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
@@ -43,11 +42,14 @@ def run(seconds: float = 600.0, folder: Path = Path("runs"), report: Report = la
         raise ConfigError(f"bench soak: seconds = {seconds:g}: a slope needs at least 30")
     folder.mkdir(parents=True, exist_ok=True)
     samples: dict[str, list[tuple[float, float]]] = {}
-    with tempfile.TemporaryDirectory(dir=folder, prefix="soak-") as scratch, _training(Path(scratch) / "soak") as process:
+    with (
+        tempfile.TemporaryDirectory(dir=folder, prefix="soak-") as scratch,
+        training("smoke", Path(scratch) / "soak", *_NUMBERS) as process,
+    ):
+        threading.Thread(target=_drain, args=(process,), daemon=True).start()
         began = _until_it_works(process, Path(scratch) / "soak")
         while (elapsed := time.monotonic() - began) < seconds:
-            if process.poll() is not None:
-                raise RuntimeError(f"the run ended after {elapsed:.0f} s, exit code {process.returncode}")
+            need_alive(process)
             for name, mb in _memory(process.pid):
                 samples.setdefault(name, []).append((elapsed, mb))
             report(elapsed, _progress(Path(scratch) / "soak"))
@@ -78,26 +80,18 @@ def describe(result: dict[str, Any]) -> str:
     return "\n".join([*lines, f"worst {result['worst_mb_per_min']:.2f} MB/min; figure {result['figure']}"])
 
 
-@contextlib.contextmanager
-def _training(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "icrl_dist.cli", "train", "smoke", "--out", str(folder), *_NUMBERS]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(60)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+def _drain(process: subprocess.Popen[str]) -> None:
+    assert process.stdout is not None
+    for _ in process.stdout:
+        pass
 
 
-def _until_it_works(process: subprocess.Popen[bytes], folder: Path, timeout_s: float = 120.0) -> float:
+def _until_it_works(process: subprocess.Popen[str], folder: Path, timeout_s: float = 120.0) -> float:
     deadline = time.monotonic() + timeout_s
     while json.loads(_progress(folder))["version"] < 1:
-        if process.poll() is not None or time.monotonic() > deadline:
-            raise RuntimeError(f"the run did not begin: exit code {process.returncode}; `icrl-dist doctor` may say why")
+        need_alive(process)
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"the run did not begin within {timeout_s:.0f} s; `icrl-dist doctor` may say why")
         time.sleep(0.2)
     return time.monotonic()
 
@@ -128,12 +122,11 @@ def _memory(pid: int) -> Iterator[tuple[str, float]]:
 
 
 def _name(process: psutil.Process, root: psutil.Process) -> str:
-    words = " ".join(process.cmdline())
     if process == root:
         return "icrl-dist train"
-    if "-m learner" in words:
+    if "-m learner" in words(process):
         return "learner"
-    return "worker" if "_Host" in words else process.name()[:20]
+    return "worker" if "_Host" in words(process) else process.name()[:20]
 
 
 def _slope(points: list[tuple[float, float]], seconds: float) -> float:

@@ -18,6 +18,7 @@ from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner.desk import Desk
 from learner.work import Board
+from tests.e2e.training import wait_for
 
 KEYS = Keys("test")
 HOSTILE = Path(__file__).parent / "hostile"
@@ -130,14 +131,6 @@ def worker(learner):
             return process
 
         yield start
-
-
-def wait_for(condition, what, timeout=60):
-    deadline = time.monotonic() + timeout
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
-        time.sleep(0.02)
-    return value
 
 
 def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(learner, hostile, worker):
