@@ -9,8 +9,8 @@ READY := $(VENV)/.ready
 demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
 	$(BIN)/icrl-dist train demo --overwrite
 
-test: env ## every test, file by file in two processes: many of them wait for others
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test: env ## every test, file by file in three processes, the long ones first: many of them wait
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder tests/e2e tests/learner tests/actors tests
 
 check: env ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .
