@@ -122,7 +122,9 @@ def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
         with _on_signals(service.stop):
             thread.start()
             try:
-                return service.run()
+                result = service.run()
+                service.desk.finish()
+                return result
             except Interrupted:
                 raise TrainInterrupted from None
             except RunFailed as error:

@@ -66,15 +66,15 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
         where.write_text(link.endpoints[0] + "\n")
         report({"event": "listening", "endpoint": link.endpoints[0], "version": service.version})
         try:
-            result = service.run()
+            report({"event": "finished", **service.run()})
+            service.desk.finish()  # not before: workers that end before the run does would look lost
+            service.desk.dismiss()
         except Interrupted:
             report({"event": "interrupted", "text": f"a checkpoint is in {folder / 'checkpoints'}"})
             return INTERRUPTED
         finally:
             where.unlink(missing_ok=True)
             service.close()
-        report({"event": "finished", **result})
-        service.desk.dismiss()
     return DONE
 
 

@@ -164,7 +164,7 @@ class Service:
                 self._plan.give_up({})
                 self._plan.look_again()
         self.store.seal()
-        result = {
+        return {
             "dataset_digest": self.store.digest(),
             "weights_digest": self._broadcast.digest_of(self.version),
             "version": self.version,
@@ -178,8 +178,6 @@ class Service:
             "threads": self._threads,
             "instruction_set": torch.backends.cpu.get_cpu_capability(),
         }
-        self.desk.finish()
-        return result
 
     def close(self) -> None:
         """Stop taking in and let go of the files."""

@@ -205,7 +205,7 @@ def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_ot
     hostile("kill")
     learner, fleet, notes = learner(60.0), fleet(1, 3), []
     fleet.start(learner.endpoint, "test", learner.folder)
-    wait_for(lambda: fleet.watch(notes.append, 1) and learner.done(), "the rest of the phase", 200)  # 1: keep a spare
+    wait_for(lambda: (fleet.watch(notes.append, 1), learner.done())[1], "the rest of the phase", 200)  # 1: keep a spare
     wait_for(lambda: not fleet.watch(notes.append, 0), "the worker's end")
     assert (fleet.deaths, len(notes)) == (3, 3) and all("starting it again" in note for note in notes)
     missing = learner.everything - set(learner.stored)

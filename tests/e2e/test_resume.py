@@ -35,7 +35,7 @@ def kill_when(process, folder, reached):
 
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
         link.subscribe(f"icrl/{folder.name}/mon/**", hear)
-        assert happened.wait(90)
+        assert happened.wait(150)
         kill_the_tree(process)
     (folder / "endpoint").unlink()
 

@@ -133,7 +133,7 @@ def test_kill_9_of_a_worker_midway_changes_nothing(reference, tmp_path):
     folder = tmp_path / "killed"
     process = start("train", *SMOKE, "--out", folder)
     with on_first_adapt_trajectory(folder, lambda: os.kill(workers_of(process)[0].pid, signal.SIGKILL)) as killed:
-        assert killed.wait(60)
+        assert killed.wait(120)
         with pytest.raises(Refused, match="not-msgpack"):
             killed.link.request(f"icrl/{folder.name}/data", b"\xc1garbage", timeout_s=10)
     output = finish(process)
@@ -152,7 +152,7 @@ def test_kill_9_of_the_learner_midway_changes_nothing(reference, tmp_path):
         learner.kill()
 
     with on_first_adapt_trajectory(folder, kill) as killed:
-        assert killed.wait(60)
+        assert killed.wait(120)
     output = finish(process)
     assert process.returncode == 0, output
     assert "the learner died (exit code -9)" in output
@@ -164,7 +164,7 @@ def test_a_polite_kill_is_a_ctrl_c(tmp_path):
     process = start("train", *SMOKE, "--out", folder)
     with on_first_adapt_trajectory(folder, process.terminate) as terminated:
         family = psutil.Process(process.pid).children(recursive=True)
-        assert terminated.wait(60)
+        assert terminated.wait(120)
     output = finish(process)
     assert process.returncode == 130, output
     assert "SIGTERM" not in output and "--resume" in output
@@ -177,7 +177,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(reference,
     process = start("train", *SMOKE, "--out", folder, start_new_session=True)
     with on_first_adapt_trajectory(folder, lambda: os.killpg(process.pid, signal.SIGINT)) as interrupted:
         family = psutil.Process(process.pid).children(recursive=True)
-        assert interrupted.wait(60)
+        assert interrupted.wait(120)
         family += psutil.Process(process.pid).children(recursive=True)
     output = finish(process)
     assert process.returncode == 130, output

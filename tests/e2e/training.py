@@ -23,7 +23,7 @@ def start(*arguments, **options):
     )
 
 
-def finish(process, timeout=90):
+def finish(process, timeout=200):
     output, _ = process.communicate(timeout=timeout)
     return output
 
@@ -32,7 +32,7 @@ def result_of(folder):
     return json.loads((folder / "result.json").read_text())
 
 
-def wait_for(condition, what, timeout=60):
+def wait_for(condition, what, timeout=120):
     deadline = time.monotonic() + timeout
     while not (value := condition()):
         assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
