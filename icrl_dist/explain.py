@@ -33,7 +33,7 @@ def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, 
         raise ConfigError(f"{folder}: has no trajectory {identity}; `icrl-dist explain {folder}` lists what it has") from None
     finally:
         store.close()
-    produced = identity.round + 1 if identity.stage == "adapt" else 0
+    produced = identity.produces
     seed = lineage.run_of(produced).seed
     answer: dict[str, Any] = {
         **ledger_line(row, seed),
@@ -59,8 +59,7 @@ def ledger(folder: Path) -> Iterator[dict[str, Any]]:
     store, lineage = _opened(folder)
     try:
         for row in store.ledger:
-            identity = row.identity
-            yield ledger_line(row, lineage.run_of(identity.round + 1 if identity.stage == "adapt" else 0).seed)
+            yield ledger_line(row, lineage.run_of(row.identity.produces).seed)
     finally:
         store.close()
 

@@ -76,7 +76,7 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
     ancestors = [(newest, a) for newest, a in lineage.ancestors if newest < version] + [(version, lineage.run_of(version))]
 
     def keep(identity: Identity) -> bool:
-        return (identity.round + 1 if identity.stage == "adapt" else 0) <= version
+        return identity.produces <= version
 
     adopt(theirs / "dataset", folder / "dataset", keep)
     store = Store(folder / "dataset")

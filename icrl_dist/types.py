@@ -139,6 +139,11 @@ class Identity(NamedTuple):
         """The identity as integers, for canonical order and as a seed's spawn key."""
         return (STAGES.index(self.stage), self.round, self.task, self.variation, self.trial)
 
+    @property
+    def produces(self) -> int:
+        """First version of the weights that is fitted to it: 0 for ``pretrain``, j + 1 for round j."""
+        return self.round + 1 if self.stage == "adapt" else 0
+
     def rng(self, seed: int) -> np.random.Generator:
         """The generator of this trajectory's draws; which worker runs it makes no difference."""
         return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=self.key()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jaxtyping
 import pytest
@@ -32,6 +32,7 @@ from icrl_dist.config import (  # noqa: E402
     StreamConfig,
 )
 from icrl_dist.envs import darkroom  # noqa: E402
+from icrl_dist.stream.memory_link import MemoryHub, MemoryLink  # noqa: E402
 from icrl_dist.types import Task  # noqa: E402
 
 
@@ -67,3 +68,17 @@ def module_run() -> Run:
         stream=StreamConfig(job_tasks=2),
         learner=LearnerConfig(threads=1),
     )
+
+
+@pytest.fixture
+def hub() -> Iterator[Callable[[], MemoryLink]]:
+    """``hub()``: another link to one network within this process."""
+    network, links = MemoryHub(), []
+
+    def link() -> MemoryLink:
+        links.append(network.link())
+        return links[-1]
+
+    yield link
+    for one in links:
+        one.close()

@@ -21,8 +21,9 @@ from typing import Any
 
 import psutil
 
-from icrl_dist.bench.training import need_alive, training, words
+from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config import ConfigError
+from icrl_dist.processes import is_learner, is_worker
 from icrl_dist.store import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
@@ -120,7 +121,7 @@ class _Heard:
                 self._freed.clear()
                 self._sent.clear()
             family = psutil.Process(self._process.pid).children(recursive=True)
-            os.kill(min(host.pid for host in family if "_Host" in words(host)), signal.SIGKILL)
+            os.kill(min(host.pid for host in family if is_worker(host)), signal.SIGKILL)
             began = time.monotonic()
             if (when := self._done_again()) is not None:
                 return when - began
@@ -152,7 +153,7 @@ def _settings(trajectories: int) -> tuple[str, ...]:
 
 
 def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path) -> tuple[float, int]:
-    (learner,) = [child for child in psutil.Process(process.pid).children() if "-m learner" in words(child)]
+    (learner,) = [child for child in psutil.Process(process.pid).children() if is_learner(child)]
     learner.kill()
     learner.wait(10)
     began = time.monotonic()

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 import psutil
 
-from icrl_dist.bench.training import need_alive, training, words
+from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config import ConfigError
+from icrl_dist.processes import is_learner, is_worker
 
 _NUMBERS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
 _PERIOD_S = 1.0
@@ -124,9 +125,9 @@ def _memory(pid: int) -> Iterator[tuple[str, float]]:
 def _name(process: psutil.Process, root: psutil.Process) -> str:
     if process == root:
         return "icrl-dist train"
-    if "-m learner" in words(process):
+    if is_learner(process):
         return "learner"
-    return "worker" if "_Host" in words(process) else process.name()[:20]
+    return "worker" if is_worker(process, spare=True) else process.name()[:20]
 
 
 def _slope(points: list[tuple[float, float]], seconds: float) -> float:

@@ -10,8 +10,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
-
 
 @contextlib.contextmanager
 def training(run: str, out: Path, *settings: str) -> Iterator[subprocess.Popen[str]]:
@@ -34,10 +32,3 @@ def need_alive(process: subprocess.Popen[str]) -> None:
     """Raises RuntimeError if the training is over."""
     if process.poll() is not None:
         raise RuntimeError(f"the run ended, exit code {process.returncode}; `icrl-dist doctor` may say why")
-
-
-def words(process: psutil.Process) -> str:
-    """A process's command line; empty if it is gone."""
-    with contextlib.suppress(psutil.Error):
-        return " ".join(process.cmdline())
-    return ""

@@ -18,6 +18,7 @@ import psutil
 
 from icrl_dist.chaos.schedule import Strike
 from icrl_dist.config import Run
+from icrl_dist.processes import is_learner, is_worker
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import security, wire
 from icrl_dist.stream.link import Keys, LinkError
@@ -118,11 +119,11 @@ class Training:
 
     def workers(self) -> list[psutil.Process]:
         """The workers' processes, by age."""
-        return sorted((p for p in self.tree() if "_Host.work" in _words(p)), key=lambda p: p.create_time())
+        return sorted((p for p in self.tree() if is_worker(p)), key=lambda p: p.create_time())
 
     def learner(self) -> psutil.Process | None:
         """The learner's process, if there is one."""
-        return next((p for p in self.tree() if "-m learner" in _words(p)), None)
+        return next((p for p in self.tree() if is_learner(p)), None)
 
     def kill(self) -> list[psutil.Process]:
         """SIGKILL everything at one stroke; returns what is left of it."""
@@ -201,9 +202,3 @@ class _Ear:
         if not self.due.is_set() and (self._order[name], fit, count) >= (strike.phase, strike.fit, strike.after):
             self.where = f"fit of {name}, step {count}" if fit else f"{name}, {count} heard"
             self.due.set()
-
-
-def _words(process: psutil.Process) -> str:
-    with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):
-        return " ".join(process.cmdline())
-    return ""

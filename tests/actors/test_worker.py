@@ -20,24 +20,9 @@ from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
-from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 
 KEYS = Keys("test")
-
-
-@pytest.fixture
-def hub():
-    hub = MemoryHub()
-    links = []
-
-    def link():
-        links.append(hub.link())
-        return links[-1]
-
-    yield link
-    for one in links:
-        one.close()
 
 
 def weights(run, version):

@@ -71,9 +71,14 @@ def test_the_ledger_says_where_each_lies_and_where_it_comes_from(Store, tmp_path
     first = trajectories[0].identity
     assert store.ledger.count("pretrain", 0) == len(trajectories) and store.ledger.count("adapt", 0) == 0
     assert store.ledger.identities("pretrain", 0, (0, 1)) == [t.identity for t in trajectories if t.identity.task == 0]
+    assert len(store.ledger) == len(list(store.ledger)) == len(trajectories)
     assert store.ledger.acted("pretrain", 0, (0, 1)) == [3] and store.ledger.acted("adapt", 0, (0, 1)) == []
     with pytest.raises(KeyError):
         store.ledger[first._replace(stage="evaluate")]
+    store.ledger.enter(rows[:3])  # once more: ignored
+    store.ledger.drop(first[:4])
+    left = [row for row in rows if row.identity[:4] != first[:4]]
+    assert list(store.ledger) == left and len(store.ledger) == len(left) < len(rows)
 
 
 def test_the_digest_depends_on_the_bytes_and_not_on_order_or_worker(Store, tmp_path, trajectories, small_run):

@@ -13,7 +13,6 @@ from icrl_dist.config import parse
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Refused
-from icrl_dist.stream.memory_link import MemoryHub
 from learner import desk as desk_module
 from learner.desk import Desk
 from learner.work import Board
@@ -56,19 +55,6 @@ class Office:
             assert time.monotonic() < deadline, f"{count} events {kind!r} did not come: {self.events}"
             time.sleep(0.01)
         return found
-
-
-@pytest.fixture
-def hub():
-    hub, links = MemoryHub(), []
-
-    def link():
-        links.append(hub.link())
-        return links[-1]
-
-    yield link
-    for one in links:
-        one.close()
 
 
 @pytest.fixture
