@@ -60,11 +60,36 @@ class PretrainConfig:
     """The pretraining dataset D_pre and the fit to it (sections 2 and 4.1)."""
 
     contexts: int = 80000
-    """Random-policy episodes in all, the same for every method and every K (appendix C.1)."""
+    """Episodes in all, the same for every method and every K (appendix C.1)."""
+    behaviours: tuple[Literal["random", "persistent", "goals", "sweep"], ...] = ("random",)
+    """Who walks through the contexts, by turns: ``random`` actions (the paper's); ``persistent``
+    walks, which mostly go on as before; walks to random ``goals``, with a rest there; a ``sweep``
+    through cells not yet visited."""
     queries: int = 16
     """Labelled query states an episode."""
     steps: int = 20000
     """Optimiser steps."""
+
+
+@dataclass(frozen=True)
+class PracticeConfig:
+    """Further rounds of pretraining on histories that T_theta makes itself (DPT and ICAG; ICAA has its own).
+
+    No behaviour policy searches as a deployed T_theta does, so its own long contexts are foreign
+    to it.  T^j is deployed in every training variation (Algorithm 1); the labels remain the
+    optimal policy's, as in D_pre.
+    """
+
+    rounds: int = 0
+    """Rounds; 0 is the paper's ICAG."""
+    trials: int = 20
+    """Episodes of a history; each round's contexts are its first few, up to all."""
+    steps: int = 4000
+    """Optimiser steps a round."""
+    learning_rate: float = 1e-3
+    """Peak learning rate of a round."""
+    new_fraction: float = 0.5
+    """Share of the batches that are histories; the rest come from D_pre."""
 
 
 @dataclass(frozen=True)
@@ -116,16 +141,21 @@ class OptimConfig:
 
     learning_rate: float = 1e-3
     """Peak learning rate."""
+    muon: float = 0.0
+    """Learning rate of Muon, over AdamW's, for the matrices of attention and feed-forward layers;
+    the rest stays with AdamW.  0: AdamW for all, as in the paper."""
     weight_decay: float = 1e-4
     """AdamW's decoupled weight decay."""
     beta2: float = 0.999
     """AdamW's memory of squared gradients; shorter (0.98) suits short fits at high rates."""
     batch: int = 128
     """Contexts a step."""
+    transitions: int = 0
+    """Transitions a step, at most: of longer contexts fewer fit in; 0 for no limit."""
     queries: int = 32
     """(prefix, query) pairs a context; each sees its own random prefix (eq. 1, many times)."""
     episodes: int = 4
-    """Episodes in a training context, at most; each context draws its own number."""
+    """Episodes in a training context, at most; each step draws its own number."""
     warmup: int = 200
     """Steps of linear warm-up; then the rate falls to a tenth along a cosine."""
     clip: float = 1.0
@@ -211,6 +241,7 @@ class Run:
     darkroom: DarkRoomConfig = field(default_factory=DarkRoomConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    practice: PracticeConfig = field(default_factory=PracticeConfig)
     icaa: ICAAConfig = field(default_factory=ICAAConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

@@ -103,10 +103,12 @@ class Shelved(Sequence[Examples], Generic[K]):
 
 @dataclass(frozen=True)
 class Pool:
-    """Examples of many variations, and the share of a training batch that comes from them."""
+    """Examples of many variations, and the share of the training batches that come from them."""
 
     share: float
     examples: Sequence[Examples]
+    episodes: int
+    """Episodes in a context, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,23 +128,26 @@ class Batch:
     prefix: Int64[np.ndarray, "B N"]
 
 
-def draw(rng: np.random.Generator, pools: Sequence[Pool], batch: int, queries: int, episodes: int) -> Batch:
+def draw(rng: np.random.Generator, pools: Sequence[Pool], batch: int, queries: int, transitions: int = 0) -> Batch:
     """A training batch: random variations, random contexts of them, random prefixes and queries.
 
-    Each row chooses its pool by share and then a variation of it uniformly.
-
-    All contexts of a batch have the same drawn number of episodes (at most ``episodes``, and
-    at most what the variation has), so little is padding.
+    A batch comes from one pool, drawn by share, and its contexts have the same drawn number of
+    episodes (at most what the variation has), so little is padding.  It has ``batch`` contexts,
+    or as many as make up ``transitions`` if that is above 0 and those are fewer.
     """
-    count = int(rng.integers(1, episodes + 1))
     shares = np.array([pool.share for pool in pools])
-    chosen = [pools[i].examples for i in rng.choice(len(pools), size=batch, p=shares / shares.sum())]
-    rows = [_context(rng, examples[int(rng.integers(0, len(examples)))], count, queries) for examples in chosen]
+    pool = pools[int(rng.choice(len(pools), p=shares / shares.sum()))]
+    count = int(rng.integers(1, pool.episodes + 1))
+    chosen = [pool.examples[int(i)] for i in rng.integers(0, len(pool.examples), size=batch)]
+    if transitions:
+        longest = max(min(count, len(examples.actions)) * examples.actions.shape[1] for examples in chosen)
+        chosen = chosen[: max(1, transitions // longest)]
+    rows = [_context(rng, examples, count, queries) for examples in chosen]
     length = max(len(r[1]) for r in rows)
 
     def padded(column: int) -> np.ndarray:
         first = rows[0][column]
-        out = np.zeros((batch, length, *first.shape[1:]), dtype=first.dtype)
+        out = np.zeros((len(rows), length, *first.shape[1:]), dtype=first.dtype)
         for b, row in enumerate(rows):
             out[b, : len(row[column])] = row[column]
         return out

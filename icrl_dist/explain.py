@@ -73,7 +73,7 @@ def ledger_line(row: Row, seed: int) -> dict[str, Any]:
         "weights": row.weights,
         "weights_digest": row.digest,
         "worker": row.worker,
-        "label_origin": "self" if row.identity.stage == "adapt" else row.origin,
+        "label_origin": "self" if row.origin == "none" else row.origin,
         "sha256": row.sha256,
         "segment": row.segment,
         "byte": row.offset,

@@ -8,11 +8,12 @@ from typing import Protocol
 import numpy as np
 
 from icrl_dist import envs
+from icrl_dist.behaviour import Walks
 from icrl_dist.config import ContextConfig
 from icrl_dist.envs.darkroom import cells
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, heuristic_labels, soft_labels
-from icrl_dist.rollout import Episodes, InContextPolicy, RandomPolicy, deploy_online, episode, sample
+from icrl_dist.rollout import Episodes, InContextPolicy, deploy_online, episode, sample
 from icrl_dist.types import Identity, Job, Trajectory
 
 
@@ -37,48 +38,64 @@ def do(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
 
 
 def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
-    """Random-policy contexts D^{i,k}, query states and their labels (Algorithm 2, lines 8 to 12).
+    """Contexts D^{i,k} of behaviour policies, query states and their labels (Algorithm 2, lines 8 to 12).
 
-    Settings: ``queries`` a trajectory, ``labels`` (soft, sampled, heuristic), ``gamma``,
-    ``slack``.
+    Settings: ``behaviours``, taken by turns from trial to trial; ``queries`` a trajectory,
+    ``labels`` (soft, sampled, heuristic), ``gamma``, ``slack``.
     """
-    hypotheses = Hypotheses.of(job.variations)
-    place = {row: index for index, row in enumerate(job.rows())}
-    mode = job.setting("labels")
-    if mode == "heuristic":
-        table = heuristic_labels(hypotheses)
-    else:
-        table = soft_labels(hypotheses, _number(job, "gamma"), _number(job, "slack"))
-    states = cells(hypotheses.size)
+    labeller = _Labeller(job)
     identities = list(job.identities())
     rngs = [identity.rng(job.seed) for identity in identities]
     env = envs.batch([job.variation(identity) for identity in identities])
-    ran = episode(env, RandomPolicy(env.spec.actions), rngs)
+    behaviours = str(job.setting("behaviours")).split(",")
+    kinds = [behaviours[identity.trial % len(behaviours)] for identity in identities]
+    ran = episode(env, Walks(labeller.size, env.spec.horizon, kinds, rngs), rngs)
     for row, (identity, rng) in enumerate(zip(identities, rngs, strict=True)):
-        query = rng.integers(0, len(states), size=int(_number(job, "queries")))
-        labels = table[place[identity.task, identity.variation], query]
-        if mode == "sampled":
-            labels = np.eye(env.spec.actions, dtype=np.float32)[sample(labels, rng.random(len(query)))]
-        origin = "heuristic" if mode == "heuristic" else "optimal"
-        yield _trajectory(job, identity, ran, row, worker, "", states[query], labels, origin)
+        yield _trajectory(job, identity, ran, row, worker, "", *labeller(identity, rng))
 
 
 def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
     """Online rollouts of T^j in each variation, N + 1 trials each (Algorithm 3, line 12).
 
-    One T^j acts in all trials: the version that the job names.  Its own later actions become
-    labels, which is the learner's choice to make, so none are written here.
+    One T^j acts in all trials: the version that the job names.  Settings: ``context_max``;
+    ``labels`` and what goes with it, as for ``random_context``, or ``none``: then T^j's own later
+    actions become labels, which is the learner's choice to make.
     """
     model, digest = policies.at(job.weights)
     context = ContextConfig(max=int(_number(job, "context_max")), keep="all")
     env = envs.batch(job.variations)
     policy = InContextPolicy(model, env.batch, context)
+    labeller = None if job.setting("labels") == "none" else _Labeller(job)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
-    trials = ([identity.rng(job.seed) for identity in row] for row in rows)
-    nothing = np.zeros((0, env.spec.observation), np.float32), np.zeros((0, env.spec.actions), np.float32)
-    for row, ran in zip(rows, deploy_online(env, policy, trials), strict=True):
-        for b, identity in enumerate(row):
-            yield _trajectory(job, identity, ran, b, worker, digest, *nothing, "none")
+    rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
+    nothing = np.zeros((0, env.spec.observation), np.float32), np.zeros((0, env.spec.actions), np.float32), "none"
+    for row, chance, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
+        for b, (identity, rng) in enumerate(zip(row, chance, strict=True)):
+            given = labeller(identity, rng) if labeller else nothing
+            yield _trajectory(job, identity, ran, b, worker, digest, *given)
+
+
+class _Labeller:
+    """Random query states of a trajectory's variation, and their labels."""
+
+    def __init__(self, job: Job) -> None:
+        hypotheses = Hypotheses.of(job.variations)
+        self.size = hypotheses.size
+        self._mode, self._queries = job.setting("labels"), int(_number(job, "queries"))
+        self._place = {row: index for index, row in enumerate(job.rows())}
+        self._states = cells(self.size)
+        if self._mode == "heuristic":
+            self._table = heuristic_labels(hypotheses)
+        else:
+            self._table = soft_labels(hypotheses, _number(job, "gamma"), _number(job, "slack"))
+
+    def __call__(self, identity: Identity, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
+        """Query states, labels, and whose the labels are."""
+        query = rng.integers(0, len(self._states), size=self._queries)
+        labels = self._table[self._place[identity.task, identity.variation], query]
+        if self._mode == "sampled":
+            labels = np.eye(labels.shape[1], dtype=np.float32)[sample(labels, rng.random(len(query)))]
+        return self._states[query], labels, "heuristic" if self._mode == "heuristic" else "optimal"
 
 
 def _number(job: Job, name: str) -> float:

@@ -19,7 +19,7 @@ def validate(run: Run, source: str) -> None:
         if not condition:
             raise ConfigError(f"{source}: {where} = {value!r}: {remedy}")
 
-    room, icaa, optim = run.darkroom, run.icaa, run.optim
+    room, icaa, practice, optim = run.darkroom, run.icaa, run.practice, run.optim
     need(room.size >= 2, "darkroom.size", room.size, "a room has at least 2 cells a side")
     need(room.horizon >= 1, "darkroom.horizon", room.horizon, "an episode has at least 1 step")
     need(0 < room.train_fraction < 1, "darkroom.train_fraction", room.train_fraction, "use a share between 0 and 1")
@@ -34,7 +34,9 @@ def validate(run: Run, source: str) -> None:
     need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
     need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
     need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
+    need(len(run.pretrain.behaviours) > 0, "pretrain.behaviours", run.pretrain.behaviours, "name at least one")
     need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
+    need(0 <= practice.new_fraction <= 1, "practice.new_fraction", practice.new_fraction, "a share lies in [0, 1]")
     need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
     need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
     need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
@@ -47,6 +49,9 @@ def validate(run: Run, source: str) -> None:
     positive = {
         "pretrain.queries": run.pretrain.queries,
         "pretrain.steps": run.pretrain.steps,
+        "practice.trials": practice.trials,
+        "practice.steps": practice.steps,
+        "practice.learning_rate": practice.learning_rate,
         "icaa.steps": icaa.steps,
         "model.layers": run.model.layers,
         "model.width": run.model.width,
@@ -70,6 +75,9 @@ def validate(run: Run, source: str) -> None:
         "darkroom.split_seed": room.split_seed,
         "darkroom.label_slack": room.label_slack,
         "model.fourier": run.model.fourier,
+        "practice.rounds": practice.rounds,
+        "optim.transitions": optim.transitions,
+        "optim.muon": optim.muon,
         "optim.weight_decay": optim.weight_decay,
         "optim.warmup": optim.warmup,
         "learner.threads": run.learner.threads,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from jaxtyping import Float
@@ -30,10 +30,49 @@ def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
     return loss(model(context, put(batch.queries), put(batch.prefix)), put(batch.labels))
 
 
-def optimiser(model: PretrainedTransformer, config: OptimConfig) -> torch.optim.AdamW:
-    """AdamW of appendix B.2."""
-    betas = (0.9, config.beta2)
-    return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=betas)
+class Optimiser:
+    """AdamW of appendix B.2; with ``optim.muon``, Muon for the trunk's matrices and AdamW for the rest."""
+
+    def __init__(self, model: PretrainedTransformer, config: OptimConfig) -> None:
+        named = list(model.named_parameters())
+        matrices = [p for name, p in named if config.muon and name.startswith("trunk.") and p.ndim == 2]
+        others = [p for _, p in named if all(p is not matrix for matrix in matrices)]
+        betas = (0.9, config.beta2)
+        adamw = torch.optim.AdamW(others, lr=config.learning_rate, weight_decay=config.weight_decay, betas=betas)
+        self._parts: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
+        if matrices:
+            self._parts.append((torch.optim.Muon(matrices, weight_decay=0.0), config.muon))
+
+    def step(self, learning_rate: float) -> None:
+        """Change the weights by their gradients, and forget those."""
+        for part, factor in self._parts:
+            for group in part.param_groups:
+                group["lr"] = learning_rate * factor
+            part.step()
+            part.zero_grad(set_to_none=True)
+
+    def state(self) -> dict[str, Tensor]:
+        """What it remembers of earlier gradients, by name."""
+        return {
+            f"{number}/{index}/{name}": value
+            for number, (part, _) in enumerate(self._parts)
+            for index, state in part.state_dict()["state"].items()
+            for name, value in state.items()
+        }
+
+    def load(self, remembered: Mapping[str, Tensor]) -> None:
+        """The inverse of ``state``.  Raises ValueError for another optimiser's."""
+        groups = [part.state_dict()["param_groups"] for part, _ in self._parts]
+        places = {(number, index) for number, (group,) in enumerate(groups) for index in group["params"]}
+        states: dict[tuple[int, int], dict[str, Tensor]] = {}
+        for key, value in remembered.items():
+            first, second, name = key.split("/")
+            states.setdefault((int(first), int(second)), {})[name] = value
+        if states and set(states) != places:
+            raise ValueError(f"it remembers {len(states)} parameters in other places than these {len(places)}")
+        for number, (part, _) in enumerate(self._parts):
+            own = {index: state for (of, index), state in states.items() if of == number}
+            part.load_state_dict({"state": own, "param_groups": groups[number]})
 
 
 def rate(step: int, steps: int, warmup: int) -> float:
@@ -46,7 +85,7 @@ def rate(step: int, steps: int, warmup: int) -> float:
 
 def fit(
     model: PretrainedTransformer,
-    opt: torch.optim.Optimizer,
+    opt: Optimiser,
     config: OptimConfig,
     learning_rate: float,
     steps: int,
@@ -64,13 +103,10 @@ def fit(
     warmup = min(config.warmup, max(1, steps // 10))
     total, counted = 0.0, 0
     for step in range(first, steps):
-        for group in opt.param_groups:
-            group["lr"] = learning_rate * rate(step, steps, warmup)
         value = batch_loss(model, batch(step))
-        opt.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip)
-        opt.step()
+        opt.step(learning_rate * rate(step, steps, warmup))
         current = value.item()
         if not math.isfinite(current):
             raise FloatingPointError(f"loss is {current} at step {step}: lower the learning rate ({learning_rate})")

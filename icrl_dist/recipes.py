@@ -7,6 +7,7 @@ the trajectories.  The phase after which T^j exists produces weights version j.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -70,18 +71,28 @@ def _pretrain_only(run: Run) -> tuple[Phase, ...]:
     return (Phase("pretrain", 0, run.pretrain.steps, run.optim.learning_rate),)
 
 
-def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
-    """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
+def _then_practice(run: Run) -> tuple[Phase, ...]:
+    rounds = (Phase("adapt", j, run.practice.steps, run.practice.learning_rate) for j in range(run.practice.rounds))
+    return (*_pretrain_only(run), *rounds)
 
-    All methods and all K share out the same ``pretrain.contexts`` episodes.
-    """
+
+def _labelling(run: Run) -> Params:
+    """What a collector must know to label queries."""
     room = run.darkroom
-    settings: Params = (
+    return (
         ("gamma", room.gamma),
         ("labels", room.labels),
         ("queries", run.pretrain.queries),
         ("slack", room.label_slack),
     )
+
+
+def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
+    """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
+
+    All methods and all K share out the same ``pretrain.contexts`` episodes.
+    """
+    settings: Params = (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
     chosen = [variations(i, task) for i, task in enumerate(tasks.split(run).train)]
     trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
     return _jobs(run, phase, "random_context", chosen, trials, settings)
@@ -100,10 +111,17 @@ def _jobs(
     return tuple(jobs)
 
 
+def _practice(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
+    """T^j makes a history in every training variation, started as at test; its queries are labelled as D_pre's."""
+    settings: Params = (("context_max", run.context.max), *_labelling(run))
+    chosen = [variations(i, tasks.deployed(task)) for i, task in enumerate(tasks.split(run).train)]
+    return _jobs(run, phase, "adapt", chosen, run.practice.trials, settings)
+
+
 def _labelled(trials: Sequence[Trajectory]) -> Examples:
     """A variation's episodes with the queries that were labelled when they were collected."""
     queries, labels = (np.concatenate([getattr(t, name) for t in trials]) for name in ("queries", "labels"))
-    return Examples.of(trials, queries, labels)
+    return Examples.of(trials, queries, labels, history=trials[0].identity.stage == "adapt")
 
 
 def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
@@ -111,7 +129,7 @@ def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
 
     def read(key: Key) -> Examples:
         trials = data.trials(key)
-        examples = self_labelled(run, trials) if key[0] == "adapt" else _labelled(trials)
+        examples = self_labelled(run, trials) if trials[0].origin == "none" else _labelled(trials)
         assert examples is not None, "only variations that give labels are asked for"
         return examples
 
@@ -122,11 +140,19 @@ def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
 
 
 def _dpt_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
-    return _random_contexts(run, phase, lambda i, task: (Variation(task),))
+    asked = _random_contexts if phase.stage == "pretrain" else _practice
+    return asked(run, phase, lambda i, task: (Variation(task),))
 
 
 def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
-    return (Pool(1.0, Shelved(_shelf(run, data), data.variations("pretrain", 0))),)
+    """D_pre, and in a round of practice the histories of this and all earlier rounds."""
+    shelf = _shelf(run, data)
+    pretrain = Pool(1.0, Shelved(shelf, data.variations("pretrain", 0)), run.optim.episodes)
+    if phase.stage == "pretrain":
+        return (pretrain,)
+    histories = [key for j in range(phase.round + 1) for key in data.variations("adapt", j)]
+    share = run.practice.new_fraction
+    return dataclasses.replace(pretrain, share=1 - share), Pool(share, Shelved(shelf, histories), run.practice.trials)
 
 
 # ICAG (section 4.1, Algorithm 2): K variations of every task, labels from each variation's
@@ -134,7 +160,8 @@ def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
 
 
 def _icag_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
-    return _random_contexts(run, phase, lambda i, task: tasks.variations(run, i, task))
+    asked = _random_contexts if phase.stage == "pretrain" else _practice
+    return asked(run, phase, lambda i, task: tasks.variations(run, i, task))
 
 
 # ICAA (section 4.2, Algorithm 3): D^0 is DPT's dataset; then, round by round, the model
@@ -151,7 +178,7 @@ def _icaa_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
     """Lines 8 to 12: T^j is deployed in every variation for N + 1 trials."""
     if phase.stage == "pretrain":
         return _dpt_ask(run, phase)
-    settings: Params = (("context_max", run.context.max),)
+    settings: Params = (("context_max", run.context.max), ("labels", "none"))
     train = enumerate(tasks.split(run).train)
     chosen = [tasks.variations(run, i, tasks.deployed(task), phase.round) for i, task in train]
     return _jobs(run, phase, "adapt", chosen, run.icaa.trials + 1, settings)
@@ -169,9 +196,9 @@ def _icaa_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
                 labelling.append(key)
                 shelf.put(key, examples)
     if not labelling:
-        return (Pool(1.0, pretrain),)
+        return (Pool(1.0, pretrain, run.optim.episodes),)
     share = run.icaa.new_fraction
-    return (Pool(1 - share, pretrain), Pool(share, Shelved(shelf, labelling)))
+    return (Pool(1 - share, pretrain, run.optim.episodes), Pool(share, Shelved(shelf, labelling), run.optim.episodes))
 
 
 def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
@@ -195,7 +222,7 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
 
 
 METHODS: dict[str, Method] = {
-    "dpt": Method(_pretrain_only, _dpt_ask, _pretrain_learn),
-    "icag": Method(_pretrain_only, _icag_ask, _pretrain_learn),
+    "dpt": Method(_then_practice, _dpt_ask, _pretrain_learn),
+    "icag": Method(_then_practice, _icag_ask, _pretrain_learn),
     "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn),
 }

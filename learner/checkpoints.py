@@ -16,6 +16,7 @@ from icrl_dist.config import ConfigError, Run, dumps
 from icrl_dist.envs import tasks
 from icrl_dist.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
+from icrl_dist.pretrain import Optimiser
 from icrl_dist.stream.wire import weights_digest
 from icrl_dist.types import Spec, Weights
 
@@ -41,12 +42,11 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
     }
 
 
-def save(path: Path, model: PretrainedTransformer, opt: torch.optim.Optimizer, about: Mapping[str, Any]) -> None:
+def save(path: Path, model: PretrainedTransformer, opt: Optimiser, about: Mapping[str, Any]) -> None:
     """Weights, the optimiser's moments, and the manifest, atomically."""
     weights = weights_of(model)
     arrays = {f"model/{name}": value for name, value in weights.items()}
-    for index, state in opt.state_dict()["state"].items():
-        arrays |= {f"optimiser/{index}/{name}": value.cpu().numpy() for name, value in state.items()}
+    arrays |= {f"optimiser/{name}": value.cpu().numpy() for name, value in opt.state().items()}
     save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights_digest(weights)}))
 
 
@@ -55,10 +55,10 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
     return load_checkpoint(path).manifest
 
 
-def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: torch.optim.Optimizer) -> Mapping[str, Any]:
+def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: Optimiser) -> Mapping[str, Any]:
     """Load what ``save`` wrote into model and optimiser; returns the manifest.
 
-    Raises ConfigError for a checkpoint of another spec or another model size.
+    Raises ConfigError for a checkpoint of another spec, another model size or another optimiser.
     """
     checkpoint = load_checkpoint(path)
     theirs = spec_from(checkpoint.manifest["spec"])
@@ -68,11 +68,10 @@ def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: torch.opt
         load_weights(model, checkpoint.part("model"))
     except RuntimeError as error:
         raise ConfigError(f"{path}: a checkpoint of another model ({' '.join(str(error).split())})") from None
-    state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in checkpoint.part("optimiser").items():
-        index, _, key = name.partition("/")
-        state.setdefault(int(index), {})[key] = torch.from_numpy(np.array(value))
-    opt.load_state_dict({"state": state, "param_groups": opt.state_dict()["param_groups"]})
+    try:
+        opt.load({name: torch.from_numpy(np.array(value)) for name, value in checkpoint.part("optimiser").items()})
+    except ValueError as error:
+        raise ConfigError(f"{path}: a checkpoint of another optimiser ({error}): it has the run's optim.muon") from None
     return checkpoint.manifest
 
 

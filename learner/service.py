@@ -71,7 +71,7 @@ class Service:
         torch.manual_seed(run.seed)
         torch.use_deterministic_algorithms(True)
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
-        self._opt = pretrain.optimiser(self.model, run.optim)
+        self._opt = pretrain.Optimiser(self.model, run.optim)
         self.version = files.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder)
@@ -238,7 +238,7 @@ class Service:
             key = (_FIT_DRAWS, phase.produces, step)
             rng = np.random.default_rng(np.random.SeedSequence(self._run.seed, spawn_key=key))
             torch.manual_seed(int(rng.integers(2**31)))
-            return context.draw(rng, pools, optim.batch, optim.queries, optim.episodes)
+            return context.draw(rng, pools, optim.batch, optim.queries, optim.transitions)
 
         def progress(step: int, loss: float) -> None:
             self._partial = step  # damage may end this fit: it is taken up from here

@@ -65,13 +65,13 @@ def check_row(batch: Batch, row: int) -> tuple[int, list[int], int]:
     return variation, episodes, length
 
 
-def batches(pools: list[Pool], count: int = 40, episodes: int = 3, batch: int = 16) -> list[Batch]:
+def batches(pools: list[Pool], count: int = 40, transitions: int = 0) -> list[Batch]:
     rng = np.random.default_rng(0)
-    return [context.draw(rng, pools, batch, 6, episodes) for _ in range(count)]
+    return [context.draw(rng, pools, 16, 6, transitions) for _ in range(count)]
 
 
 def test_every_number_comes_from_one_variation_in_order() -> None:
-    pool = Pool(1.0, [examples(1, 4), examples(2, 4), examples(3, 4)])
+    pool = Pool(1.0, [examples(1, 4), examples(2, 4), examples(3, 4)], 3)
     rows = [(b, *check_row(b, row)) for b in batches([pool]) for row in range(16)]
     assert {v for _, v, _, _ in rows} == {1, 2, 3}
     assert {len(e) for _, _, e, _ in rows} == {1, 2, 3}
@@ -81,8 +81,8 @@ def test_every_number_comes_from_one_variation_in_order() -> None:
 
 
 def test_prefixes_reach_from_nothing_to_everything() -> None:
-    pool = Pool(1.0, [examples(1, 2)])
-    for b in (all_batches := batches([pool], episodes=1)):
+    pool = Pool(1.0, [examples(1, 2)], 1)
+    for b in (all_batches := batches([pool])):
         assert b.observations.shape == (16, HORIZON, 2)
     counts = np.bincount(np.concatenate([b.prefix.ravel() for b in all_batches]))
     assert len(counts) == HORIZON + 1
@@ -91,36 +91,51 @@ def test_prefixes_reach_from_nothing_to_everything() -> None:
 
 
 def test_history_contexts_are_the_first_episodes_in_order() -> None:
-    pool = Pool(1.0, [examples(1, 3, history=True), examples(2, 3, history=True)])
+    pool = Pool(1.0, [examples(1, 3, history=True), examples(2, 3, history=True)], 3)
     seen = {tuple(check_row(b, row)[1]) for b in batches([pool]) for row in range(16)}
     assert seen == {(0,), (0, 1), (0, 1, 2)}
 
 
 def test_a_variation_with_fewer_episodes_is_padded_at_the_end() -> None:
-    pool = Pool(1.0, [examples(1, 1), examples(2, 3)])
+    pool = Pool(1.0, [examples(1, 1), examples(2, 3)], 3)
     lengths = {(b.actions.shape[1], *check_row(b, row)[::2]) for b in batches([pool]) for row in range(16)}
     assert (3 * HORIZON, 1, HORIZON) in lengths
     assert (3 * HORIZON, 2, 3 * HORIZON) in lengths
     # Never longer than its longest row.
-    assert all(max(check_row(b, row)[2] for row in range(16)) == b.actions.shape[1] for b in batches([pool], batch=16))
+    assert all(max(check_row(b, row)[2] for row in range(16)) == b.actions.shape[1] for b in batches([pool]))
 
 
 def test_all_queries_are_drawn() -> None:
-    drawn = np.concatenate([b.queries[..., 0].ravel() for b in batches([Pool(1.0, [examples(1, 2)])])])
+    drawn = np.concatenate([b.queries[..., 0].ravel() for b in batches([Pool(1.0, [examples(1, 2)], 3)])])
     assert set(drawn.astype(int)) == {1000, 1001, 1002}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_pools_are_drawn_by_their_share(share: float) -> None:
-    pools = [Pool(2 * share, [examples(1, 2)]), Pool(2 * (1 - share), [examples(2, 2), examples(3, 2)])]
-    variations = np.array([check_row(b, row)[0] for b in batches(pools) for row in range(16)])
-    assert abs((variations == 1).mean() - share) <= 4.5 * np.sqrt(share * (1 - share) / len(variations))
-    assert (share == 1) or {2, 3} <= set(variations)
+    """A batch is of one pool, and as long as that pool's contexts may be."""
+    pools = [Pool(2 * share, [examples(1, 4)], 1), Pool(2 * (1 - share), [examples(2, 4), examples(3, 4)], 4)]
+    drawn = [[check_row(b, row) for row in range(16)] for b in batches(pools, 200)]
+    kinds = [{variation for variation, _, _ in rows} for rows in drawn]
+    assert all(kind == {1} or kind <= {2, 3} for kind in kinds)
+    assert abs(np.mean([kind == {1} for kind in kinds]) - share) <= 4.5 * np.sqrt(share * (1 - share) / len(kinds))
+    assert (share == 1) or {2, 3} <= set.union(*kinds)
+    lengths = {(variation == 1, len(episodes)) for rows in drawn for variation, episodes, _ in rows}
+    possible = [(share > 0, {(True, 1)}), (share < 1, {(False, n) for n in range(1, 5)})]
+    assert lengths == set().union(*(those for drawn, those in possible if drawn))
+
+
+def test_of_longer_contexts_fewer_fit_into_a_step() -> None:
+    pool = Pool(1.0, [examples(1, 4), examples(2, 4)], 4)
+    sizes = {(len({*check_row(b, 0)[1]}), len(b.actions)) for b in batches([pool], transitions=6 * HORIZON)}
+    assert sizes == {(1, 6), (2, 3), (3, 2), (4, 1)}
+    assert {len(b.actions) for b in batches([pool], transitions=1)} == {1}, "one context, however long"
+    short = Pool(1.0, [examples(1, 1), examples(2, 1)], 4)
+    assert {len(b.actions) for b in batches([short], transitions=6 * HORIZON)} == {6}, "counted as drawn, not as asked for"
 
 
 def test_a_batch_repeats_with_its_generator() -> None:
-    pool = [Pool(1.0, [examples(1, 4), examples(2, 4)])]
-    one, same, other = (context.draw(np.random.default_rng(seed), pool, 8, 4, 3) for seed in (0, 0, 1))
+    pool = [Pool(1.0, [examples(1, 4), examples(2, 4)], 3)]
+    one, same, other = (context.draw(np.random.default_rng(seed), pool, 8, 4) for seed in (0, 0, 1))
     fields = [*Batch.__dataclass_fields__]
     assert all(np.array_equal(getattr(one, f), getattr(same, f)) for f in fields)
     assert not all(np.array_equal(getattr(one, f), getattr(other, f)) for f in fields)

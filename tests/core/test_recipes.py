@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from icrl_dist import jobs
+from icrl_dist.config import PracticeConfig
 from icrl_dist.envs import tasks
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, cell_numbers, soft_labels
@@ -170,6 +171,55 @@ def test_each_round_learns_from_d0_and_all_rounds_so_far(small_run, collected):
     assert [len(pool.examples) for pool in second] == [len(first[0].examples), variations]
     assert [len(pool.examples) for pool in third] == [len(first[0].examples), 2 * variations]
     assert [pool.share for pool in third] == [1 - small_run.icaa.new_fraction, small_run.icaa.new_fraction]
+
+
+def test_practice_adds_own_histories_from_the_origin_with_optimal_labels(small_run):
+    """Rounds after D_pre: T^j acts, the optimal policy labels, contexts are histories as deployed."""
+    practice = PracticeConfig(rounds=2, trials=3, steps=7, learning_rate=0.5, new_fraction=0.25)
+    run = dataclasses.replace(small_run, method="icag", practice=practice)
+    method, data = METHODS["icag"], Kept([])
+    policies = Fixed(tasks.spec(run), run.model)
+    phases = method.phases(run)
+    assert [(p.stage, p.acting, p.produces) for p in phases] == [("pretrain", -1, 0), ("adapt", 0, 1), ("adapt", 1, 2)]
+    assert [(p.steps, p.learning_rate) for p in phases[1:]] == [(7, 0.5)] * 2
+    variations = [v for i, task in enumerate(tasks.split(run).train) for v in tasks.variations(run, i, tasks.deployed(task))]
+    for phase in phases:
+        asked = method.ask(run, phase)
+        made = [t for job in asked for t in jobs.do(job, policies, "w")]
+        data.trajectories += made
+        pools = method.learn(run, phase, data)
+        assert [len(pool.examples) for pool in pools] == [len(variations), phase.produces * len(variations)][: len(pools)]
+        assert len(pools) == 1 + (phase.stage == "adapt")
+        if phase.stage == "pretrain":
+            continue
+        assert [v for job in asked for v in job.variations] == variations, "the variations of D_pre, not new ones"
+        assert [pool.share for pool in pools] == [0.75, 0.25]
+        assert [pool.episodes for pool in pools] == [run.optim.episodes, 3]
+        assert {(t.weights, t.digest) for t in made} == {(phase.round, f"digest {phase.round}")}
+        for t in made:
+            assert (t.observations[0] == 0).all()
+            truth = soft_labels(Hypotheses.of([t.variation]), run.darkroom.gamma, run.darkroom.label_slack)[0]
+            np.testing.assert_array_equal(t.labels, truth[cell_numbers(t.queries, 3)])
+        mine = pools[1].examples[0]
+        trials = data.trials(("adapt", 0, 0, 0))
+        assert mine.history and len(trials) == 3
+        np.testing.assert_array_equal(mine.actions, np.stack([t.actions for t in trials]))
+        np.testing.assert_array_equal(mine.labels, np.concatenate([t.labels for t in trials]))
+        assert not pools[0].examples[0].history
+    assert len({tuple(t.actions) for t in data.trials(("adapt", 0, 0, 1)) + data.trials(("adapt", 1, 0, 1))}) == 6
+
+
+def test_behaviours_take_turns(small_run):
+    """Trial n of every variation walks as behaviour n modulo their number."""
+    behaviours = ("sweep", "random")
+    run = dataclasses.replace(small_run, pretrain=dataclasses.replace(small_run.pretrain, behaviours=behaviours))
+    found = {}
+    for setting in (run, small_run):
+        phase = METHODS["dpt"].phases(setting)[0]
+        made = [t for job in METHODS["dpt"].ask(setting, phase) for t in jobs.do(job, Fixed, "w")]
+        found[setting.pretrain.behaviours] = {t.identity: t.actions.tolist() for t in made}
+    same = {i: actions == found["random",][i] for i, actions in found[behaviours].items()}
+    assert all(equal == (identity.trial % 2 == 1) for identity, equal in same.items()), "only the random walks are as they were"
 
 
 def test_an_unknown_job_is_refused(small_run):

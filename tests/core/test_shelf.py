@@ -20,7 +20,7 @@ def test_a_shelf_keeps_the_last_used_within_its_budget_and_draws_the_same(kept):
     shelf = Shelf(budget, read)
     shelved = Shelved(shelf, list(everything))
     for n in range(20):
-        one, two = (draw(np.random.default_rng(n), [Pool(1.0, p)], 8, 4, 3) for p in (shelved, [*everything.values()]))
+        one, two = (draw(np.random.default_rng(n), [Pool(1.0, p, 3)], 8, 4) for p in (shelved, [*everything.values()]))
         for name in ("observations", "actions", "rewards", "queries", "labels", "prefix"):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
         assert shelf.nbytes <= max(budget, everything[0].nbytes)

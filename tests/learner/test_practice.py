@@ -1,0 +1,53 @@
+"""ICAG with rounds on T_theta's own histories, through the learner: stopped or not, and explained."""
+
+import dataclasses
+
+import pytest
+
+from icrl_dist import explain
+from icrl_dist.config import PracticeConfig
+from icrl_dist.launch import TrainInterrupted
+from icrl_dist.types import Identity
+from learner import checkpoints, service
+from tests.learner.test_service import no_tensorboard, run_inline, same
+
+__all__ = ["no_tensorboard"]
+
+
+@pytest.fixture
+def run(small_run):
+    return dataclasses.replace(
+        small_run,
+        method="icag",
+        pretrain=dataclasses.replace(small_run.pretrain, behaviours=("random", "persistent", "goals", "sweep")),
+        practice=PracticeConfig(rounds=2, trials=3, steps=6),
+        optim=dataclasses.replace(small_run.optim, muon=5.0, transitions=60),
+    )
+
+
+def test_a_round_of_practice_stopped_midway_goes_on_to_the_same_bytes(run, tmp_path, monkeypatch):
+    whole = run_inline(run, tmp_path / "whole")
+    assert whole["version"] == 2
+    assert whole["trajectories"] == 42 + 2 * 7 * run.adversary.count * 3
+
+    def stop(event):
+        if event["event"] == "progress" and (event["stage"], event["version"]) == ("fit", 1) and event["step"] >= 3:
+            made[0].stop()
+
+    made = []
+    real = service.Service.run
+    monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
+    monkeypatch.setattr(service, "PERIOD_S", 0.0)
+    with pytest.raises(TrainInterrupted):
+        run_inline(run, tmp_path / "stopped", stop)
+    partial = checkpoints.read_manifest(tmp_path / "stopped" / "checkpoints" / checkpoints.PARTIAL)
+    assert partial["produces"] == 2 and 0 < partial["step"] < 6
+    monkeypatch.setattr(service.Service, "run", real)
+    assert same(run_inline(run, tmp_path / "stopped", resume=True), whole)
+
+
+def test_a_history_is_explained_and_made_again(run, tmp_path):
+    run_inline(run, tmp_path / "run")
+    answer = explain.explain(tmp_path / "run", Identity("adapt", 1, 3, 2, 1), rerun=True)
+    assert answer["rerun_equal"] and answer["weights"] == 1
+    assert answer["label_origin"] == "optimal" and answer["learned_by"] == ["T^2"]
