@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,10 @@ from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, newest_vers
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
 from icrl_dist.rollout import InContextPolicy, sample
 from icrl_dist.types import Spec
+
+_AGENTS = Path(str(resources.files("icrl_dist") / "agents"))
+SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
+"""Agents that come with the package (docs/results/engine.md says how each was made)."""
 
 
 class InContextAgent:
@@ -35,7 +40,7 @@ class InContextAgent:
         self.reset_context()
 
     def reset_context(self, batch: int = 1) -> None:
-        """Forget everything and begin anew in ``batch`` environments."""
+        """Forget everything and begin anew in ``batch`` environments, with the model's weights as they are now."""
         self._policy = InContextPolicy(self.model, batch, self._context)
 
     def act(self, obs: ArrayLike) -> Int[np.ndarray, " B"]:
@@ -73,15 +78,30 @@ class InContextAgent:
 
 
 def load_agent(what: str | Path, seed: int | None = None) -> InContextAgent:
-    """The agent of a run folder (its newest version) or of one checkpoint file.
+    """The agent of a run folder (its newest version), of one checkpoint file, or a shipped one by its name.
+
+    ``load_agent("darkroom")`` works at once; a run folder of such a name is ``"./darkroom"``.
 
     Raises ConfigError if there is no such thing, StoreError if it was not written by this system.
     Loading executes no code from the file.
     """
-    checkpoint = load_checkpoint(checkpoint_file(Path(what)))
+    checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
     model, context = model_of(checkpoint)
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
     return InContextAgent(model, manifest, context, seed)
+
+
+def shipped(name: str | Path) -> Path:
+    """The checkpoint of an agent that comes with the package.  Raises ConfigError if there is none."""
+    if name not in SHIPPED:
+        raise ConfigError(f"--pretrained {name}: no agent of that name is shipped; there are {', '.join(SHIPPED)}")
+    return _AGENTS / f"{name}.npz"
+
+
+def slim(checkpoint: Checkpoint) -> Checkpoint:
+    """What deployment needs of a checkpoint: the weights and where they come from, not the optimiser or the dataset's list."""
+    manifest = {key: value for key, value in checkpoint.manifest.items() if key != "dataset"}
+    return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith("model/")}, manifest)
 
 
 def checkpoint_file(what: Path, version: int | None = None) -> Path:

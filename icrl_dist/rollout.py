@@ -12,8 +12,7 @@ from jaxtyping import Float, Float32, Int16, Int64
 
 from icrl_dist.config import ContextConfig
 from icrl_dist.envs import Batch
-from icrl_dist.models.dpt import PretrainedTransformer, Transitions
-from icrl_dist.models.gpt import Cache
+from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions
 
 
 class Policy(Protocol):
@@ -55,17 +54,16 @@ class InContextPolicy:
         self.model, self.batch, self._config = model, batch, context
         self._episodes: list[Transitions] = []
         self._pending: list[tuple[np.ndarray, ...]] = []
-        self._cache: Cache = self._encode([])
+        self._deployed = Deployed(model, batch)
 
     @property
     def length(self) -> int:
         """Transitions in the context of each environment."""
-        return self._cache[0][0].shape[2]
+        return self._deployed.length
 
-    @torch.inference_mode()
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
-        query = torch.from_numpy(np.array(observation)).to(self.model.low.device).unsqueeze(1)
-        return self.model.decide(query, self._cache)[:, 0].softmax(-1).cpu().numpy()
+        states = torch.from_numpy(np.array(observation)).to(self.model.low.device)
+        return self._deployed.decide(states).softmax(-1).cpu().numpy()
 
     def observe(
         self,
@@ -81,7 +79,6 @@ class InContextPolicy:
             self._pending = []
             self.append(stacked[0], stacked[1], stacked[2], stacked[3])
 
-    @torch.inference_mode()
     def append(
         self,
         observations: Float32[np.ndarray, "B T S"],
@@ -101,20 +98,11 @@ class InContextPolicy:
         total = sum(e.actions.shape[1] for e in kept) + episode.actions.shape[1]
         while kept and total > self._config.max:
             total -= kept.pop(0).actions.shape[1]
-        grows = len(kept) == len(self._episodes)
-        self._episodes = [*kept, episode]
-        self._cache = self.model.encode(episode, self._cache) if grows else self._encode(self._episodes)
-
-    @torch.inference_mode()
-    def _encode(self, episodes: Sequence[Transitions]) -> Cache:
-        device, size = self.model.low.device, len(self.model.spec.low)
-        empty = Transitions(
-            torch.zeros(self.batch, 0, size, device=device),
-            torch.zeros(self.batch, 0, dtype=torch.long, device=device),
-            torch.zeros(self.batch, 0, size, device=device),
-            torch.zeros(self.batch, 0, device=device),
-        )
-        return self.model.encode(Transitions(*(torch.cat(c, dim=1) for c in zip(empty, *episodes, strict=True))))
+        dropped, self._episodes = len(kept) < len(self._episodes), [*kept, episode]
+        if dropped:
+            self._deployed.clear()
+            episode = Transitions(*(torch.cat(columns, dim=1) for columns in zip(*self._episodes, strict=True)))
+        self._deployed.append(episode)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from icrl_dist.config import ModelConfig
-from icrl_dist.models.gpt import GPT, Cache
+from icrl_dist.models.gpt import GPT, Cache, Decoder, copied
 from icrl_dist.types import Spec
 
 
@@ -32,15 +33,17 @@ class PretrainedTransformer(nn.Module):
     """T_theta(a | s_query, D) of eq. (1)."""
 
     low: Tensor
-    high: Tensor
+    scale: Tensor
+    shift: Tensor
 
     def __init__(self, spec: Spec, config: ModelConfig) -> None:
         super().__init__()
         if not spec.discrete:
             raise ValueError("PretrainedTransformer: only discrete actions are built so far")
         self.spec, self.config = spec, config
-        self.register_buffer("low", torch.tensor(spec.low), persistent=False)
-        self.register_buffer("high", torch.tensor(spec.high), persistent=False)
+        low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+        for name, buffer in (("low", low), ("scale", 2 / (high - low)), ("shift", -(high + low) / (high - low))):
+            self.register_buffer(name, buffer, persistent=False)
         features = spec.observation * (1 + 2 * config.fourier)
         self.embed_transition = nn.Linear(2 * features + spec.actions + 1, config.width)
         self.embed_query = nn.Linear(features, config.width)
@@ -56,13 +59,15 @@ class PretrainedTransformer(nn.Module):
 
     def features(self, observations: Float[Tensor, "*B S"]) -> Float[Tensor, "*B F"]:
         """Observations scaled to [-1, 1], with ``fourier`` sine and cosine pairs of each."""
-        x = 2 * (observations - self.low) / (self.high - self.low) - 1
+        x = torch.addcmul(self.shift, observations, self.scale)
+        if not self.config.fourier:
+            return x
         waves = [f(0.5 * torch.pi * k * x) for k in range(1, self.config.fourier + 1) for f in (torch.sin, torch.cos)]
         return torch.cat([x, *waves], dim=-1)
 
-    def encode(self, context: Transitions, past: Cache | None = None) -> Cache:
-        """Keys and values of a context, appended to an earlier one's."""
-        one_hot = nn.functional.one_hot(context.actions, self.spec.actions).to(context.rewards.dtype)
+    def tokens(self, context: Transitions) -> Float[Tensor, "B T D"]:
+        """The embedded tokens of a context, one a transition."""
+        one_hot = F.one_hot(context.actions, self.spec.actions).to(context.rewards.dtype)
         token = torch.cat(
             [
                 self.features(context.observations),
@@ -72,7 +77,12 @@ class PretrainedTransformer(nn.Module):
             ],
             dim=-1,
         )
-        return self.trunk.encode(self.embed_transition(token), past)
+        embedded: Tensor = self.embed_transition(token)
+        return embedded
+
+    def encode(self, context: Transitions) -> Cache:
+        """Keys and values of a context."""
+        return self.trunk.encode(self.tokens(context))
 
     def decide(
         self, queries: Float[Tensor, "B Q S"], cache: Cache, prefix: Int[Tensor, "B Q"] | None = None
@@ -92,6 +102,36 @@ class PretrainedTransformer(nn.Module):
         self, context: Transitions, queries: Float[Tensor, "B Q S"], prefix: Int[Tensor, "B Q"]
     ) -> Float[Tensor, "B Q A"]:
         return self.decide(queries, self.encode(context), prefix)
+
+
+class Deployed:
+    """T_theta beside a growing context in each of B environments: one token a decision.
+
+    Make it anew when the model has learned something: weights are copied.
+    """
+
+    def __init__(self, model: PretrainedTransformer, batch: int) -> None:
+        self._model, self._decoder = model, Decoder(model.trunk, batch)
+        self._embed, self._head = copied(model.embed_query), copied(model.head)
+
+    @property
+    def length(self) -> int:
+        """Transitions in each context."""
+        return self._decoder.length
+
+    def clear(self) -> None:
+        """Forget every context."""
+        self._decoder.clear()
+
+    @torch.inference_mode()
+    def append(self, transitions: Transitions) -> None:
+        """Append transitions to each context."""
+        self._decoder.append(self._model.tokens(transitions))
+
+    @torch.inference_mode()
+    def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B A"]:
+        """Logits of T_theta at a query state of each context, given the whole of it."""
+        return F.linear(self._decoder.query(F.linear(self._model.features(states), *self._embed)), *self._head)
 
 
 def weights_of(model: nn.Module) -> dict[str, np.ndarray]:

@@ -13,7 +13,8 @@ from torch import Tensor
 from icrl_dist import context, pretrain
 from icrl_dist.config import ModelConfig, OptimConfig
 from icrl_dist.context import Batch, Examples, Pool
-from icrl_dist.models.dpt import PretrainedTransformer, Transitions, load_weights, weights_of
+from icrl_dist.models import gpt
+from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, load_weights, weights_of
 from icrl_dist.models.gpt import GPT
 from icrl_dist.types import Spec
 
@@ -57,15 +58,49 @@ def changed(of: Transitions, at: int) -> Transitions:
 
 
 @torch.no_grad()
+@pytest.mark.parametrize(("heads", "width"), [(1, 32), (2, 32), (1, 64), (4, 64)])
 @pytest.mark.parametrize("cuts", [(0, 20), (0, 7, 20), (0, 0, 1, 2, 19, 20), tuple(range(21))], ids=str)
-def test_encoding_in_pieces_equals_encoding_at_once(cuts: tuple[int, ...]) -> None:
-    model, context_, queries = build(), transitions(), states()
-    at_once = model(context_, queries, torch.full((B, Q), T))
-    cache = None
+def test_a_deployed_context_grown_in_pieces_decides_as_in_training(cuts: tuple[int, ...], heads: int, width: int) -> None:
+    model, whole, queries = build(3, heads, width), transitions(), states(T + 1)
+    prefixes = model(whole, queries, torch.arange(T + 1).repeat(B, 1))
+    deployed = Deployed(model, B)
     for start, stop in itertools.pairwise(cuts):
-        cache = model.encode(part(context_, start, stop), cache)
-    assert cache is not None
-    torch.testing.assert_close(model.decide(queries, cache), at_once, atol=1e-5, rtol=1e-5)
+        deployed.append(part(whole, start, stop))
+        assert deployed.length == stop
+        for _ in range(2):  # A decision leaves nothing behind.
+            torch.testing.assert_close(deployed.decide(queries[:, stop]), prefixes[:, stop], atol=1e-5, rtol=1e-5)
+    assert prefixes.std(dim=1).min() > 1e-3, "the queries all answer alike: this would prove nothing"
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("tokens", [1, 25, 40, 10_000])
+def test_contexts_appended_some_at_a_time_are_the_same(tokens: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, whole, queries = build(), transitions(), states()[:, 0]
+    monkeypatch.setattr(gpt, "_AT_ONCE", tokens)
+    deployed = Deployed(model, B)
+    for start, stop in ((0, 11), (11, T)):
+        deployed.append(part(whole, start, stop))
+    expected = model(whole, queries[:, None], torch.full((B, 1), T))[:, 0]
+    torch.testing.assert_close(deployed.decide(queries), expected, atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_a_cleared_context_is_an_empty_one_and_later_training_does_not_reach_it() -> None:
+    model, queries = build(), states()[:, 0]
+    deployed = Deployed(model, B)
+    empty = deployed.decide(queries)
+    torch.testing.assert_close(
+        empty, model(transitions(), queries[:, None], torch.zeros(B, 1, dtype=torch.int64))[:, 0], atol=1e-5, rtol=1e-5
+    )
+    deployed.append(transitions())
+    full = deployed.decide(queries)
+    assert (full - empty).abs().amax() > 1e-3
+    for parameter in model.parameters():
+        parameter.mul_(1.5)
+    torch.testing.assert_close(deployed.decide(queries), full, atol=0, rtol=0)
+    deployed.clear()
+    assert deployed.length == 0
+    torch.testing.assert_close(deployed.decide(queries), empty, atol=0, rtol=0)
 
 
 @torch.no_grad()
@@ -238,11 +273,11 @@ def corridor() -> tuple[PretrainedTransformer, list[Pool]]:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     model = PretrainedTransformer(Spec((0.0,), (1.0,), 2, 8), ModelConfig(layers=2, heads=1, width=16))
-    return model, [Pool(1.0, [two_cells(goal, rng) for goal in (0, 1) for _ in range(4)])]
+    return model, [Pool(1.0, [two_cells(goal, rng) for goal in (0, 1) for _ in range(4)], 1)]
 
 
 def corridor_batch(pools: list[Pool], step: int) -> Batch:
-    return context.draw(np.random.default_rng(step), pools, 32, 8, 1)
+    return context.draw(np.random.default_rng(step), pools, 32, 8)
 
 
 @torch.no_grad()
@@ -273,7 +308,7 @@ def test_fit_learns_the_corridor() -> None:
     seen: list[tuple[int, float]] = []
     final = pretrain.fit(
         model,
-        pretrain.optimiser(model, config),
+        pretrain.Optimiser(model, config),
         config,
         config.learning_rate,
         200,
@@ -295,7 +330,7 @@ def test_fit_stops_at_a_loss_that_is_no_number() -> None:
         model.head.bias.fill_(math.nan)
     with pytest.raises(FloatingPointError, match=r"nan at step 0: lower the learning rate \(0\.25\)"):
         pretrain.fit(
-            model, pretrain.optimiser(model, config), config, config.learning_rate, 3, lambda step: corridor_batch(pools, step)
+            model, pretrain.Optimiser(model, config), config, config.learning_rate, 3, lambda step: corridor_batch(pools, step)
         )
 
 

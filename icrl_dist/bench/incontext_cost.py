@@ -1,0 +1,164 @@
+"""What a decision and a label cost: the real deployment loop and the real training step, ours and the peer's."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from icrl_dist import envs, pretrain
+from icrl_dist.bench import peer
+from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, SPEC, Law
+from icrl_dist.config import ContextConfig
+from icrl_dist.envs import darkroom
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.rollout import InContextPolicy, Policy, RandomPolicy, episode
+from icrl_dist.types import NULL, Variation
+
+LENGTHS = tuple(range(0, 4001, 500))
+"""Contexts at which a decision is timed, and how many at once."""
+ROWS = 20
+
+
+def matmul_gflops(size: int = 1024, repeats: int = 9, device: str = "cpu") -> float:
+    """What a product of two float32 matrices reaches: how fast this machine is."""
+    a = torch.ones(size, size, device=device)
+    return 2e-9 * size**3 / statistics.median(_times(lambda: a @ a, repeats, device))
+
+
+def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
+    """Environment steps a CPU-second of whole online episodes, each begun with a context of 100 transitions.
+
+    Both sides run ``rollout.episode`` in the same environments, in turns, and take the episode
+    that ended for their next context, as the official code does.
+    """
+    rng = np.random.default_rng(0)
+    env = envs.batch([Variation(darkroom.task(goal), NULL) for goal in rng.integers(0, 10, size=(batch, 2)).tolist()])
+    rngs = rng.spawn(batch)
+    torch.manual_seed(0)
+    ours = InContextPolicy(PretrainedTransformer(env.spec, MODEL).eval(), batch, ContextConfig(keep="last"))
+    theirs = peer.PeerPolicy(peer.Peer(env.spec).eval())
+    first = episode(env, RandomPolicy(env.spec.actions), rngs)
+    for policy in (ours, theirs):
+        policy.append(first.observations[:, :-1], first.actions.astype(np.int64), first.observations[:, 1:], first.rewards)
+
+    def rates(policy: Policy, episodes: int) -> list[float]:
+        return [batch * LENGTH / taken for taken in _times(lambda: episode(env, policy, rngs), episodes)]
+
+    rates(ours, 1)  # finds cold caches
+    measured: dict[str, list[float]] = {"ours": [], "peer": []}
+    for _ in range(pairs):
+        measured["ours"] += rates(ours, 4)
+        measured["peer"] += rates(theirs, 1)
+    return measured
+
+
+def training(rounds: int) -> dict[str, float]:
+    """Contexts and labelled queries a CPU-second through forward, backward and optimiser, in turns."""
+    law = Law(0)
+    torch.manual_seed(0)
+    step, labels = _our_step(law, "cpu", OPTIM.batch)
+    model = peer.Peer(SPEC)
+    opt, drawn = peer.optimiser(model), law.draw(0, 0, peer.BATCH, 1).tensors()
+    ours, theirs = [], []
+    for turn in range(rounds + 1):
+        measured = _times(step, 8), _times(lambda: peer.train_step(model, opt, *drawn), 5)
+        if turn:  # the first finds cold caches
+            ours += measured[0]
+            theirs += measured[1]
+    return {
+        "labels_per_s": labels / statistics.median(ours),
+        "peer_labels_per_s": peer.BATCH / statistics.median(theirs),
+    }
+
+
+def by_length(repeats: int = 25) -> dict[str, Any]:
+    """CPU time of a decision in ``ROWS`` environments at once as their contexts grow, and its exponents.
+
+    ``length_exponent`` is the slope of log time against log length over all contexts but the empty
+    one, ``length_exponent_long`` over the longer half, which no longer fits into every processor's cache.
+    """
+    law = Law(0)
+    torch.manual_seed(0)
+    policy = InContextPolicy(PretrainedTransformer(SPEC, MODEL).eval(), ROWS, ContextConfig(max=max(LENGTHS)))
+    state = np.zeros((ROWS, SPEC.observation), np.float32)
+    taken: list[float] = []
+    for number, length in enumerate(LENGTHS):
+        while policy.length < length:
+            drawn = law.draw(number, policy.length, ROWS, 1)
+            data = drawn.batch(np.zeros(drawn.query.shape, np.int64))
+            policy.append(data.observations, data.actions, data.next_observations, data.rewards)
+        policy.probabilities(state)
+        taken.append(1e6 * statistics.median(_times(lambda: policy.probabilities(state), repeats)))
+    slope = [float(np.polyfit(np.log(LENGTHS[first:]), np.log(taken[first:]), 1)[0]) for first in (1, len(LENGTHS) // 2)]
+    return {
+        "length": list(LENGTHS),
+        "decision_us": [round(t) for t in taken],
+        "length_exponent": round(slope[0], 3),
+        "length_exponent_long": round(slope[1], 3),
+    }
+
+
+def on_device(device: str, batch: int = 1024, environments: int = 4096, size: int = 8192) -> dict[str, Any]:
+    """Labels and decisions a second on an accelerator, and their shares of its own limits.
+
+    A label's limit is the rate of a float32 product of two matrices ``(size, size)``, a decision's
+    that of copying one, both measured here: a decision reads its context once a layer.
+    """
+    law = Law(0)
+    torch.manual_seed(0)
+    step, labels = _our_step(law, device, batch)
+    step()
+    with FlopCounterMode(display=False) as counter:
+        step()
+    label_s = statistics.median(_times(step, 9, device)) / labels
+    model = PretrainedTransformer(SPEC, MODEL).to(device).eval()
+    policy = InContextPolicy(model, environments, ContextConfig())
+    data = law.draw(0, 0, environments, 1).batch(np.zeros((environments, 1), np.int64))
+    policy.append(data.observations, data.actions, data.next_observations, data.rewards)
+    state = data.queries[:, 0]
+    policy.probabilities(state)
+    decision_s = statistics.median(_times(lambda: policy.probabilities(state), 25, device)) / environments
+    block = torch.ones(size, size, device=device)
+    copied_per_s = 8 * size**2 / statistics.median(_times(block.clone, 9, device))
+    return {
+        "device": device,
+        "labels_per_s": 1 / label_s,
+        "labels_share": counter.get_total_flops() / labels / label_s / 1e9 / matmul_gflops(size, device=device),
+        "decisions_per_s": 1 / decision_s,
+        "decisions_share": 4 * MODEL.layers * MODEL.width * LENGTH / decision_s / copied_per_s,
+    }
+
+
+def _our_step(law: Law, device: str, batch: int) -> tuple[Callable[[], object], int]:
+    """A training step on one drawn batch, and its labelled queries."""
+    model = PretrainedTransformer(SPEC, MODEL).to(device).train()
+    opt = pretrain.Optimiser(model, OPTIM)
+    drawn = law.draw(0, 0, batch, OPTIM.queries)
+    data = drawn.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=drawn.query.shape))
+
+    def step() -> None:
+        value = pretrain.batch_loss(model, data)
+        value.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(model.parameters(), OPTIM.clip)
+        opt.step(OPTIM.learning_rate)
+
+    return step, drawn.query.size
+
+
+def _times(call: Callable[[], object], repeats: int, device: str = "cpu") -> list[float]:
+    """Seconds of each call: the processor's, or the clock's where another device works."""
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    taken = []
+    for _ in range(repeats):
+        began = clock()
+        call()
+        if device != "cpu":
+            torch.cuda.synchronize()
+        taken.append(clock() - began)
+    return taken
