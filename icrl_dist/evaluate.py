@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from icrl_dist import envs
-from icrl_dist.config import Run
-from icrl_dist.envs import tasks
+from icrl_dist.config import DarkRoomConfig, Run
+from icrl_dist.envs import darkroom, tasks
 from icrl_dist.envs.darkroom import ACTIONS
+from icrl_dist.exact import RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.oracle import Hypotheses, OptimalAgent, cell_numbers, optimal_returns, soft_labels
+from icrl_dist.oracle import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.recipes import Dataset, Phase, self_labelled
 from icrl_dist.rollout import InContextPolicy, Policy, RandomPolicy, deploy_offline, deploy_online, episode
 from icrl_dist.stats import mean_and_error
-from icrl_dist.types import Identity, Variation
+from icrl_dist.types import Adversary, Identity, Task, Variation
 
 MakePolicy = Callable[[Sequence[Variation]], Policy]
 ORACLE = "oracle"
@@ -52,10 +54,12 @@ class Result:
         }
 
 
-def variations(run: Run, p: float) -> tuple[Variation, ...]:
-    """Every held-out task under its test adversary of strength p, started in the origin."""
-    test = tasks.split(run).test
-    return tuple(Variation(tasks.deployed(t), tasks.test_adversary(run, i, p, run.evaluate.prior)) for i, t in enumerate(test))
+def variations(run: Run, p: float, goals: Sequence[Task] | None = None) -> tuple[Variation, ...]:
+    """Every held-out task (or these) under its test adversary of strength p, started in the origin."""
+    chosen = tasks.split(run).test if goals is None else goals
+    return tuple(
+        Variation(tasks.deployed(t), tasks.test_adversary(run, i, p, run.evaluate.prior)) for i, t in enumerate(chosen)
+    )
 
 
 def in_context(run: Run, model: PretrainedTransformer) -> MakePolicy:
@@ -78,15 +82,37 @@ def optimal(run: Run) -> MakePolicy:
     return make
 
 
+@functools.lru_cache(maxsize=64)
+def _any_goal(room: DarkRoomConfig, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
+    goals = [darkroom.task(divmod(cell, room.size), room.size, room.horizon) for cell in range(room.size**2)]
+    hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
+    return hypotheses, soft_labels(hypotheses, room.gamma, room.label_slack)
+
+
+def exact(run: Run, rule: Rule) -> Callable[[Sequence[Variation]], ExactAgent]:
+    """The exact agent that knows every row's adversary and holds each cell for the goal, all equally."""
+
+    def make(rows: Sequence[Variation]) -> ExactAgent:
+        adversaries = list(dict.fromkeys(v.adversary for v in rows))
+        families, labels = zip(*(_any_goal(run.darkroom, a) for a in adversaries), strict=True)
+        return ExactAgent(families, labels, np.array([adversaries.index(v.adversary) for v in rows]), rule)
+
+    return make
+
+
 def online(
     run: Run,
     agents: Mapping[str, MakePolicy],
     progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
+    goals: Sequence[Task] | None = None,
 ) -> list[Result]:
-    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, same chance for all."""
+    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, same chance for all.
+
+    On the held-out tasks, or those given.
+    """
     results = []
     for level, p in enumerate(run.evaluate.p):
-        chosen = variations(run, p)
+        chosen = variations(run, p, goals)
         optimum = optimal_returns(Hypotheses.of(chosen))
         rows, ids = _rows(run, chosen, level)
         for name, make in agents.items():
@@ -102,7 +128,10 @@ def online(
 
 
 def offline(run: Run, agents: Mapping[str, PretrainedTransformer]) -> list[Result]:
-    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off."""
+    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
+
+    Of every model and every exact agent.
+    """
     results = []
     for level, p in enumerate(run.evaluate.p):
         chosen = variations(run, p)
@@ -113,10 +142,15 @@ def offline(run: Run, agents: Mapping[str, PretrainedTransformer]) -> list[Resul
             data = episode(env, behaviour(rows), [i.rng(run.seed) for i in ids])
             shape = (len(chosen), run.evaluate.seeds, 1)
             results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
+            ran = {}
             for name, model in agents.items():
                 policy = InContextPolicy(model, len(rows), run.context)
-                ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
-                results.append(Result(f"{name}, {source} data", p, ran.returns.reshape(shape), optimum))
+                ran[name] = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
+            for rule, name in RULES.items():
+                agent = exact(run, rule)(rows)
+                agent.append(data.observations[:, :-1], data.actions, data.observations[:, 1:], data.rewards)
+                ran[name] = episode(env, agent, [i._replace(trial=1).rng(run.seed) for i in ids])
+            results += [Result(f"{name}, {source} data", p, r.returns.reshape(shape), optimum) for name, r in ran.items()]
     return results
 
 
@@ -134,7 +168,7 @@ def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
     the trials that became contexts and of those that gave labels; the optimum beside them.
     Empty for a phase whose labels are not the model's own.
     """
-    if phase.stage != "adapt":
+    if phase.stage != "adapt" or run.method != "icaa":
         return {}
     agreement, early, late, best = [], [], [], []
     for trials in map(data.trials, data.variations(phase.stage, phase.round)):

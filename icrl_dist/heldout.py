@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from icrl_dist import evaluate, plots
+from icrl_dist import evaluate, plots, truth
 from icrl_dist.agent import checkpoint_file, model_of
 from icrl_dist.config import Run
+from icrl_dist.envs import tasks
+from icrl_dist.exact import RULES
 from icrl_dist.files import atomic_write, load_checkpoint
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.terminal import Display, returns_table
+from icrl_dist.terminal import Display, gap_table, kl_table, returns_table
 
 
 def models(what: Path) -> dict[str, PretrainedTransformer]:
@@ -27,18 +30,12 @@ def models(what: Path) -> dict[str, PretrainedTransformer]:
 
 
 def online(run: Run, what: Path, display: Display) -> list[evaluate.Result]:
-    """Online returns of the folder's models, a random policy and the oracle."""
+    """Online returns of the folder's models, a random policy, the exact agents and the oracle."""
     agents: dict[str, evaluate.MakePolicy] = {name: evaluate.in_context(run, model) for name, model in models(what).items()}
-    agents |= {"random": evaluate.random, evaluate.ORACLE: evaluate.optimal(run)}
-    total = len(agents) * len(run.evaluate.p) * run.evaluate.episodes
-    done = 0
-
-    def progress(agent: str, p: float, episodes: int) -> None:
-        nonlocal done
-        done += 1
-        display.report({"event": "progress", "stage": "evaluate", "phase": "held-out evaluation", "step": done, "steps": total})
-
-    return evaluate.online(run, agents, progress)
+    agents["random"] = evaluate.random
+    agents |= {name: evaluate.exact(run, rule) for rule, name in RULES.items()}
+    agents[evaluate.ORACLE] = evaluate.optimal(run)
+    return evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
 
 
 def offline(run: Run, what: Path) -> list[evaluate.Result]:
@@ -46,10 +43,9 @@ def offline(run: Run, what: Path) -> list[evaluate.Result]:
     return evaluate.offline(run, models(what))
 
 
-def show_online(run: Run, what: Path, results: list[evaluate.Result], console: Console) -> dict[str, Any]:
-    """Print the table, draw the figure, keep the rows under ``report/``; returns them with the figure's path."""
+def show_online(run: Run, folder: Path, results: list[evaluate.Result], console: Console) -> dict[str, Any]:
+    """Print the table, draw the figure, keep the rows in the folder; returns them with the figure's path."""
     rows = [result.row() for result in results]
-    folder = (what if what.is_dir() else what.parent) / "report"
     size, count = run.darkroom.size, len(results[0].optimum)
     title = f"{run.method.upper()} on {count} held-out goals of a {size}x{size} Dark Room, {run.evaluate.seeds} seeds"
     atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
@@ -57,6 +53,59 @@ def show_online(run: Run, what: Path, results: list[evaluate.Result], console: C
     console.print(returns_table(results, f"Return by online episode: {title}"))
     console.print(f"figure {figure}", highlight=False, markup=False)
     return {"rows": rows, "figure": str(figure)}
+
+
+def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
+    """The newest model beside the exact posterior: ``truth``'s measures on training and on held-out goals."""
+    model = model_of(load_checkpoint(checkpoint_file(what)))[0]
+    report: dict[str, Any] = {}
+    total = len(truth.KINDS) * len(truth.levels(run))
+    for name, heldout in (("kl_nats", False), ("kl_heldout", True)):
+        event = {"event": "progress", "stage": "evaluate", "phase": f"contexts, {_goals(heldout)}", "steps": total}
+        found = []
+        for pair in truth.divergences(run, model, heldout):
+            found.append(pair)
+            display.report(event | {"step": len(found)})
+        for law, ones in zip(truth.LAWS, zip(*found, strict=True), strict=True):
+            summary = truth.summary(ones)
+            report |= {f"{name}{law}{part}": value for part, value in summary.items()}
+            report[f"{name}{law}_curves"] = truth.curves(ones)
+    split = tasks.split(run)
+    for name, heldout in (("paper_gap", True), ("paper_gap_train", False)):
+        goals = split.test if heldout else split.train[: len(split.test)]
+        progress = _count(display, f"online, {_goals(heldout)}", run, 2)
+        report[name] = truth.gaps(run, evaluate.in_context(run, model), goals, progress)
+    return report
+
+
+def show_posterior(run: Run, folder: Path, report: dict[str, Any], console: Console) -> dict[str, Any]:
+    """Print the tables, draw the figure, keep everything in the folder; returns all but the curves."""
+    size = run.darkroom.size
+    title = f"{run.method.upper()} beside the exact posterior in a {size}x{size} Dark Room"
+    atomic_write(folder / "posterior.json", lambda file: file.write(json.dumps(report, indent=1).encode()))
+    figure = plots.agreement(report, folder / "posterior.png", title)
+    for law, meaning in truth.LAWS.items():
+        console.print(kl_table(report, law, f"KL(exact || model) in nats, where {meaning}"))
+    adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
+    console.print(gap_table(report, f"Online return by Algorithm 1 beside the exact agent's: {adversary}"))
+    console.print(f"figure {figure}", highlight=False, markup=False)
+    return {key: value for key, value in report.items() if not key.endswith("_curves")} | {"figure": str(figure)}
+
+
+def _goals(heldout: bool) -> str:
+    return f"{'held-out' if heldout else 'training'} goals"
+
+
+def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str, float, int], None]:
+    """Shows every episode of ``agents`` at every p as one step."""
+    total, done = agents * len(run.evaluate.p) * run.evaluate.episodes, 0
+
+    def progress(agent: str, p: float, episodes: int) -> None:
+        nonlocal done
+        done += 1
+        display.report({"event": "progress", "stage": "evaluate", "phase": phase, "step": done, "steps": total})
+
+    return progress
 
 
 def show_offline(results: list[evaluate.Result], console: Console) -> dict[str, Any]:

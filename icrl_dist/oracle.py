@@ -19,14 +19,17 @@ from icrl_dist.types import Trajectory, Variation
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """M variations of one room as arrays: what could be true of the environment."""
+    """M variations of one room as arrays: what could be true of the environment.
+
+    With a leading axis, of each row of a batch (only ``log_likelihood`` takes those).
+    """
 
     size: int
     horizon: int
-    goal: Int[np.ndarray, " M"]
+    goal: Int[np.ndarray, "*B M"]
     """Cell number of the goal."""
-    p: Float64[np.ndarray, " M"]
-    q: Float64[np.ndarray, "M A"]
+    p: Float64[np.ndarray, "*B M"]
+    q: Float64[np.ndarray, "*B M A"]
 
     @classmethod
     def of(cls, variations: Sequence[Variation]) -> Hypotheses:
@@ -110,11 +113,13 @@ def log_likelihood(
     """log P(s', r | s, a, tau, phi) of each transition under each hypothesis, both factors.
 
     -inf where a hypothesis is refuted.  The agent's own choice of a is left out: it is the
-    same under every hypothesis (Assumption E.1).
+    same under every hypothesis (Assumption E.1).  Every transition may have hypotheses of its
+    own, ``h.p (T, M)``.
     """
     reached = next_cell(h.size)[cell] == arrived[:, None]
-    chance = (1 - h.p)[None, :] * reached[np.arange(len(cell)), action][:, None] + h.p[None, :] * (reached @ h.q.T)
-    consistent = (arrived[:, None] == h.goal[None, :]) == (reward[:, None] > 0.5)
+    overridden = (h.q @ reached[:, :, None].astype(np.float64))[..., 0]
+    chance = (1 - h.p) * reached[np.arange(len(cell)), action][:, None] + h.p * overridden
+    consistent = (arrived[:, None] == h.goal) == (reward[:, None] > 0.5)
     with np.errstate(divide="ignore"):
         result: np.ndarray = np.log(chance * consistent)
     return result
@@ -146,52 +151,3 @@ def posterior_action(
 ) -> Float64[np.ndarray, "B A"]:
     """P(a* | s_query, D): what a perfectly pretrained T_theta would output (Theorem E.3)."""
     return np.einsum("bm,mba->ba", belief, labels[:, cell].astype(np.float64))
-
-
-class ExactAgent:
-    """The agent that Theorem E.3 promises: actions from the exact posterior, no network.
-
-    Deployed as Algorithm 1 deploys T_theta: the posterior is updated at an episode's end,
-    or with ``every_step`` at every transition.
-    """
-
-    def __init__(
-        self, hypotheses: Hypotheses, labels: Float32[np.ndarray, "M C A"], batch: int, every_step: bool = False
-    ) -> None:
-        self._h, self._labels, self._every_step = hypotheses, labels, every_step
-        self._log_prior = np.full(len(hypotheses.goal), -np.log(len(hypotheses.goal)))
-        self._loglik = np.zeros((batch, len(hypotheses.goal)))
-        self._pending = np.zeros_like(self._loglik)
-
-    def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
-        belief = posterior(self._log_prior, self._loglik)
-        return posterior_action(belief, self._labels, cell_numbers(observation, self._h.size))
-
-    def observe(
-        self,
-        observation: Float32[np.ndarray, "B S"],
-        action: Int[np.ndarray, " B"],
-        reward: Float32[np.ndarray, " B"],
-        next_observation: Float32[np.ndarray, "B S"],
-        done: bool,
-    ) -> None:
-        cell, arrived = cell_numbers(observation, self._h.size), cell_numbers(next_observation, self._h.size)
-        self._pending += log_likelihood(self._h, cell, action.astype(np.int64), reward, arrived)
-        if done or self._every_step:
-            self._loglik += self._pending
-            self._pending[:] = 0.0
-
-
-class OptimalAgent:
-    """The oracle: knows tau and phi, and follows pi*_{tau,phi} of eq. (5)."""
-
-    def __init__(self, labels: Float32[np.ndarray, "B C A"], size: int) -> None:
-        self._labels, self._size = labels, size
-
-    def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
-        cell = cell_numbers(observation, self._size)
-        result: np.ndarray = self._labels[np.arange(len(cell)), cell].astype(np.float64)
-        return result
-
-    def observe(self, *transition: object) -> None:
-        """Nothing to learn."""

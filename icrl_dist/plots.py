@@ -2,46 +2,119 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-COLOURS = ("#1f6feb", "#8957e5", "#8b949e", "#d29922", "#2da44e")
+COLOURS = ("#1f6feb", "#8957e5", "#d29922", "#2da44e")
+_EXACT = (("#8c959f", (0, (1, 1.2))), ("#8c959f", "-."), ("#57606a", (0, (5, 1.5))), ("#57606a", "-"))
+_GOALS = {"kl_nats": ("goals trained on", "#2da44e"), "kl_heldout": ("goals never trained on", "#cf222e")}
+_GAPS = ("paper_gap_train", "paper_gap")
+_LAWS = {"": "own adversaries", "_any": "any adversary"}
 
 
 def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Path:
-    """Return per online episode, one panel for each p (Figures 3b and 3d); the oracle dashed.
+    """Return per online episode, one panel for each p (Figures 3b and 3d); exact agents in grey, the oracle a line.
 
     ``rows`` are those of ``evaluate.Result.row``.  Returns ``path``.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    pyplot = _pyplot()
     from matplotlib.ticker import MaxNLocator
 
     levels = sorted({row["p"] for row in rows})
-    figure, axes = pyplot.subplots(1, len(levels), figsize=(4.6 * len(levels), 3.6), sharey=True, squeeze=False)
+    figure, axes = pyplot.subplots(
+        1, len(levels), figsize=(max(7.0, 4.6 * len(levels)), 4.2), sharey=True, squeeze=False, layout="constrained"
+    )
     for axis, p in zip(axes[0], levels, strict=True):
         here = [row for row in rows if row["p"] == p]
-        for colour, row in zip(COLOURS, [r for r in here if r["agent"] != "oracle"], strict=False):
-            episodes = range(1, len(row["episodes"]) + 1)
+        episodes = range(1, len(here[0]["episodes"]) + 1)
+        for (colour, dashes), row in zip(_EXACT, [r for r in here if _is_exact(r)], strict=False):
+            axis.plot(episodes, row["episodes"], color=colour, linestyle=dashes, label=row["agent"], linewidth=1.2)
+        learned = [r for r in here if r["agent"] != "oracle" and not _is_exact(r)]
+        for colour, row in zip(itertools.cycle(COLOURS), learned, strict=False):
             error = [e or 0.0 for e in row["standard_error"]]
             low = [m - e for m, e in zip(row["episodes"], error, strict=True)]
             high = [m + e for m, e in zip(row["episodes"], error, strict=True)]
             axis.plot(episodes, row["episodes"], color=colour, label=row["agent"], linewidth=1.8)
             axis.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
-        axis.axhline(here[0]["optimum"], color="black", linestyle="--", linewidth=1, label="oracle (knows the goal)")
+        axis.axhline(here[0]["optimum"], color="black", linewidth=0.8, label="oracle (knows the goal)")
         axis.set_title("no disturbance" if p == 0 else f"actions overridden with p = {p:g}", fontsize=10)
         axis.set_xlabel("online episode")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.set_ylim(0, 1.08 * max(row["optimum"] for row in rows))
         axis.grid(alpha=0.25)
     axes[0][0].set_ylabel("return on goals never trained on")
-    axes[0][-1].legend(fontsize=8, loc="center right")
+    figure.legend(*axes[0][0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(title, fontsize=11)
-    figure.tight_layout()
+    return _saved(figure, path)
+
+
+def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:
+    """T_theta beside the exact posterior: KL by prefix, probabilities, and online return.  Returns ``path``.
+
+    ``report`` is what ``heldout.posterior`` returns.
+    """
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(2, 3, figsize=(14, 8), layout="constrained")
+    for row, (name, (goals, colour)) in zip(axes, _GOALS.items(), strict=True):
+        row[0].sharey(row[1])
+        for axis, (law, meaning) in zip(row, _LAWS.items(), strict=False):
+            _by_prefix(axis, report[f"{name}{law}_curves"]["by_prefix"])
+            axis.set_title(f"{goals}; {meaning}", fontsize=10)
+            axis.set(xlabel="transitions in the context", ylabel="KL(exact || model), nats")
+        points = report[f"{name}_any_curves"]["agreement"]
+        axes[0][2].plot(points["exact"], points["model"], "o-", color=colour, markersize=4, label=goals)
+    axes[0][2].plot([0, 1], [0, 1], color="black", linewidth=0.8)
+    axes[0][2].set_title("probabilities of actions; any adversary", fontsize=10)
+    axes[0][2].set(xlabel="exact probability", ylabel="the model's, on average")
+    for shift, (name, (goals, colour)) in zip((-0.15, 0.15), zip(_GAPS, _GOALS.values(), strict=True), strict=True):
+        at = [100 * row["gap"] for row in report[name].values()]
+        error = [[100 * abs(row[side] - row["gap"]) for row in report[name].values()] for side in ("low", "high")]
+        axes[1][2].bar(
+            [i + shift for i in range(len(at))], at, 0.28, yerr=error, color=colour, alpha=0.8, capsize=3, label=goals
+        )
+    axes[1][2].axhline(0, color="black", linewidth=0.8)
+    axes[1][2].set_xticks(range(len(report["paper_gap"])), [f"p = {p}" for p in report["paper_gap"]])
+    axes[1][2].set_title("online, both by Algorithm 1", fontsize=10)
+    axes[1][2].set_ylabel("return over the exact agent's, less 1 (%)")
+    for axis in axes.flat:
+        axis.grid(alpha=0.25)
+    for axis in axes[:, 2]:
+        axis.legend(fontsize=8)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), fontsize=8, loc="outside lower left", ncols=6, frameon=False)
+    figure.suptitle(title, fontsize=11)
+    return _saved(figure, path)
+
+
+def _by_prefix(axis: Any, curves: Sequence[Mapping[str, Any]], width: int = 5) -> None:
+    """KL against the prefix's length, averaged over ``width`` lengths or more; dashed where actions are overridden."""
+    kinds = list(dict.fromkeys(curve["kind"] for curve in curves))
+    for curve in curves:
+        kl = curve["kl"]
+        starts = range(0, max(1, len(kl) - width + 1), width)
+        pieces = [(a, b, kl[a:b]) for a, b in zip(starts, (*starts[1:], len(kl)), strict=True)]
+        label, style = f"{curve['kind']}, p = {curve['p']:g}", "--" if curve["p"] else "-"
+        x, y = [(a + b - 1) / 2 for a, b, _ in pieces], [sum(piece) / len(piece) for _, _, piece in pieces]
+        axis.plot(x, y, style, color=COLOURS[kinds.index(curve["kind"])], label=label)
+    axis.set_ylim(bottom=0)
+
+
+def _is_exact(row: Mapping[str, Any]) -> bool:
+    return str(row["agent"]).startswith("exact")
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _saved(figure: Any, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
-    pyplot.close(figure)
+    _pyplot().close(figure)
     return path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -97,7 +97,7 @@ def _info(event: dict[str, Any]) -> str:
 def returns_table(results: Sequence[Result], title: str) -> Table:
     """Mean return by online episode, a row an agent and p, the last column beside the optimum."""
     episodes = results[0].returns.shape[2]
-    shown = [e for e in (1, 2, 3, 5, 10, 15, 20, 30, 40) if e <= episodes]
+    shown = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes]
     last = min(5, episodes)
     table = Table(title=title, title_justify="left")
     table.add_column("p", justify="right")
@@ -119,4 +119,36 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
             f"{result.last(last):.1f}",
             f"{result.last(last) / ceiling:.0%}",
         )
+    return table
+
+
+def kl_table(report: Mapping[str, Any], law: str, title: str) -> Table:
+    """Divergence from the exact posterior by one law, a row a kind of context and p, and all of them together."""
+    table = Table(title=title, title_justify="left")
+    for name in ("goals", "context", "p", "KL", "+-", "goal met", "not met", "met in"):
+        table.add_column(name, justify="left" if name in ("goals", "context") else "right")
+    for name, goals in ((f"kl_nats{law}", "trained on"), (f"kl_heldout{law}", "never trained on")):
+        for index, row in enumerate(report[f"{name}_cells"]):
+            numbers = [_nats(row[key]) for key in ("kl", "standard_error", "goal_met", "goal_unmet")]
+            table.add_row("" if index else goals, row["kind"], f"{row['p']:g}", *numbers, f"{row['met']:.0%}")
+        whole = [_nats(report[f"{name}{part}"]) for part in ("", "_standard_error", "_goal_met", "_goal_unmet")]
+        table.add_row("", "all", "", *whole, "", style="bold", end_section=True)
+    return table
+
+
+def _nats(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
+
+
+def gap_table(report: Mapping[str, Any], title: str) -> Table:
+    """Online return over the exact agent's, a row a set of goals and p, with 95% intervals."""
+    table = Table(title=title, title_justify="left")
+    for name in ("goals", "p", "model", "exact", "gap", "95%"):
+        table.add_column(name, justify="left" if name == "goals" else "right")
+    for name, goals in (("paper_gap", "never trained on"), ("paper_gap_train", "trained on")):
+        for index, (p, row) in enumerate(report[name].items()):
+            interval = f"{row['low']:+.1%} .. {row['high']:+.1%}"
+            last = index + 1 == len(report[name])
+            cells = (f"{row['model']:.1f}", f"{row['exact']:.1f}", f"{row['gap']:+.1%}", interval)
+            table.add_row("" if index else goals, p, *cells, end_section=last)
     return table

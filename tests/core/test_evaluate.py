@@ -1,19 +1,25 @@
 """The evaluation and the agent, held against what is known exactly."""
 
 import dataclasses
+import itertools
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from icrl_dist import InContextAgent, evaluate, make
+from icrl_dist import InContextAgent, cli, evaluate, make, truth
 from icrl_dist.agent import load_agent
-from icrl_dist.config import ConfigError, ContextConfig
-from icrl_dist.envs import spec, tasks
-from icrl_dist.files import StoreError
-from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.oracle import Hypotheses, optimal_returns
+from icrl_dist.config import ConfigError, ContextConfig, EvaluateConfig
+from icrl_dist.envs import darkroom, spec, tasks
+from icrl_dist.exact import RULES, ExactAgent
+from icrl_dist.files import Checkpoint, StoreError, save_checkpoint, version_file
+from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.oracle import Hypotheses, optimal_returns, soft_labels
 from icrl_dist.stats import mean_and_error
+from icrl_dist.types import Variation
+from learner import checkpoints
 
 
 @pytest.fixture
@@ -58,9 +64,34 @@ def test_rows_are_tidy(small_run):
 
 def test_offline_rows_hold_random_and_expert_data(small_run, model):
     rows = evaluate.offline(small_run, {"T": model})
-    assert [r.agent for r in rows[:4]] == ["random data", "T, random data", "expert data", "T, expert data"]
+    agents = ["T", *RULES.values()]
+    for rows_at, source in ((rows[:6], "random data"), (rows[6:12], "expert data")):
+        assert [r.agent for r in rows_at] == [source, *(f"{agent}, {source}" for agent in agents)]
     expert = next(r for r in rows if r.agent == "expert data" and r.p == 0)
     np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), expert.optimum)
+    informed = next(r for r in rows if r.agent == f"{RULES['paper']}, expert data" and r.p == 0)
+    np.testing.assert_array_equal(informed.returns, expert.returns)
+
+
+def test_exact_agents_find_the_goal_and_know_the_adversary_of_their_row(small_run):
+    run = dataclasses.replace(small_run, evaluate=EvaluateConfig(episodes=6, seeds=20, p=(0.0, 0.4), prior="unseen"))
+    agents = {name: evaluate.exact(run, rule) for rule, name in RULES.items()} | {evaluate.ORACLE: evaluate.optimal(run)}
+    results = {(r.agent, r.p): r.returns for r in evaluate.online(run, agents)}
+    for name in RULES.values():
+        np.testing.assert_array_equal(results[name, 0.0][:, :, -1], results[evaluate.ORACLE, 0.0][:, :, -1])
+        error = results[name, 0.4].mean(axis=(0, 2)).std() / np.sqrt(20)
+        assert abs(results[name, 0.4][:, :, -2:].mean() - results[evaluate.ORACLE, 0.4].mean()) < 5 * error
+    early = {rule: results[name, 0.0][:, :, :2].mean() for rule, name in RULES.items()}
+    assert early["paper"] < early["every step"] < early["committed"]
+    rows = evaluate.variations(run, 0.4)
+    goals = [darkroom.task(divmod(cell, 3), 3, 8) for cell in range(9)]
+    families = [Hypotheses.of([Variation(goal, row.adversary) for goal in goals]) for row in rows]
+    labels = [soft_labels(h, run.darkroom.gamma, run.darkroom.label_slack) for h in families]
+    assert not np.array_equal(labels[0], labels[1])
+    own, made = ExactAgent(families, labels, np.arange(2), "every step"), evaluate.exact(run, "every step")(rows)
+    for cell in range(9):
+        observation = np.array([divmod(cell, 3)] * 2, np.float32)
+        np.testing.assert_array_equal(made.probabilities(observation), own.probabilities(observation))
 
 
 def test_the_agent_acts_as_the_policy_under_it_and_forgets_on_reset(small_run, model):
@@ -115,3 +146,53 @@ def test_loading_nothing_and_garbage_is_told_in_one_line(tmp_path):
 def test_the_exact_optimum_beside_a_result_is_the_variations_own(small_run):
     (result, *_) = evaluate.online(small_run, {"random": evaluate.random})
     np.testing.assert_allclose(result.optimum, optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
+
+
+@pytest.fixture
+def folder(small_run, tmp_path, monkeypatch):
+    """A run folder with the untrained T^0 of an ICAG run, and few contexts to measure it in."""
+    run = dataclasses.replace(small_run, method="icag")
+    torch.manual_seed(0)
+    model = PretrainedTransformer(tasks.spec(run), run.model)
+    monkeypatch.setattr(truth, "CONTEXTS", 4)
+    monkeypatch.setattr(truth, "RESAMPLES", 100)
+    arrays = {f"model/{name}": value for name, value in weights_of(model).items()}
+    manifest = checkpoints.manifest(run, tasks.spec(run), 0, 1)
+    save_checkpoint(version_file(tmp_path, 0), Checkpoint(arrays, manifest))
+    return tmp_path
+
+
+def test_the_suite_ends_with_one_json_object(folder, capsys):
+    assert cli.main(["evaluate", str(folder), "--suite", "posterior", "--seeds", "2", "--json"]) == 0
+    printed = capsys.readouterr()
+    answer = json.loads(printed.out.splitlines()[-1])
+    for name, law in itertools.product(("kl_nats", "kl_heldout"), truth.LAWS):
+        rows = answer[f"{name}{law}_cells"]
+        assert [(row["kind"], row["p"]) for row in rows] == [(kind, p) for p in (0.0, 0.2) for kind in truth.KINDS]
+        assert answer[f"{name}{law}"] == pytest.approx(np.mean([row["kl"] for row in rows]))
+        assert all(answer[f"{name}{law}{part}"] > 0 for part in ("", "_standard_error", "_goal_met", "_goal_unmet"))
+    for name in ("paper_gap", "paper_gap_train"):
+        assert list(answer[name]) == ["0", "0.2", "0.4", "0.6"]
+        assert all(row["low"] <= row["gap"] <= row["high"] for row in answer[name].values())
+        assert all(row["gap"] == pytest.approx(row["model"] / row["exact"] - 1) for row in answer[name].values())
+    assert not any(key.endswith("_curves") for key in answer)
+    kept = json.loads((folder / "report" / "posterior.json").read_text())
+    assert {key: kept[key] for key in answer if key in kept}.items() <= answer.items()
+    assert all(len(c["kl"]) == 17 for c in kept["kl_heldout_any_curves"]["by_prefix"])
+    assert Path(answer["figure"]).read_bytes().startswith(b"\x89PNG")
+    assert all(meaning in printed.err for meaning in truth.LAWS.values()) and f"{answer['kl_nats']:.4f}" in printed.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--p", "1.5"), r"evaluate.p = 1.5: a probability lies in [0, 1]"),
+        (("--episodes", "0"), "evaluate.episodes = 0: must be above 0"),
+        (("--seeds", "0"), "evaluate.seeds = 0: must be above 0"),
+    ],
+)
+def test_what_cannot_be_measured_is_told_in_one_line(folder, capsys, arguments, expected):
+    words = ["evaluate", str(folder), "--suite", "posterior", *arguments]
+    assert cli.main(words) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert expected in line

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from icrl_dist import oracle
-from icrl_dist.envs import darkroom
 from icrl_dist.envs.adversary import argmax_law
 from icrl_dist.envs.darkroom import ACTIONS, DarkRoom
-from icrl_dist.oracle import ExactAgent, Hypotheses, OptimalAgent
+from icrl_dist.oracle import Hypotheses
 from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
 
 ALPHA = (0.1, 1.0, 0.5, 2.0, 0.3)
@@ -245,86 +244,6 @@ def test_posterior_action_is_the_sum_over_hypotheses(hypotheses: tuple[Variation
         for action in range(ACTIONS):
             slow = sum(float(belief[b, m]) * float(labels[m, cell[b], action]) for m in range(18))
             assert result[b, action] == pytest.approx(slow)
-
-
-def feed(agent: ExactAgent, one: Trajectory, h: int) -> None:
-    agent.observe(
-        one.observations[h : h + 1],
-        one.actions[h : h + 1],
-        one.rewards[h : h + 1],
-        one.observations[h + 1 : h + 2],
-        h + 1 == len(one.actions),
-    )
-
-
-@pytest.mark.parametrize("every_step", [False, True])
-def test_exact_agent_updates_when_its_deployment_says(hypotheses: tuple[Variation, ...], every_step: bool) -> None:
-    """Algorithm 1 appends at an episode's end; ``every_step`` at every transition."""
-    # A third adversary and labels of no meaning, so that every change of the posterior shows.
-    meddlers = [Variation(v.task, Adversary.of("uniform", p=0.9)) for v in hypotheses[::2]]
-    hypotheses = (*hypotheses, *meddlers)
-    h = Hypotheses.of(hypotheses)
-    labels = np.random.default_rng(0).dirichlet([1.0] * ACTIONS, size=(len(hypotheses), SIZE * SIZE)).astype(np.float32)
-    agent = ExactAgent(h, labels, 1, every_step)
-    query = np.array([[0.0, 2.0]], np.float32)
-    past: list[Trajectory] = []
-    moved_within = False
-    for seed in range(3):
-        one = episode(hypotheses[7], seed)
-        for step in range(HORIZON):
-            known = [slow_likelihood(v, past) for v in hypotheses]
-            if every_step:
-                known = [k * slow_likelihood(v, [one], step) for k, v in zip(known, hypotheses, strict=True)]
-            expected = sum(w * labels[m, 2].astype(float) for m, w in enumerate(normalised(known)))
-            before = agent.probabilities(query)
-            np.testing.assert_allclose(before[0], expected, rtol=1e-9)
-            feed(agent, one, step)
-            if step + 1 < HORIZON and not np.array_equal(agent.probabilities(query), before):
-                moved_within = True
-        past.append(one)
-    assert moved_within == every_step
-
-
-def test_exact_agent_keeps_rows_apart(hypotheses: tuple[Variation, ...]) -> None:
-    h = Hypotheses.of(hypotheses)
-    labels = oracle.soft_labels(h, 0.99, 0.1)
-    pair = [episode(hypotheses[3], 0), episode(hypotheses[12], 1)]
-    both, alone = ExactAgent(h, labels, 2), [ExactAgent(h, labels, 1) for _ in pair]
-    for step in range(HORIZON):
-        columns = [np.stack([getattr(t, name)[step] for t in pair]) for name in ("observations", "actions", "rewards")]
-        both.observe(*columns, np.stack([t.observations[step + 1] for t in pair]), step + 1 == HORIZON)
-        for agent, one in zip(alone, pair, strict=True):
-            feed(agent, one, step)
-    query = np.array([[1.0, 0.0]], np.float32)
-    together = both.probabilities(np.repeat(query, 2, axis=0))
-    for row, agent in enumerate(alone):
-        np.testing.assert_allclose(together[row], agent.probabilities(query)[0], rtol=1e-12)
-    assert not np.allclose(together[0], together[1])
-
-
-def test_optimal_agent_earns_what_optimal_returns_promises() -> None:
-    """Theory against the simulator: p, q, walls, horizon and start must agree in both."""
-    rows, horizon = 2000, 15
-    adversaries = (NULL, Adversary.of("uniform", p=0.5), Adversary.of("dirichlet", p=0.4, alpha=ALPHA))
-    kinds = [
-        Variation(darkroom.task(g, 4, horizon, (0, 0)), a) for g, a in zip([(3, 1), (2, 2), (1, 3)], adversaries, strict=True)
-    ]
-    h = Hypotheses.of(kinds)
-    promised = oracle.optimal_returns(h)
-    labels = oracle.soft_labels(h, 1.0, 0.0)
-    room = DarkRoom([v for v in kinds for _ in range(rows)])
-    agent = OptimalAgent(np.repeat(labels, rows, axis=0), 4)
-    rng = np.random.default_rng(0)
-    observation = room.reset([np.random.default_rng(seed) for seed in range(3 * rows)])
-    total = np.zeros(3 * rows)
-    for _ in range(horizon):
-        edges = agent.probabilities(observation).cumsum(axis=1)
-        step = room.step(np.minimum((rng.random((3 * rows, 1)) >= edges).sum(axis=1), ACTIONS - 1))
-        observation, total = step.observation, total + step.reward
-    earned = total.reshape(3, rows)
-    error = earned.std(axis=1, ddof=1) / math.sqrt(rows)
-    assert earned[0].std() == 0
-    assert (np.abs(earned.mean(axis=1) - promised) <= 4 * error + 1e-9).all(), (earned.mean(axis=1), promised, error)
 
 
 def test_hypotheses_refuse_a_mixture(room: Room) -> None:
