@@ -60,13 +60,17 @@ class Train:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Deploy a trained agent on tasks it never trained on, beside T^0, a random policy and the oracle."""
+    """Deploy a trained agent on tasks it never trained on, beside T^0, exact agents and the oracle."""
 
-    what: tyro.conf.Positional[Path]
+    what: tyro.conf.Positional[Path | None] = None
     """A run folder, or a checkpoint file."""
-    suite: Literal["online", "offline"] = "online"
+    pretrained: str | None = None
+    """Instead, the name of an agent that comes with the package: ``darkroom``.  Its report is
+    written under runs/NAME-pretrained."""
+    suite: Literal["online", "offline", "posterior"] = "online"
     """``online``: episode after episode from an empty context; ``offline``: one episode given a
-    random or an expert one (Algorithm 1)."""
+    random or an expert one (Algorithm 1); ``posterior``: how far its decisions are from the exact
+    posterior's, in nats, and its return from the exact agent's."""
     deploy: Literal["paper"] = "paper"
     """``paper``: Algorithm 1, the context frozen within an episode."""
     episodes: int | None = None
@@ -74,9 +78,9 @@ class Evaluate:
     seeds: int | None = None
     """Evaluations of every task; the run's own number if not given."""
     p: tuple[float, ...] = ()
-    """Override probabilities to test; the run's own if none are given."""
+    """Override probabilities to test; the run's own if none are given (posterior: 0 0.2 0.4 0.6)."""
     prior: Literal["uniform", "unseen"] | None = None
-    """Law of the test adversary; the run's own if not given."""
+    """Law of the test adversary; the run's own if not given (posterior: uniform)."""
     json: bool = False
     """Print one JSON object on the last line."""
 
@@ -105,20 +109,22 @@ class Tap:
 class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
-    name: tyro.conf.Positional[Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz"]]
+    name: tyro.conf.Positional[Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext"]]
     """``env``: environment steps a second; ``stream``: trajectories a second through the stream
     and, in the same run, as Ray actor returns; ``ingest``: trajectories a second onto the disk, with
     and without fsync; ``broadcast``: weights to eight processes, beside ``ray.put`` and ``get``;
     ``recovery``: how soon a run is at work again after a worker or the learner was killed;
     ``soak``: does any process of a long run grow; ``fuzz``: 100,000 hostile inputs to every reader
-    of bytes."""
+    of bytes; ``incontext``: deployment and training of the model, beside DPT's official layout."""
     problem: str = "darkroom"
     """Which environment (env only)."""
     seconds: float | None = None
     """How long to measure (env, stream, ingest and soak)."""
+    quick: bool = False
+    """One seed instead of three (incontext only)."""
     folder: Path = Path("runs")
-    """Whose disk to write to (ingest, recovery), where to put the figure (soak) or an input that
-    breaks something (fuzz)."""
+    """Whose disk to write to (ingest, recovery), where to put the figure (soak, incontext) or an
+    input that breaks something (fuzz), where to keep finished trainings (incontext)."""
     json: bool = False
     """Print one JSON object on the last line."""
 
@@ -138,6 +144,19 @@ class Explain:
     """Make it once more on this machine and compare every byte."""
     json: bool = False
     """Print one JSON object on the last line."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write what a run made in a form for others to use."""
+
+    what: tyro.conf.Positional[Path]
+    """A run folder (its newest version), or a checkpoint file."""
+    to: Literal["agent"] = "agent"
+    """``agent``: weights and manifest in one file for ``load_agent``, without what only training
+    needs."""
+    out: Path | None = None
+    """File to write; agent.npz in the run folder, or beside the checkpoint, if not given."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +206,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "tap": (Tap, commands.tap),
     "bench": (Bench, commands.bench),
     "explain": (Explain, commands.explain),
+    "export": (Export, commands.export),
     "chaos": (Chaos, commands.chaos),
     "doctor": (Doctor, commands.doctor),
 }

@@ -18,7 +18,7 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.types import Identity
 
 if TYPE_CHECKING:
-    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Tap, Train
+    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -59,7 +59,7 @@ def train(arguments: Train, console: Console) -> int:
         console.print(f"interrupted; `icrl-dist train {given} --resume` goes on from the checkpoint", markup=False)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
-    result |= heldout.show_online(run, folder, results, console)
+    result |= heldout.show_online(run, folder / "report", results, console)
     atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
@@ -84,21 +84,54 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     from icrl_dist.files import load_checkpoint
     from icrl_dist.terminal import Display
 
-    checkpoint = load_checkpoint(checkpoint_file(arguments.what))
-    run = parse(str(checkpoint.manifest.get("run", "")), str(arguments.what))
+    what, folder = _evaluated(arguments)
+    checkpoint = load_checkpoint(checkpoint_file(what))
+    run = parse(str(checkpoint.manifest.get("run", "")), str(what))
     given = {name: getattr(arguments, name) for name in ("episodes", "seeds", "p", "prior")}
     chosen = {name: value for name, value in given.items() if value not in (None, ())}
+    if arguments.suite == "posterior":
+        chosen = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform"} | chosen
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
     validate(run, "evaluate")
-    answer: dict[str, Any] = {"suite": arguments.suite, "deploy": arguments.deploy, "what": str(arguments.what)}
+    answer: dict[str, Any] = {"suite": arguments.suite, "deploy": arguments.deploy, "what": str(what)}
     if arguments.suite == "online":
         with Display(console) as display:
-            results = heldout.online(run, arguments.what, display)
-        answer |= heldout.show_online(run, arguments.what, results, console)
+            results = heldout.online(run, what, display)
+        answer |= heldout.show_online(run, folder, results, console)
+    elif arguments.suite == "posterior":
+        with Display(console) as display:
+            report = heldout.posterior(run, what, display)
+        answer |= heldout.show_posterior(run, folder, report, console)
     else:
-        answer |= heldout.show_offline(heldout.offline(run, arguments.what), console)
+        answer |= heldout.show_offline(heldout.offline(run, what), console)
     if arguments.json:
         print(json.dumps(answer))
+    return OK
+
+
+def _evaluated(arguments: Evaluate) -> tuple[Path, Path]:
+    """What is to be evaluated, and the folder of its report."""
+    from icrl_dist.agent import shipped
+
+    what, name = arguments.what, arguments.pretrained
+    if what is not None and name is None:
+        return what, (what if what.is_dir() else what.parent) / "report"
+    if what is None and name is not None:
+        return shipped(name), Path("runs") / f"{name}-pretrained" / "report"
+    raise ConfigError("evaluate: name a run folder or a checkpoint file, or with --pretrained an agent that is shipped")
+
+
+def export(arguments: Export, console: Console) -> int:
+    """``icrl-dist export``: an agent without what only training needs."""
+    from icrl_dist.agent import checkpoint_file, slim
+    from icrl_dist.files import load_checkpoint, save_checkpoint
+
+    source = checkpoint_file(arguments.what)
+    out = arguments.out or (arguments.what if arguments.what.is_dir() else source.parent) / "agent.npz"
+    if out.is_dir():
+        raise ConfigError(f"--out {out}: is a folder; name a file, such as {out / 'agent.npz'}")
+    save_checkpoint(out, slim(load_checkpoint(source)))
+    console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)
     return OK
 
 
@@ -147,9 +180,9 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import broadcast, env, fuzz, ingest, recovery, soak, stream
+    from icrl_dist.bench import broadcast, env, fuzz, incontext, ingest, recovery, soak, stream
 
-    if arguments.seconds is not None and arguments.name in ("broadcast", "fuzz", "recovery"):
+    if arguments.seconds is not None and arguments.name in ("broadcast", "fuzz", "incontext", "recovery"):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
@@ -170,6 +203,10 @@ def bench(arguments: Bench, console: Console) -> int:
             text = soak.describe(result)
         case "fuzz":
             result, text = (r := fuzz.run(folder=arguments.folder)), fuzz.describe(r)
+        case "incontext":
+            with console.status("incontext") as status:
+                result = incontext.run(arguments.folder, arguments.quick, lambda said: status.update(f"incontext: {said}"))
+            text = incontext.describe(result)
     console.print(text, highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))

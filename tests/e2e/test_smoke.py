@@ -16,6 +16,7 @@ import pytest
 from icrl_dist import recipes
 from icrl_dist.agent import load_agent
 from icrl_dist.config import load
+from icrl_dist.exact import RULES
 from icrl_dist.files import version_file
 from icrl_dist.store import Store
 from icrl_dist.stream.link import Refused
@@ -88,7 +89,7 @@ def test_the_result_is_on_the_last_line_and_in_the_folder(undisturbed):
     result = json.loads(output.splitlines()[-1])
     assert result["rows"] == result_of(folder)["rows"]
     assert {(row["agent"], row["p"]) for row in result["rows"]} == {
-        (agent, p) for agent in ("T^2 (icaa)", "T^0", "random", "oracle") for p in (0.0, 0.2)
+        (agent, p) for agent in ("T^2 (icaa)", "T^0", "random", *RULES.values(), "oracle") for p in (0.0, 0.2)
     }
     assert Path(result["figure"]).read_bytes().startswith(b"\x89PNG")
 
@@ -124,7 +125,7 @@ def test_evaluate_prints_returns_beside_the_oracles(undisturbed):
     output = finish(process)
     assert process.returncode == 0, output
     rows = json.loads(output.splitlines()[-1])["rows"]
-    assert [row["p"] for row in rows] == [0.0] * 4 + [0.4] * 4
+    assert [row["p"] for row in rows] == [0.0] * 8 + [0.4] * 8
     assert all(len(row["episodes"]) == 2 for row in rows)
     assert next(row for row in rows if row["agent"] == "oracle")["episodes"] == [9.0, 9.0]
 

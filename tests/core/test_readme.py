@@ -1,0 +1,15 @@
+"""The README's Python is run as it stands."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+
+def test_the_example_runs_and_prints_ten_returns():
+    (code,) = re.findall(r"```python\n(.*?)```", Path("README.md").read_text(), re.DOTALL)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(code, {})
+    lines = printed.getvalue().splitlines()
+    assert [int(re.fullmatch(r"episode (\d+): return \d+", line)[1]) for line in lines] == list(range(1, 11))

@@ -1,0 +1,85 @@
+"""Agents as single files: exported from a run, and shipped with the package."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist import cli
+from icrl_dist.agent import SHIPPED, load_agent, shipped
+from icrl_dist.config import ConfigError
+from icrl_dist.envs import tasks
+from icrl_dist.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.pretrain import Optimiser
+from learner import checkpoints
+
+
+@pytest.fixture
+def folder(small_run, tmp_path):
+    """A run folder with versions 0 and 1, optimiser and list of data included."""
+    for version in (0, 1):
+        torch.manual_seed(version)
+        model = PretrainedTransformer(tasks.spec(small_run), small_run.model)
+        opt = Optimiser(model, small_run.optim)
+        sum(p.sum() for p in model.parameters()).backward()
+        opt.step(1e-3)
+        about = checkpoints.manifest(small_run, tasks.spec(small_run), version, 1)
+        checkpoints.save(version_file(tmp_path, version), model, opt, {**about, "dataset": ["a"], "dataset_digest": "d"})
+    return tmp_path
+
+
+def test_an_exported_agent_is_the_newest_version_without_what_only_training_needs(folder, tmp_path, capsys):
+    assert cli.main(["export", str(folder), "--to", "agent"]) == 0
+    assert str(folder / "agent.npz") in capsys.readouterr().out
+    source, made = load_checkpoint(version_file(folder, 1)), load_checkpoint(folder / "agent.npz")
+    assert set(made.arrays) == {name for name in source.arrays if name.startswith("model/")}
+    assert made.manifest == {name: value for name, value in source.manifest.items() if name != "dataset"}
+    whole, alone = load_agent(folder, seed=0), load_agent(folder / "agent.npz", seed=0)
+    for name, value in weights_of(whole.model).items():
+        np.testing.assert_array_equal(weights_of(alone.model)[name], value)
+    other = tmp_path / "elsewhere" / "old.npz"
+    assert cli.main(["export", str(version_file(folder, 0)), "--out", str(other)]) == 0
+    assert load_agent(other).manifest["version"] == 0
+
+
+def test_a_folder_is_no_file_to_export_to(folder, capsys):
+    assert cli.main(["export", str(folder), "--out", str(folder)]) == 2
+    assert "is a folder; name a file" in capsys.readouterr().err
+
+
+def test_shipped_agents_are_small_and_say_where_they_come_from():
+    assert "darkroom" in SHIPPED
+    for name in SHIPPED:
+        assert shipped(name).stat().st_size < 1_000_000
+        manifest = load_checkpoint(shipped(name)).manifest
+        assert {"run", "seed", "versions", "weights_digest", "dataset_digest", "test_goals"} <= set(manifest)
+
+
+def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["evaluate", "--pretrained", "darkroom", "--episodes", "8", "--seeds", "1", "--p", "0", "--json"]
+    assert cli.main(words) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[-1])
+    rows = {row["agent"]: row["episodes"] for row in answer["rows"]}
+    (name,) = (agent for agent in rows if agent.startswith("T^"))
+    assert rows[name][0] < 15 and rows[name][-1] > 0.6 * rows["oracle"][-1]
+    assert (tmp_path / "runs" / "darkroom-pretrained" / "report" / "adaptation.png").is_file()
+    assert load_agent("darkroom").manifest["size"] == 10
+
+
+def test_what_is_evaluated_is_named_once(capsys, tmp_path):
+    for words in (["evaluate"], ["evaluate", str(tmp_path), "--pretrained", "darkroom"]):
+        assert cli.main(words) == 2
+        assert "name a run folder or a checkpoint file, or with --pretrained" in capsys.readouterr().err
+    assert cli.main(["evaluate", "--pretrained", "darkrom"]) == 2
+    assert "there are darkroom" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="no agent of that name"):
+        shipped("nothing")
+
+
+def test_a_file_of_that_name_does_not_hide_the_shipped_agent(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_checkpoint(tmp_path / "darkroom", Checkpoint({}, {}))
+    assert load_agent("darkroom").manifest["method"] == "icag"
