@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jaxtyping
 import pytest
@@ -34,6 +35,14 @@ from icrl_dist.config import (  # noqa: E402
 from icrl_dist.envs import darkroom  # noqa: E402
 from icrl_dist.stream.memory_link import MemoryHub, MemoryLink  # noqa: E402
 from icrl_dist.types import Task  # noqa: E402
+
+
+@pytest.fixture
+def no_ray_token(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A home and an environment in which Ray has left no token, as it does where it once started a cluster."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
 
 
 @pytest.fixture

@@ -21,15 +21,7 @@ def ask(name: str, endpoint: str = FREE, folder: Path = Path()) -> Finding:
     return finding
 
 
-@pytest.fixture
-def quiet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A machine whose Ray settings are nobody's."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
-        monkeypatch.delenv(name, raising=False)
-
-
-@pytest.mark.usefixtures("quiet")
+@pytest.mark.usefixtures("no_ray_token")
 def test_what_holds_on_every_machine_that_runs_these_tests(tmp_path: Path) -> None:
     findings = {f.name: f for f in diagnose(FREE, tmp_path / "runs" / "new")}
     for name in ("Python", *LIBRARIES, "stream endpoint", "loopback", "run folder", "home", "Ray token", "GPU"):
@@ -131,7 +123,7 @@ def test_few_cores_and_few_files_are_warnings(monkeypatch: pytest.MonkeyPatch) -
     assert "ulimit" in files.remedy
 
 
-@pytest.mark.usefixtures("quiet")
+@pytest.mark.usefixtures("no_ray_token")
 def test_ray_token_is_looked_for_when_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     assert ask("Ray token").ok is False

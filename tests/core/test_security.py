@@ -154,11 +154,9 @@ def off_host(**stream):
     return Run(stream=Run().stream.__class__(endpoint="tls/10.0.0.1:7447", **stream))
 
 
+@pytest.mark.usefixtures("no_ray_token")
 def test_a_cluster_off_this_machine_needs_rays_token(made, tmp_path, monkeypatch):
     run = off_host(certificates=made)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
-        monkeypatch.delenv(name, raising=False)
     remedy = r"--address head:6379: without a token.*ray get-auth-token --generate.*RAY_AUTH_MODE=token"
     with pytest.raises(ConfigError, match=remedy):
         check_security(run, "head:6379")
@@ -177,6 +175,7 @@ def test_a_cluster_off_this_machine_needs_rays_token(made, tmp_path, monkeypatch
     check_security(Run(), "127.0.0.1:6379")
 
 
+@pytest.mark.usefixtures("no_ray_token")
 def test_certificates_are_checked_before_anything_starts(made, tmp_path):
     (tmp_path / "half").mkdir()
     for name in ("ca.pem", "learner.pem", "learner.key"):

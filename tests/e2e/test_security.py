@@ -291,9 +291,8 @@ def test_what_a_role_may_not_do_works_without_the_rules_and_not_with_them(ours, 
             assert scene.heard
 
 
-def test_off_this_machine_in_the_clear_is_refused(capsys, tmp_path, ours, monkeypatch):
-    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)  # Ray sets it in a process that once started a cluster
-
+@pytest.mark.usefixtures("no_ray_token")
+def test_off_this_machine_in_the_clear_is_refused(capsys, tmp_path, ours):
     def refused(*arguments):
         assert cli.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "out"), *arguments]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
