@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from icrl_dist.config import ConfigError, ContextConfig, parse
+from icrl_dist.config import ConfigError, ContextConfig, Deployment, parse
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
-from icrl_dist.rollout import InContextPolicy, sample
+from icrl_dist.rollout import Actions, in_context
 from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist") / "agents"))
@@ -22,48 +21,55 @@ SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
 
 
 class InContextAgent:
-    """T_theta deployed by Algorithm 1 in B environments at once, without weight updates.
+    """T_theta deployed in B environments at once, without weight updates.
 
-    ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` collects what happened, which
-    joins the context D_on when the episode is done.
+    ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` says what happened.  Deployed by
+    ``paper`` (Algorithm 1) that joins the context D_on when the episode is done; by ``committed``,
+    the default for a model trained on stretches, at once.
     """
 
     def __init__(
-        self, model: PretrainedTransformer, manifest: dict[str, Any], context: ContextConfig, seed: int | None = None
+        self,
+        model: PretrainedTransformer,
+        manifest: dict[str, Any],
+        context: ContextConfig,
+        seed: int | None = None,
+        deploy: Deployment | None = None,
     ) -> None:
+        """Raises ConfigError for a deployment that the model was not trained for."""
         self.model = model.eval()
         self.manifest = manifest
         """Where the agent comes from: method, version, digests, seeds, versions of the
         libraries; in Dark Room also ``test_goals`` as ``[x, y]`` pairs, ``size``, ``horizon``."""
-        self._context = context
+        self._context, self._deploy = context, deploy
         self._rng = np.random.default_rng(seed)
         self.reset_context()
 
     def reset_context(self, batch: int = 1) -> None:
         """Forget everything and begin anew in ``batch`` environments, with the model's weights as they are now."""
-        self._policy = InContextPolicy(self.model, batch, self._context)
+        self._policy = in_context(self.model, batch, self._context, self._deploy)
 
-    def act(self, obs: ArrayLike) -> Int[np.ndarray, " B"]:
-        """One action for each observation of ``obs (B, S)``.
+    def act(self, obs: ArrayLike) -> Actions:
+        """One action for each observation of ``obs (B, S)``: numbers ``(B,)``, or vectors in [-1, 1] ``(B, A)``.
 
         Raises ValueError for a batch of another shape.
         """
         states = self._shaped("obs", obs, np.float32, self.model.spec.observation)
-        return sample(self._policy.probabilities(states), self._rng.random(len(states)))
+        return self._policy.act(states, self._rng.random((len(states), self.model.reads.numbers)))
 
     def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
-        """One transition of each environment: ``obs`` and ``next_obs (B, S)``, the others ``(B,)``.
+        """One transition of each environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, the others ``(B,)``.
 
         ``done`` says where the episode ended.  Raises ValueError for another shape, or if only
         some of the episodes ended: a batch shares one horizon.
         """
-        size = self.model.spec.observation
+        spec, size = self.model.spec, self.model.spec.observation
         ended = self._shaped("done", done, np.bool_)
         if ended.any() != ended.all():
             raise ValueError("done: the episodes of a batch end together; deploy unlike horizons in separate agents")
         self._policy.observe(
             self._shaped("obs", obs, np.float32, size),
-            self._shaped("action", action, np.int64),
+            self._shaped("action", action, *((np.int64,) if spec.discrete else (np.float32, spec.actions))),
             self._shaped("reward", reward, np.float32),
             self._shaped("next_obs", next_obs, np.float32, size),
             bool(ended.all()),
@@ -77,18 +83,18 @@ class InContextAgent:
         return array
 
 
-def load_agent(what: str | Path, seed: int | None = None) -> InContextAgent:
+def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | None = None) -> InContextAgent:
     """The agent of a run folder (its newest version), of one checkpoint file, or a shipped one by its name.
 
     ``load_agent("darkroom")`` works at once; a run folder of such a name is ``"./darkroom"``.
 
-    Raises ConfigError if there is no such thing, StoreError if it was not written by this system.
-    Loading executes no code from the file.
+    Raises ConfigError if there is no such thing or it was not trained to be deployed so, StoreError
+    if it was not written by this system.  Loading executes no code from the file.
     """
     checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
     model, context = model_of(checkpoint)
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    return InContextAgent(model, manifest, context, seed)
+    return InContextAgent(model, manifest, context, seed, deploy)
 
 
 def shipped(name: str | Path) -> Path:

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from icrl_dist import commands
 from icrl_dist.commands import FAILED, INTERRUPTED, OK, USAGE
-from icrl_dist.config import ConfigError, Run, load
+from icrl_dist.config import ConfigError, Deployment, Run, load
 from icrl_dist.lineage import parse_source
 
 
@@ -71,8 +71,10 @@ class Evaluate:
     """``online``: episode after episode from an empty context; ``offline``: one episode given a
     random or an expert one (Algorithm 1); ``posterior``: how far its decisions are from the exact
     posterior's, in nats, and its return from the exact agent's."""
-    deploy: Literal["paper"] = "paper"
-    """``paper``: Algorithm 1, the context frozen within an episode."""
+    deploy: Deployment | None = None
+    """``paper``: Algorithm 1, the context frozen within an episode; ``committed``: every transition
+    joins the context at once, and a guess once acted on is kept.  Committed if not given, for an
+    agent that was trained on stretches (model.stretch); the posterior suite is about ``paper``."""
     episodes: int | None = None
     """Online episodes; the run's own number if not given."""
     seeds: int | None = None

@@ -80,7 +80,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     """``icrl-dist evaluate``: per-episode returns beside the oracle's."""
     from icrl_dist import heldout
     from icrl_dist.agent import checkpoint_file
-    from icrl_dist.config import parse
+    from icrl_dist.config import default_deployment, parse
     from icrl_dist.files import load_checkpoint
     from icrl_dist.terminal import Display
 
@@ -93,10 +93,11 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
         chosen = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform"} | chosen
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
     validate(run, "evaluate")
-    answer: dict[str, Any] = {"suite": arguments.suite, "deploy": arguments.deploy, "what": str(what)}
+    deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or default_deployment(run.model)
+    answer: dict[str, Any] = {"suite": arguments.suite, "deploy": deploy, "what": str(what)}
     if arguments.suite == "online":
         with Display(console) as display:
-            results = heldout.online(run, what, display)
+            results = heldout.online(run, what, display, arguments.deploy)
         answer |= heldout.show_online(run, folder, results, console)
     elif arguments.suite == "posterior":
         with Display(console) as display:

@@ -21,6 +21,10 @@ from icrl_dist.tables import ConfigError, build, dumps, nearest
 
 __all__ = ["ConfigError", "Run", "dumps", "load", "override", "parse", "validate"]
 
+Deployment = Literal["paper", "committed"]
+"""How T_theta is deployed online: by Algorithm 1, its context frozen within an episode; or with every
+transition in its context at once and its guesses kept (zeta of eq. 6)."""
+
 METHOD_NAMES = ("dpt", "icag", "icaa")
 
 
@@ -67,6 +71,9 @@ class PretrainConfig:
     through cells not yet visited."""
     queries: int = 16
     """Labelled query states an episode."""
+    stretches: int = 0
+    """Stretches of ``model.stretch`` states an episode, in which the optimal policy acts from a
+    random state on."""
     steps: int = 20000
     """Optimiser steps."""
 
@@ -131,8 +138,21 @@ class ModelConfig:
     fourier: int = 0
     """Sine and cosine pairs added to each observation component; 0 gives the scaled values
     only, which keep no gap between training and held-out goals (docs/decisions.md)."""
+    stretch: int = 1
+    """States of a stretch: T_theta also reads what was done in the stretch so far (zeta of eq. 6), so
+    that a guess once acted on is kept.  1: none, as in the paper's experiments."""
+    outcomes: int = 0
+    """Transitions a training context whose outcome (s', r) T_theta also predicts from those before:
+    what ``InContextAgent.surprise`` is made of.  0: none, as in the paper."""
+    outcome_weight: float = 0.1
+    """Weight of that prediction's loss beside eq. (1)."""
     dropout: float = 0.0
     """Dropout on attention and feed-forward outputs."""
+
+
+def default_deployment(model: ModelConfig) -> Deployment:
+    """``committed`` for a model that is trained on stretches."""
+    return "committed" if model.stretch > 1 else "paper"
 
 
 @dataclass(frozen=True)
@@ -154,6 +174,8 @@ class OptimConfig:
     """Transitions a step, at most: of longer contexts fewer fit in; 0 for no limit."""
     queries: int = 32
     """(prefix, query) pairs a context; each sees its own random prefix (eq. 1, many times)."""
+    stretches: int = 0
+    """Stretches a context (``model.stretch``), each with its own random prefix."""
     episodes: int = 4
     """Episodes in a training context, at most; each step draws its own number."""
     warmup: int = 200

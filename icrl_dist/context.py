@@ -4,15 +4,36 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
-from typing import Generic, TypeVar, overload
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int64, Integer
 
 from icrl_dist.types import Trajectory
 
 K = TypeVar("K", bound=Hashable)
+
+
+class Stretches(NamedTuple):
+    """R stretches of L states, the optimal actions taken in them, and the labels (zeta of eq. 6); or of each of B contexts."""
+
+    states: Float32[np.ndarray, "*B R L S"]
+    taken: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
+    labels: Float32[np.ndarray, "*B R L A"]
+
+    @classmethod
+    def cut(
+        cls,
+        length: int,
+        states: Float32[np.ndarray, "N S"],
+        taken: Integer[np.ndarray, " N"],
+        labels: Float32[np.ndarray, "N A"],
+    ) -> Stretches:
+        """What happened in a row as stretches of this length; what is left at the end is not used."""
+        whole = len(taken) // length * length
+        columns = states.astype(np.float32), taken.astype(np.int64), labels.astype(np.float32)
+        return cls(*(c[:whole].reshape(-1, length, *c.shape[1:]) for c in columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +45,13 @@ class Examples:
     as the deployed agent met them; otherwise it is any of the episodes in any order.
     """
 
-    actions: Int64[np.ndarray, "E H"]
+    actions: Int64[np.ndarray, "E H"] | Float32[np.ndarray, "E H A"]
     observations: Float32[np.ndarray, "E H+1 S"]
     rewards: Float32[np.ndarray, "E H"]
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
     history: bool
+    stretches: Stretches | None = None
 
     @classmethod
     def of(
@@ -38,6 +60,7 @@ class Examples:
         queries: Float32[np.ndarray, "Q S"],
         labels: Float32[np.ndarray, "Q A"],
         history: bool = False,
+        stretches: Stretches | None = None,
     ) -> Examples:
         """Raises ValueError without an episode or without a label."""
         if not episodes or not len(queries):
@@ -49,11 +72,13 @@ class Examples:
             np.asarray(queries, np.float32),
             np.asarray(labels, np.float32),
             history,
+            stretches,
         )
 
     @property
     def nbytes(self) -> int:
-        return sum(array.nbytes for array in (self.actions, self.observations, self.rewards, self.queries, self.labels))
+        own = (self.actions, self.observations, self.rewards, self.queries, self.labels)
+        return sum(array.nbytes for array in (*own, *(self.stretches or ())))
 
 
 class Shelf(Generic[K]):
@@ -113,23 +138,35 @@ class Pool:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """B contexts of up to T transitions, zero-padded at the end, and N queries of each.
+    """B contexts of up to T transitions, zero-padded at the end, and N queries and R stretches of each.
 
     Padding needs no mask: context tokens see only earlier ones, and ``prefix`` never
     reaches beyond a context's real length.
     """
 
     observations: Float32[np.ndarray, "B T S"]
-    actions: Int64[np.ndarray, "B T"]
+    actions: Int64[np.ndarray, "B T"] | Float32[np.ndarray, "B T A"]
     next_observations: Float32[np.ndarray, "B T S"]
     rewards: Float32[np.ndarray, "B T"]
     queries: Float32[np.ndarray, "B N S"]
     labels: Float32[np.ndarray, "B N A"]
     prefix: Int64[np.ndarray, "B N"]
+    stretches: Stretches | None = None
+    stretch_prefix: Int64[np.ndarray, "B R"] | None = None
+    outcomes: Int64[np.ndarray, "B M"] | None = None
+    """Numbers of the transitions whose outcome is to be predicted."""
 
 
-def draw(rng: np.random.Generator, pools: Sequence[Pool], batch: int, queries: int, transitions: int = 0) -> Batch:
-    """A training batch: random variations, random contexts of them, random prefixes and queries.
+def draw(
+    rng: np.random.Generator,
+    pools: Sequence[Pool],
+    batch: int,
+    queries: int,
+    transitions: int = 0,
+    stretches: int = 0,
+    outcomes: int = 0,
+) -> Batch:
+    """A training batch: random variations, random contexts of them, random prefixes, queries and stretches.
 
     A batch comes from one pool, drawn by share, and its contexts have the same drawn number of
     episodes (at most what the variation has), so little is padding.  It has ``batch`` contexts,
@@ -143,17 +180,24 @@ def draw(rng: np.random.Generator, pools: Sequence[Pool], batch: int, queries: i
         longest = max(min(count, len(examples.actions)) * examples.actions.shape[1] for examples in chosen)
         chosen = chosen[: max(1, transitions // longest)]
     rows = [_context(rng, examples, count, queries) for examples in chosen]
-    length = max(len(r[1]) for r in rows)
+    lengths = [len(row[1]) for row in rows]
 
     def padded(column: int) -> np.ndarray:
         first = rows[0][column]
-        out = np.zeros((len(rows), length, *first.shape[1:]), dtype=first.dtype)
+        out = np.zeros((len(rows), max(lengths), *first.shape[1:]), dtype=first.dtype)
         for b, row in enumerate(rows):
             out[b, : len(row[column])] = row[column]
         return out
 
-    stacked = [np.stack([r[c] for r in rows]) for c in (4, 5, 6)]
-    return Batch(padded(0), padded(1), padded(2), padded(3), *stacked)
+    asked, labels, prefix = (np.stack([row[column] for row in rows]) for column in (4, 5, 6))
+    made = Batch(padded(0), padded(1), padded(2), padded(3), asked, labels, prefix)
+    if stretches:
+        drawn = [_stretches(rng, examples, length, stretches) for examples, length in zip(chosen, lengths, strict=True)]
+        columns = (np.stack(column) for column in zip(*(of for of, _ in drawn), strict=True))
+        made = replace(made, stretches=Stretches(*columns), stretch_prefix=np.stack([prefix for _, prefix in drawn]))
+    if outcomes:
+        made = replace(made, outcomes=np.stack([rng.integers(0, length, size=outcomes) for length in lengths]))
+    return made
 
 
 def _context(rng: np.random.Generator, examples: Examples, count: int, queries: int) -> tuple[np.ndarray, ...]:
@@ -164,10 +208,19 @@ def _context(rng: np.random.Generator, examples: Examples, count: int, queries: 
     length = len(chosen) * examples.actions.shape[1]
     return (
         states[:, :-1].reshape(length, -1),
-        examples.actions[chosen].reshape(length),
+        examples.actions[chosen].reshape(length, *examples.actions.shape[2:]),
         states[:, 1:].reshape(length, -1),
         examples.rewards[chosen].reshape(length),
         examples.queries[query],
         examples.labels[query],
         rng.integers(0, length + 1, size=queries),
     )
+
+
+def _stretches(rng: np.random.Generator, examples: Examples, length: int, count: int) -> tuple[Stretches, np.ndarray]:
+    """Random stretches, and a random prefix of the context for each.  Raises ValueError if there are none."""
+    of = examples.stretches
+    if of is None or not len(of.states):
+        raise ValueError("optim.stretches: these examples have none; datasets without stretches cannot train model.stretch")
+    chosen = rng.integers(0, len(of.states), size=count)
+    return Stretches(*(column[chosen] for column in of)), rng.integers(0, length + 1, size=count)

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from icrl_dist import envs
-from icrl_dist.config import DarkRoomConfig, Run
+from icrl_dist import envs, rollout
+from icrl_dist.config import DarkRoomConfig, Deployment, Run
 from icrl_dist.envs import darkroom, tasks
 from icrl_dist.envs.darkroom import ACTIONS
 from icrl_dist.exact import RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.recipes import Dataset, Phase, self_labelled
-from icrl_dist.rollout import InContextPolicy, Policy, RandomPolicy, deploy_offline, deploy_online, episode
+from icrl_dist.rollout import Policy, RandomPolicy, deploy_offline, deploy_online, episode
 from icrl_dist.stats import mean_and_error
 from icrl_dist.types import Adversary, Identity, Task, Variation
 
@@ -39,6 +39,15 @@ class Result:
     def last(self, episodes: int) -> float:
         """Mean return over the last episodes."""
         return float(self.returns[:, :, -episodes:].mean())
+
+    def first_over(self, oracle: Result, episodes: int) -> float:
+        """Mean return over the first episodes (or all, if there are fewer), as a share of the oracle's in the same ones."""
+        return round(float(self.returns[:, :, :episodes].mean() / oracle.returns[:, :, :episodes].mean()), 4)
+
+    def episode_of(self, oracle: Result, share: float) -> int | None:
+        """First episode, from 1, whose mean return is this share of the oracle's over all episodes; None if none is."""
+        good = self.returns.mean(axis=(0, 1)) >= share * oracle.returns.mean()
+        return int(good.argmax()) + 1 if good.any() else None
 
     def row(self) -> dict[str, Any]:
         """The result as plain values, for JSON."""
@@ -62,9 +71,9 @@ def variations(run: Run, p: float, goals: Sequence[Task] | None = None) -> tuple
     )
 
 
-def in_context(run: Run, model: PretrainedTransformer) -> MakePolicy:
-    """T_theta, deployed by Algorithm 1."""
-    return lambda rows: InContextPolicy(model, len(rows), run.context)
+def in_context(run: Run, model: PretrainedTransformer, deploy: Deployment | None = None) -> MakePolicy:
+    """T_theta, deployed by this rule or the better one that it was trained for."""
+    return lambda rows: rollout.in_context(model, len(rows), run.context, deploy)
 
 
 def random(rows: Sequence[Variation]) -> Policy:
@@ -144,7 +153,7 @@ def offline(run: Run, agents: Mapping[str, PretrainedTransformer]) -> list[Resul
             results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
             ran = {}
             for name, model in agents.items():
-                policy = InContextPolicy(model, len(rows), run.context)
+                policy = rollout.in_context(model, len(rows), run.context)
                 ran[name] = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
             for rule, name in RULES.items():
                 agent = exact(run, rule)(rows)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from icrl_dist import evaluate, plots, truth
 from icrl_dist.agent import checkpoint_file, model_of
-from icrl_dist.config import Run
+from icrl_dist.config import Deployment, Run, default_deployment
 from icrl_dist.envs import tasks
 from icrl_dist.exact import RULES
 from icrl_dist.files import atomic_write, load_checkpoint
@@ -29,9 +29,17 @@ def models(what: Path) -> dict[str, PretrainedTransformer]:
     return found
 
 
-def online(run: Run, what: Path, display: Display) -> list[evaluate.Result]:
-    """Online returns of the folder's models, a random policy, the exact agents and the oracle."""
-    agents: dict[str, evaluate.MakePolicy] = {name: evaluate.in_context(run, model) for name, model in models(what).items()}
+def online(run: Run, what: Path, display: Display, deploy: Deployment | None = None) -> list[evaluate.Result]:
+    """Online returns of the folder's models, a random policy, the exact agents and the oracle; the newest model first.
+
+    Deployed by ``deploy``, or by the better rule that they were trained for; if that is not
+    Algorithm 1, the newest is deployed by it too.
+    """
+    found = models(what)
+    agents: dict[str, evaluate.MakePolicy] = {name: evaluate.in_context(run, model, deploy) for name, model in found.items()}
+    newest, model = next(iter(found.items()))
+    if (deploy or default_deployment(run.model)) != "paper":
+        agents[f"{newest}, Algorithm 1"] = evaluate.in_context(run, model, "paper")
     agents["random"] = evaluate.random
     agents |= {name: evaluate.exact(run, rule) for rule, name in RULES.items()}
     agents[evaluate.ORACLE] = evaluate.optimal(run)
@@ -46,13 +54,24 @@ def offline(run: Run, what: Path) -> list[evaluate.Result]:
 def show_online(run: Run, folder: Path, results: list[evaluate.Result], console: Console) -> dict[str, Any]:
     """Print the table, draw the figure, keep the rows in the folder; returns them with the figure's path."""
     rows = [result.row() for result in results]
+    adapted = _adaptation(results)
     size, count = run.darkroom.size, len(results[0].optimum)
     title = f"{run.method.upper()} on {count} held-out goals of a {size}x{size} Dark Room, {run.evaluate.seeds} seeds"
     atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
     figure = plots.adaptation(rows, folder / "adaptation.png", title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
     console.print(f"figure {figure}", highlight=False, markup=False)
-    return {"rows": rows, "figure": str(figure)}
+    return {**adapted, "rows": rows, "figure": str(figure)}
+
+
+def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:
+    """How soon the newest model acts well, by p, beside the oracle: see ``Result.first_over`` and ``Result.episode_of``."""
+    oracle = {result.p: result for result in results if result.agent == evaluate.ORACLE}
+    newest = [result for result in results if result.agent == results[0].agent]
+    return {
+        "first10_over_oracle": {f"{one.p:g}": one.first_over(oracle[one.p], 10) for one in newest},
+        "episode_of_90": {f"{one.p:g}": one.episode_of(oracle[one.p], 0.9) for one in newest},
+    }
 
 
 def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
+from jaxtyping import Float32, Int, Int16
 
 from icrl_dist import envs
 from icrl_dist.behaviour import Walks
-from icrl_dist.config import ContextConfig
+from icrl_dist.config import ContextConfig, Deployment
 from icrl_dist.envs.darkroom import cells
+from icrl_dist.exact import OptimalAgent
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.oracle import Hypotheses, heuristic_labels, soft_labels
-from icrl_dist.rollout import Episodes, InContextPolicy, deploy_online, episode, sample
-from icrl_dist.types import Identity, Job, Trajectory
+from icrl_dist.models.heads import sample
+from icrl_dist.oracle import Hypotheses, cell_numbers, heuristic_labels, soft_labels
+from icrl_dist.rollout import Episodes, deploy_online, episode, in_context
+from icrl_dist.types import Identity, Job, Spec, Trajectory, Variation
 
 
 class Policies(Protocol):
@@ -41,7 +44,8 @@ def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
     """Contexts D^{i,k} of behaviour policies, query states and their labels (Algorithm 2, lines 8 to 12).
 
     Settings: ``behaviours``, taken by turns from trial to trial; ``queries`` a trajectory,
-    ``labels`` (soft, sampled, heuristic), ``gamma``, ``slack``.
+    ``labels`` (soft, sampled, heuristic), ``gamma``, ``slack``; ``stretches`` a trajectory, of
+    ``stretch`` states.
     """
     labeller = _Labeller(job)
     identities = list(job.identities())
@@ -50,52 +54,93 @@ def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
     behaviours = str(job.setting("behaviours")).split(",")
     kinds = [behaviours[identity.trial % len(behaviours)] for identity in identities]
     ran = episode(env, Walks(labeller.size, env.spec.horizon, kinds, rngs), rngs)
-    for row, (identity, rng) in enumerate(zip(identities, rngs, strict=True)):
-        yield _trajectory(job, identity, ran, row, worker, "", *labeller(identity, rng))
+    for row, (identity, known) in enumerate(zip(identities, labeller(identities, rngs), strict=True)):
+        yield _trajectory(job, identity, ran, row, worker, "", known)
 
 
 def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
     """Online rollouts of T^j in each variation, N + 1 trials each (Algorithm 3, line 12).
 
-    One T^j acts in all trials: the version that the job names.  Settings: ``context_max``;
+    One T^j acts in all trials: the version that the job names.  Settings: ``context_max``, ``deploy``;
     ``labels`` and what goes with it, as for ``random_context``, or ``none``: then T^j's own later
     actions become labels, which is the learner's choice to make.
     """
     model, digest = policies.at(job.weights)
     context = ContextConfig(max=int(_number(job, "context_max")), keep="all")
     env = envs.batch(job.variations)
-    policy = InContextPolicy(model, env.batch, context)
+    policy = in_context(model, env.batch, context, cast(Deployment, job.setting("deploy")))
     labeller = None if job.setting("labels") == "none" else _Labeller(job)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
-    nothing = np.zeros((0, env.spec.observation), np.float32), np.zeros((0, env.spec.actions), np.float32), "none"
     for row, chance, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
-        for b, (identity, rng) in enumerate(zip(row, chance, strict=True)):
-            given = labeller(identity, rng) if labeller else nothing
-            yield _trajectory(job, identity, ran, b, worker, digest, *given)
+        known = labeller(row, chance) if labeller else [_nothing(env.spec)] * len(row)
+        for b, identity in enumerate(row):
+            yield _trajectory(job, identity, ran, b, worker, digest, known[b])
+
+
+class _Known(NamedTuple):
+    """What a trajectory's collector knew better: its last fields."""
+
+    queries: Float32[np.ndarray, "Q S"]
+    labels: Float32[np.ndarray, "Q A"]
+    taken: Int16[np.ndarray, " R"]
+    origin: str
+
+
+def _nothing(spec: Spec) -> _Known:
+    zeros = np.zeros((0, spec.observation), np.float32), np.zeros((0, spec.actions), np.float32), np.zeros(0, np.int16)
+    return _Known(*zeros, "none")
 
 
 class _Labeller:
-    """Random query states of a trajectory's variation, and their labels."""
+    """Random query states of a trajectory's variation, stretches from random states on, and their labels."""
 
     def __init__(self, job: Job) -> None:
-        hypotheses = Hypotheses.of(job.variations)
-        self.size = hypotheses.size
+        self._job = job
+        self._hypotheses = Hypotheses.of(job.variations)
+        self.size = self._hypotheses.size
         self._mode, self._queries = job.setting("labels"), int(_number(job, "queries"))
+        self._stretches, self._length = int(_number(job, "stretches")), int(_number(job, "stretch"))
         self._place = {row: index for index, row in enumerate(job.rows())}
         self._states = cells(self.size)
         if self._mode == "heuristic":
-            self._table = heuristic_labels(hypotheses)
+            self._table = heuristic_labels(self._hypotheses)
         else:
-            self._table = soft_labels(hypotheses, _number(job, "gamma"), _number(job, "slack"))
+            self._table = soft_labels(self._hypotheses, _number(job, "gamma"), _number(job, "slack"))
 
-    def __call__(self, identity: Identity, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
-        """Query states, labels, and whose the labels are."""
+    def __call__(self, identities: Sequence[Identity], rngs: Sequence[np.random.Generator]) -> list[_Known]:
+        place = np.array([self._place[identity.task, identity.variation] for identity in identities])
+        alone = [self._alone(p, rng) for p, rng in zip(place.tolist(), rngs, strict=True)]
+        if not self._stretches:
+            return alone
+        states, taken = self._follow(place, rngs)
+        labels = self._table[place[:, None], cell_numbers(states, self.size)]
+        if self._mode == "sampled":
+            labels = np.eye(labels.shape[2], dtype=np.float32)[taken]
+        return [
+            _Known(np.concatenate([one.queries, states[b]]), np.concatenate([one.labels, labels[b]]), taken[b], one.origin)
+            for b, one in enumerate(alone)
+        ]
+
+    def _alone(self, place: int, rng: np.random.Generator) -> _Known:
         query = rng.integers(0, len(self._states), size=self._queries)
-        labels = self._table[self._place[identity.task, identity.variation], query]
+        labels = self._table[place, query]
         if self._mode == "sampled":
             labels = np.eye(labels.shape[1], dtype=np.float32)[sample(labels, rng.random(len(query)))]
-        return self._states[query], labels, "heuristic" if self._mode == "heuristic" else "optimal"
+        origin = "heuristic" if self._mode == "heuristic" else "optimal"
+        return _Known(self._states[query], labels, np.zeros(0, np.int16), origin)
+
+    def _follow(
+        self, place: Int[np.ndarray, " B"], rngs: Sequence[np.random.Generator]
+    ) -> tuple[Float32[np.ndarray, "B R S"], Int16[np.ndarray, "B R"]]:
+        """States and actions of the labelling policy from random states on, each row's stretches one after another."""
+        rows = place.repeat(self._stretches)
+        short = [self._job.variations[p] for p in rows.tolist()]
+        short = [Variation(v.task.replace(start="random", horizon=self._length), v.adversary) for v in short]
+        chance = [rng for rng in rngs for _ in range(self._stretches)]
+        ran = episode(envs.batch(short), OptimalAgent(self._table[rows], self.size), chance)
+        states = ran.observations[:, :-1].reshape(len(place), self._stretches * self._length, -1)
+        return states, ran.actions.reshape(len(place), -1)
 
 
 def _number(job: Job, name: str) -> float:
@@ -112,9 +157,7 @@ def _trajectory(
     row: int,
     worker: str,
     digest: str,
-    queries: np.ndarray,
-    labels: np.ndarray,
-    origin: str,
+    known: _Known,
 ) -> Trajectory:
     return Trajectory(
         identity=identity,
@@ -126,7 +169,5 @@ def _trajectory(
         actions=ran.actions[row],
         rewards=ran.rewards[row],
         adversary=ran.adversary[row],
-        queries=queries,
-        labels=labels,
-        origin=origin,
+        **known._asdict(),
     )

@@ -40,6 +40,11 @@ def validate(run: Run, source: str) -> None:
     need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
     need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
     need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
+    need(run.model.stretch > 0, "model.stretch", run.model.stretch, "at least 1, which is none")
+    for where, stretches in (("pretrain.stretches", run.pretrain.stretches), ("optim.stretches", optim.stretches)):
+        remedy = "above 0 exactly if model.stretch is above 1"
+        need((stretches > 0) == (run.model.stretch > 1), where, stretches, remedy)
+    need(run.model.stretch <= room.horizon, "model.stretch", run.model.stretch, "at most darkroom.horizon")
     need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
     need(run.context.max >= room.horizon, "context.max", run.context.max, "must hold at least one episode")
     need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
@@ -75,6 +80,8 @@ def validate(run: Run, source: str) -> None:
         "darkroom.split_seed": room.split_seed,
         "darkroom.label_slack": room.label_slack,
         "model.fourier": run.model.fourier,
+        "model.outcomes": run.model.outcomes,
+        "model.outcome_weight": run.model.outcome_weight,
         "practice.rounds": practice.rounds,
         "optim.transitions": optim.transitions,
         "optim.muon": optim.muon,

@@ -11,23 +11,28 @@ from torch import Tensor
 
 from icrl_dist.config import OptimConfig
 from icrl_dist.context import Batch
-from icrl_dist.models.dpt import PretrainedTransformer, Transitions
-
-
-def loss(logits: Float[Tensor, "*B A"], labels: Float[Tensor, "*B A"]) -> Float[Tensor, ""]:
-    """-log T_theta(a* | s_query, D) of eq. (1), in nats, averaged; a* may be a distribution."""
-    return -(labels * logits.log_softmax(dim=-1)).sum(dim=-1).mean()
+from icrl_dist.models.dpt import PretrainedTransformer, Stretches, Transitions
 
 
 def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
-    """Eq. (1) over every (prefix, query) pair of a batch."""
+    """Eq. (1) over every (prefix, query) pair of a batch, and with stretches eq. (6), every label counting the same."""
     device = model.low.device
 
     def put(array: object) -> Tensor:
         return torch.as_tensor(array, device=device)
 
     context = Transitions(*map(put, (batch.observations, batch.actions, batch.next_observations, batch.rewards)))
-    return loss(model(context, put(batch.queries), put(batch.prefix)), put(batch.labels))
+    cache = model.encode(context)
+    total = model.reads.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
+    if batch.stretches is not None:
+        states, taken, labels = batch.stretches
+        followed = model.follow(Stretches(put(states), put(taken)), cache, put(batch.stretch_prefix))
+        count = states.shape[1] * states.shape[2]
+        share = count / (count + batch.prefix.shape[1])
+        total = (1 - share) * total + share * model.reads.loss(followed, put(labels))
+    if batch.outcomes is not None:
+        total = total + model.config.outcome_weight * model.outcome_loss(context, cache, put(batch.outcomes)).mean()
+    return total
 
 
 class Optimiser:

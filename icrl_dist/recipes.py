@@ -14,8 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
-from icrl_dist.config import Run
-from icrl_dist.context import Examples, Pool, Shelf, Shelved
+from icrl_dist.config import Deployment, Run, default_deployment
+from icrl_dist.context import Examples, Pool, Shelf, Shelved, Stretches
 from icrl_dist.envs import tasks
 from icrl_dist.types import Job, Params, Task, Trajectory, Variation
 
@@ -84,6 +84,8 @@ def _labelling(run: Run) -> Params:
         ("labels", room.labels),
         ("queries", run.pretrain.queries),
         ("slack", room.label_slack),
+        ("stretch", run.model.stretch),
+        ("stretches", run.pretrain.stretches),
     )
 
 
@@ -112,16 +114,30 @@ def _jobs(
 
 
 def _practice(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
-    """T^j makes a history in every training variation, started as at test; its queries are labelled as D_pre's."""
-    settings: Params = (("context_max", run.context.max), *_labelling(run))
+    """T^j makes a history in every training variation, started as at test; its queries are labelled as D_pre's.
+
+    By every rule that it may be deployed by, job by job, for each makes histories of its own kind.
+    """
     chosen = [variations(i, tasks.deployed(task)) for i, task in enumerate(tasks.split(run).train)]
-    return _jobs(run, phase, "adapt", chosen, run.practice.trials, settings)
+    jobs = _jobs(run, phase, "adapt", chosen, run.practice.trials, _labelling(run))
+    rules: tuple[Deployment, ...] = ("committed", "paper") if run.model.stretch > 1 else ("paper",)
+    return tuple(
+        dataclasses.replace(job, settings=(*job.settings, *_deployment(run, rules[(phase.round + number) % len(rules)])))
+        for number, job in enumerate(jobs)
+    )
 
 
-def _labelled(trials: Sequence[Trajectory]) -> Examples:
-    """A variation's episodes with the queries that were labelled when they were collected."""
-    queries, labels = (np.concatenate([getattr(t, name) for t in trials]) for name in ("queries", "labels"))
-    return Examples.of(trials, queries, labels, history=trials[0].identity.stage == "adapt")
+def _deployment(run: Run, rule: Deployment) -> Params:
+    """How T^j is deployed."""
+    return (("context_max", run.context.max), ("deploy", rule))
+
+
+def _labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
+    """A variation's episodes with the queries and stretches that were labelled when they were collected."""
+    alone = np.concatenate([np.arange(len(t.queries)) < len(t.queries) - len(t.taken) for t in trials])
+    queries, labels, taken = (np.concatenate([getattr(t, name) for t in trials]) for name in ("queries", "labels", "taken"))
+    stretches = Stretches.cut(run.model.stretch, queries[~alone], taken, labels[~alone])
+    return Examples.of(trials, queries[alone], labels[alone], trials[0].identity.stage == "adapt", stretches)
 
 
 def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
@@ -129,7 +145,7 @@ def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
 
     def read(key: Key) -> Examples:
         trials = data.trials(key)
-        examples = self_labelled(run, trials) if trials[0].origin == "none" else _labelled(trials)
+        examples = self_labelled(run, trials) if trials[0].origin == "none" else _labelled(run, trials)
         assert examples is not None, "only variations that give labels are asked for"
         return examples
 
@@ -178,7 +194,7 @@ def _icaa_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
     """Lines 8 to 12: T^j is deployed in every variation for N + 1 trials."""
     if phase.stage == "pretrain":
         return _dpt_ask(run, phase)
-    settings: Params = (("context_max", run.context.max), ("labels", "none"))
+    settings: Params = (*_deployment(run, default_deployment(run.model)), ("labels", "none"))
     train = enumerate(tasks.split(run).train)
     chosen = [tasks.variations(run, i, tasks.deployed(task), phase.round) for i, task in train]
     return _jobs(run, phase, "adapt", chosen, run.icaa.trials + 1, settings)
@@ -218,7 +234,10 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
     queries = np.concatenate([t.observations[:-1] for t in later])
     actions = np.concatenate([t.actions for t in later])
     labels = np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
-    return Examples.of(contexts, queries, labels, run.icaa.context == "history")
+    length, horizon = run.model.stretch, len(later[0].actions)
+    whole = np.arange(len(later) * horizon).reshape(-1, horizon)[:, : horizon // length * length].ravel()
+    stretches = Stretches.cut(length, queries[whole], actions[whole], labels[whole])
+    return Examples.of(contexts, queries, labels, run.icaa.context == "history", stretches)
 
 
 METHODS: dict[str, Method] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,13 +11,17 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int16, Int64
 
-from icrl_dist.config import ContextConfig
+from icrl_dist.config import ConfigError, ContextConfig, Deployment, default_deployment
 from icrl_dist.envs import Batch
-from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions
+from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Stretches, Transitions
+from icrl_dist.models.heads import sample
+
+Actions = Int64[np.ndarray, " B"] | Float32[np.ndarray, "B A"]
+"""Of B environments: numbers, or vectors in [-1, 1]."""
 
 
 class Policy(Protocol):
-    """Acts in B environments at once; whatever it learns, it learns from ``observe``."""
+    """Acts in B environments at once, by its law over discrete actions; whatever it learns, it learns from ``observe``."""
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]: ...
 
@@ -61,39 +66,54 @@ class InContextPolicy:
         """Transitions in the context of each environment."""
         return self._deployed.length
 
+    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
+        """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
+        return self.model.reads.act(self._decide(observation), u)
+
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
-        states = torch.from_numpy(np.array(observation)).to(self.model.low.device)
-        return self._deployed.decide(states).softmax(-1).cpu().numpy()
+        """The law over discrete actions."""
+        return self._decide(observation).softmax(-1).cpu().numpy()
+
+    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
+        return self._deployed.decide(torch.from_numpy(np.array(observation)).to(self.model.low.device))
 
     def observe(
         self,
         observation: Float32[np.ndarray, "B S"],
-        action: Int64[np.ndarray, " B"],
+        action: Actions,
         reward: Float32[np.ndarray, " B"],
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None:
         self._pending.append((observation, action, next_observation, reward))
         if done:
-            stacked = [np.stack(column, axis=1) for column in zip(*self._pending, strict=True)]
-            self._pending = []
-            self.append(stacked[0], stacked[1], stacked[2], stacked[3])
+            self._add(self._episode())
+
+    def _episode(self) -> Transitions:
+        """The episode that has just ended."""
+        columns = [np.stack(column, axis=1) for column in zip(*self._pending, strict=True)]
+        self._pending = []
+        return Transitions(*self._tensors(*columns))
 
     def append(
         self,
         observations: Float32[np.ndarray, "B T S"],
-        actions: Int64[np.ndarray, "B T"],
+        actions: Int64[np.ndarray, "B T"] | Float32[np.ndarray, "B T A"],
         next_observations: Float32[np.ndarray, "B T S"],
         rewards: Float32[np.ndarray, "B T"],
     ) -> None:
-        """Append an episode, or any data D_off collected before, to every context."""
-        device = self.model.low.device
-        episode = Transitions(
-            *(
-                torch.from_numpy(np.array(a)).to(device)
-                for a in (observations, actions.astype(np.int64), next_observations, rewards)
-            )
-        )
+        """Add one episode, of this or any other policy, to the context."""
+        self._add(Transitions(*self._tensors(observations, actions, next_observations, rewards)))
+
+    def _add(self, episode: Transitions) -> None:
+        if not self._remember(episode):
+            self._deployed.append(episode)
+
+    def _tensors(self, *columns: np.ndarray) -> Iterator[torch.Tensor]:
+        return (torch.from_numpy(np.array(column)).to(self.model.low.device) for column in columns)
+
+    def _remember(self, episode: Transitions) -> bool:
+        """Add an episode to those of the context; true if others were dropped for it, and all was encoded anew."""
         kept = [] if self._config.keep == "last" else list(self._episodes)
         total = sum(e.actions.shape[1] for e in kept) + episode.actions.shape[1]
         while kept and total > self._config.max:
@@ -101,15 +121,110 @@ class InContextPolicy:
         dropped, self._episodes = len(kept) < len(self._episodes), [*kept, episode]
         if dropped:
             self._deployed.clear()
-            episode = Transitions(*(torch.cat(columns, dim=1) for columns in zip(*self._episodes, strict=True)))
-        self._deployed.append(episode)
+            self._deployed.append(Transitions(*(torch.cat(columns, dim=1) for columns in zip(*self._episodes, strict=True))))
+        return dropped
+
+
+class CommittedPolicy(InContextPolicy):
+    """T_theta(. | s, D_on, zeta): every transition joins the context at once, and a guess once acted on is kept.
+
+    zeta are the last states and actions of the episode, as if the optimal policy had taken
+    them (eq. 6): what T_theta has begun to do it goes on with, unless the context has come to
+    speak against it.  Then the guess is refuted and zeta is empty again.  It is refuted when
+    T_theta, knowing what it knows now, would hardly have done what it did: when that has become
+    ``REFUTED`` times as likely as it was.
+    """
+
+    REFUTED = 0.5
+
+    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig) -> None:
+        super().__init__(model, batch, context)
+        spec, length = model.spec, model.config.stretch
+        self._rows = np.arange(batch)
+        self._states = np.zeros((batch, length, spec.observation), np.float32)
+        shape, dtype = ((), np.int64) if spec.discrete else ((spec.actions,), np.float32)
+        self._taken = np.zeros((batch, length, *shape), dtype)
+        self._said = np.zeros((batch, length))
+        self._kept = np.zeros(batch, np.int64)
+        self._arrived: Transitions | None = None
+
+    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
+        outputs, taken = self._follow(observation, self._kept)
+        decided = outputs[self._rows, self._kept]
+        now = self.model.reads.log_likelihood(outputs, taken).double().cpu().numpy()
+        past = np.arange(now.shape[1]) < self._kept[:, None]
+        change = np.where(past, now - self._said[:, : now.shape[1]], 0.0).sum(axis=1)
+        refuted = change < math.log(self.REFUTED)
+        if refuted.any():
+            self._kept[refuted] = 0
+            anew, _ = self._follow(observation, np.zeros_like(self._kept))
+            decided[torch.from_numpy(refuted)] = anew[:, 0][torch.from_numpy(refuted)]
+        self._decided = decided
+        return decided
+
+    def _follow(
+        self, observation: Float32[np.ndarray, "B S"], kept: Int64[np.ndarray, " B"]
+    ) -> tuple[Float[torch.Tensor, "B L O"], torch.Tensor]:
+        """Outputs at the first ``kept`` states of zeta and at this observation after them; and the actions of zeta."""
+        length = int(kept.max()) + 1
+        states = self._states[:, :length].copy()
+        states[self._rows, kept] = observation
+        of = Stretches(*(column[:, None] for column in self._tensors(states, self._taken[:, :length])))
+        arrived, self._arrived = self._arrived, None
+        return self._deployed.follow(of, arrived), of.taken[:, 0]
+
+    def observe(
+        self,
+        observation: Float32[np.ndarray, "B S"],
+        action: Actions,
+        reward: Float32[np.ndarray, " B"],
+        next_observation: Float32[np.ndarray, "B S"],
+        done: bool,
+    ) -> None:
+        self._pending.append((observation, action, next_observation, reward))
+        self._arrived = Transitions(*(column[:, None] for column in self._tensors(*self._pending[-1])))
+        self._keep(observation, action)
+        if done:
+            episode = self._episode()
+            self._kept[:] = 0
+            if not self._remember(episode):
+                self._follow(observation, self._kept)  # the last transition arrives
+            self._arrived = None
+            self._deployed.settle()
+
+    def _keep(self, observation: Float32[np.ndarray, "B S"], action: Actions) -> None:
+        """Add a step to zeta, which lets go of its first where it is full."""
+        chosen, at = torch.from_numpy(np.array(action)).to(self._decided.device), (self._rows, self._kept)
+        self._states[at], self._taken[at] = observation, action
+        self._said[at] = self.model.reads.log_likelihood(self._decided, chosen).double().cpu().numpy()
+        self._kept += 1
+        full = self._kept == self._states.shape[1]
+        for column in (self._states, self._taken, self._said):
+            column[full] = np.roll(column[full], -1, axis=1)
+        self._kept[full] -= 1
+
+
+def in_context(
+    model: PretrainedTransformer, batch: int, context: ContextConfig, deploy: Deployment | None = None
+) -> InContextPolicy:
+    """T_theta deployed by this rule, or by the better one that it was trained for.
+
+    Raises ConfigError for ``committed`` if it was not trained on stretches.
+    """
+    rule = deploy or default_deployment(model.config)
+    if rule == "committed" and model.config.stretch == 1:
+        raise ConfigError(
+            "deploy 'committed': this agent never trained on stretches (model.stretch = 1); "
+            "deploy it by 'paper', or train with model.stretch, pretrain.stretches and optim.stretches"
+        )
+    return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context)
 
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
     """One episode in each of B environments."""
 
-    actions: Int16[np.ndarray, "B H"]
+    actions: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H A"]
     observations: Float32[np.ndarray, "B H+1 S"]
     rewards: Float32[np.ndarray, "B H"]
     adversary: Int16[np.ndarray, "B H"]
@@ -120,24 +235,25 @@ class Episodes:
         return self.rewards.sum(axis=1, dtype=np.float64)
 
 
-def sample(probabilities: Float[np.ndarray, "B A"], u: Float[np.ndarray, " B"]) -> Int64[np.ndarray, " B"]:
-    """The action of each row that its uniform number u in [0, 1) picks."""
-    edges = probabilities.astype(np.float64).cumsum(axis=1)
-    return (u[:, None] * edges[:, -1:] >= edges[:, :-1]).sum(axis=1)
+def _act(policy: Policy | InContextPolicy, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
+    if isinstance(policy, InContextPolicy):
+        return policy.act(observation, u)
+    return sample(policy.probabilities(observation), u[:, 0])
 
 
-def episode(env: Batch, policy: Policy, rngs: Sequence[np.random.Generator]) -> Episodes:
+def episode(env: Batch, policy: Policy | InContextPolicy, rngs: Sequence[np.random.Generator]) -> Episodes:
     """One episode; row b's chance, the agent's included, comes from ``rngs[b]`` alone."""
     observation = env.reset(rngs)
-    noise = np.stack([rng.random(env.spec.horizon) for rng in rngs], axis=1)
+    shape = (env.spec.horizon, 1 if env.spec.discrete else env.spec.actions)
+    noise = np.stack([rng.random(shape) for rng in rngs], axis=1)
     observations, actions, rewards, adversary = [observation], [], [], []
     for h in range(env.spec.horizon):
-        action = sample(policy.probabilities(observation), noise[h])
+        action = _act(policy, observation, noise[h])
         step = env.step(action)
         policy.observe(observation, action, step.reward, step.observation, step.done)
         observation = step.observation
         observations.append(observation)
-        actions.append(action.astype(np.int16))
+        actions.append(action.astype(np.int16) if env.spec.discrete else action)
         rewards.append(step.reward)
         adversary.append(step.adversary)
     return Episodes(

@@ -34,7 +34,7 @@ _PREFIX = b"icr"
 NAME, TRAJECTORY, SEAL = b"icrN", b"icrT", b"icrS"
 HEADER_BYTES = _HEADER.size
 SEAL_BYTES = HEADER_BYTES + 32
-_NUMBERS = 14
+_NUMBERS = 15
 _DTYPES = {name: np.dtype(dtype) for name, (dtype, _) in ARRAYS.items()}
 
 
@@ -102,7 +102,7 @@ def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
         number, new = names.number(value)
         numbers.append(number)
         fresh.append(new)
-    shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1])
+    shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.taken))
     head = msgpack.packb([*t.identity.key(), t.weights, *numbers, *shape])
     return b"".join(fresh), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
 
@@ -114,7 +114,8 @@ def decode(payload: bytes, names: Names) -> Trajectory:
     """
     reader = _reader(payload[:256])
     numbers = [strict.integer(n, "frame", -1) for n in strict.as_list(_next(reader), "frame", _NUMBERS)]
-    stage, round_, task, variation, trial, weights, phi, digest, worker, origin, steps, components, queries, actions = numbers
+    stage, round_, task, variation, trial, weights, phi, digest, worker, origin, *sizes = numbers
+    steps, components, queries, actions, taken = sizes
     if min(numbers[:5] + numbers[6:]) < 0 or max(numbers) >= 1 << 31 or stage >= len(STAGES):
         raise ValueError(f"a trajectory frame of {numbers}")
     shapes = {
@@ -124,6 +125,7 @@ def decode(payload: bytes, names: Names) -> Trajectory:
         "adversary": (steps,),
         "queries": (queries, components),
         "labels": (queries, actions),
+        "taken": (taken,),
     }
     arrays, at = {}, reader.tell()
     if len(payload) - at != sum(prod(shape) * _DTYPES[name].itemsize for name, shape in shapes.items()):

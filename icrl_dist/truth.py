@@ -116,7 +116,7 @@ def divergences(run: Run, model: PretrainedTransformer, heldout: bool) -> Iterat
             seed = np.random.SeedSequence(run.seed, spawn_key=(_TRUTH, int(heldout), level, number))
             rng = np.random.default_rng(seed)
             rows = [_disturbed(rng, groups[row % len(groups)], p) for row in range(CONTEXTS)]
-            context = contexts(kind, rows, evaluate.in_context(run, model), rng.spawn(CONTEXTS))
+            context = contexts(kind, rows, evaluate.in_context(run, model, "paper"), rng.spawn(CONTEXTS))
             query = rng.integers(0, room.size**2, size=(CONTEXTS, 1 + EPISODES * room.horizon))
             decided = model_decisions(model, context, query, room.size)
             met = np.pad(context.rewards.cumsum(axis=1) > 0, ((0, 0), (1, 0)))

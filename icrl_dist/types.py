@@ -194,6 +194,9 @@ class Trajectory:
     """Query states s_query; none (Q = 0) if the collector knew no labels."""
     labels: Float32[np.ndarray, "Q A"]
     """A distribution over actions at each query state."""
+    taken: Int16[np.ndarray, " R"]
+    """The actions a* taken at the last R query states, which lie in stretches (zeta of eq. 6), one
+    after another; the first Q - R states stand alone."""
     origin: str
     """Where the labels came from: ``optimal``, ``heuristic`` or ``none``."""
 
@@ -213,6 +216,7 @@ ARRAYS: dict[str, tuple[str, int]] = {
     "adversary": ("<i2", 1),
     "queries": ("<f4", 2),
     "labels": ("<f4", 2),
+    "taken": ("<i2", 1),
 }
 """A trajectory's arrays: their dtype and number of dimensions."""
 

@@ -36,6 +36,7 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
         "split_seed": room.split_seed,
         "size": room.size,
         "horizon": room.horizon,
+        "stretch": run.model.stretch,
         "test_goals": [[int(c) for c in task.vector("goal")] for task in split.test],
         "threads": threads,
         "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},

@@ -42,8 +42,9 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
         raise Rejected("spec", f"{identity}: observations {trajectory.observations.shape}, this run needs {size}")
     if trajectory.queries.shape[1] != spec.observation or trajectory.labels.shape[1] != spec.actions:
         raise Rejected("spec", f"{identity}: queries {trajectory.queries.shape}, labels {trajectory.labels.shape}")
-    if trajectory.actions.min() < 0 or trajectory.actions.max() >= spec.actions:
-        raise Rejected("spec", f"{identity}: an action lies outside 0..{spec.actions - 1}")
+    for chosen in (trajectory.actions, trajectory.taken):
+        if len(chosen) and (chosen.min() < 0 or chosen.max() >= spec.actions):
+            raise Rejected("spec", f"{identity}: an action lies outside 0..{spec.actions - 1}")
     if not all(map(_finite, trajectory.arrays().values())):
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
     if trajectory.variation != job.variation(identity):

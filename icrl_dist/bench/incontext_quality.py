@@ -23,6 +23,7 @@ from icrl_dist.context import Batch
 from icrl_dist.envs import darkroom
 from icrl_dist.envs.darkroom import cells, next_cell
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
+from icrl_dist.models.heads import Categorical
 from icrl_dist.oracle import Hypotheses, heuristic_labels, log_likelihood, posterior, posterior_action
 from icrl_dist.types import NULL, Spec, Variation
 
@@ -204,4 +205,4 @@ def _our_loss(model: PretrainedTransformer, held_out: Drawn) -> float:
 def _peer_loss(model: peer.Peer, held_out: Drawn) -> float:
     context, query, label = held_out.tensors()
     logits = model(context, query)[:, 1:]
-    return float(pretrain.loss(logits, label[:, None].expand_as(logits)))
+    return float(Categorical(SPEC.actions).loss(logits, label[:, None].expand_as(logits)))

@@ -46,6 +46,7 @@ def example(trial: int = 0) -> Trajectory:
         adversary=np.full(steps, -1, np.int16),
         queries=rng.normal(size=(queries, observation)).astype(np.float32),
         labels=rng.random((queries, actions), np.float32),
+        taken=np.zeros(0, np.int16),
         origin="heuristic",
     )
 

@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from icrl_dist.config import ModelConfig
+from icrl_dist.models import heads
 from icrl_dist.models.gpt import GPT, Cache, Decoder, copied
 from icrl_dist.types import Spec
 
@@ -24,13 +25,20 @@ class Transitions(NamedTuple):
     """T transitions of each of B contexts."""
 
     observations: Float[Tensor, "B T S"]
-    actions: Int[Tensor, "B T"]
+    actions: Int[Tensor, "B T"] | Float[Tensor, "B T A"]
     next_observations: Float[Tensor, "B T S"]
     rewards: Float[Tensor, "B T"]
 
 
+class Stretches(NamedTuple):
+    """R stretches of each of B contexts: L states in a row, and the action taken at each (zeta of eq. 6)."""
+
+    states: Float[Tensor, "B R L S"]
+    taken: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
+
+
 class PretrainedTransformer(nn.Module):
-    """T_theta(a | s_query, D) of eq. (1)."""
+    """T_theta(a | s_query, D) of eq. (1), and with ``model.stretch`` T_theta(a | s_query, D, zeta) of eq. (6)."""
 
     low: Tensor
     scale: Tensor
@@ -38,17 +46,20 @@ class PretrainedTransformer(nn.Module):
 
     def __init__(self, spec: Spec, config: ModelConfig) -> None:
         super().__init__()
-        if not spec.discrete:
-            raise ValueError("PretrainedTransformer: only discrete actions are built so far")
-        self.spec, self.config = spec, config
+        self.spec, self.config, self.reads = spec, config, heads.head(spec)
         low, high = torch.tensor(spec.low), torch.tensor(spec.high)
         for name, buffer in (("low", low), ("scale", 2 / (high - low)), ("shift", -(high + low) / (high - low))):
             self.register_buffer(name, buffer, persistent=False)
         features = spec.observation * (1 + 2 * config.fourier)
         self.embed_transition = nn.Linear(2 * features + spec.actions + 1, config.width)
         self.embed_query = nn.Linear(features, config.width)
+        if config.stretch > 1:
+            self.embed_taken = nn.Linear(features + spec.actions, config.width)
+        if config.outcomes:
+            self.embed_outcome = nn.Linear(features + spec.actions, config.width)
+            self.head_outcome = nn.Linear(config.width, 2 * (spec.observation + 1))
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
-        self.head = nn.Linear(config.width, spec.actions)
+        self.head = nn.Linear(config.width, self.reads.outputs)
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
                 # Variance 1 / fan-in, for 0.02 is GPT-2's at widths near 1000; what is added to
@@ -67,11 +78,10 @@ class PretrainedTransformer(nn.Module):
 
     def tokens(self, context: Transitions) -> Float[Tensor, "B T D"]:
         """The embedded tokens of a context, one a transition."""
-        one_hot = F.one_hot(context.actions, self.spec.actions).to(context.rewards.dtype)
         token = torch.cat(
             [
                 self.features(context.observations),
-                one_hot,
+                self.reads.features(context.actions),
                 self.features(context.next_observations),
                 context.rewards.unsqueeze(-1),
             ],
@@ -80,28 +90,56 @@ class PretrainedTransformer(nn.Module):
         embedded: Tensor = self.embed_transition(token)
         return embedded
 
+    def stretch_tokens(self, of: Stretches) -> Float[Tensor, "B R L D"]:
+        """The embedded tokens of stretches: a state, and what was done in the state before it."""
+        states = self.features(of.states)
+        before = torch.cat([states, self.reads.features(of.taken)], dim=-1)[..., :-1, :]
+        tokens: Tensor = self.embed_query(states) + F.pad(self.embed_taken(before), (0, 0, 1, 0))
+        return tokens
+
     def encode(self, context: Transitions) -> Cache:
         """Keys and values of a context."""
         return self.trunk.encode(self.tokens(context))
 
     def decide(
         self, queries: Float[Tensor, "B Q S"], cache: Cache, prefix: Int[Tensor, "B Q"] | None = None
-    ) -> Float[Tensor, "B Q A"]:
-        """Logits of T_theta at query states, each given its own prefix of the context.
+    ) -> Float[Tensor, "B Q O"]:
+        """Outputs of T_theta (``models.heads``) at query states, each given its own prefix of the context.
 
         ``prefix`` is the number of transitions that a query sees; None shows it all of them.
         """
-        seen = None
-        if prefix is not None:
-            length = cache[0][0].shape[2]
-            seen = torch.arange(length, device=queries.device) < prefix.unsqueeze(-1)
+        seen = None if prefix is None else _seen(prefix, cache)
         logits: Tensor = self.head(self.trunk.query(self.embed_query(self.features(queries)), cache, seen))
         return logits
 
+    def follow(self, of: Stretches, cache: Cache, prefix: Int[Tensor, "B R"]) -> Float[Tensor, "B R L O"]:
+        """Outputs at every state of stretches, given a prefix of the context and what was done before in the stretch."""
+        length = of.states.shape[2]
+        seen = _seen(prefix.repeat_interleave(length, dim=1), cache)
+        states = self.trunk.query(self.stretch_tokens(of).flatten(1, 2), cache, seen, length)
+        logits: Tensor = self.head(states).unflatten(1, (-1, length))
+        return logits
+
+    def outcome_loss(self, context: Transitions, cache: Cache, at: Int[Tensor, "B M"]) -> Float[Tensor, "B M"]:
+        """-log p(s', r | s, a, D) of the transitions numbered ``at``, given those before each, in nats.
+
+        In units of which the observation's range is 2.
+        """
+        s, a, following, r = (column[torch.arange(len(at), device=at.device)[:, None], at] for column in context)
+        tokens = self.embed_outcome(torch.cat([self.features(s), self.reads.features(a)], dim=-1))
+        outputs = self.head_outcome(self.trunk.query(tokens, cache, _seen(at, cache)))
+        values = torch.cat([(following - s) * self.scale, r.unsqueeze(-1)], dim=-1)
+        return -heads.log_normal(outputs, values)
+
     def forward(
         self, context: Transitions, queries: Float[Tensor, "B Q S"], prefix: Int[Tensor, "B Q"]
-    ) -> Float[Tensor, "B Q A"]:
+    ) -> Float[Tensor, "B Q O"]:
         return self.decide(queries, self.encode(context), prefix)
+
+
+def _seen(prefix: Int[Tensor, "B Q"], cache: Cache) -> Bool[Tensor, "B Q T"]:
+    """Which context tokens each query sees: those of its prefix."""
+    return torch.arange(cache[0][0].shape[2], device=prefix.device) < prefix.unsqueeze(-1)
 
 
 class Deployed:
@@ -129,7 +167,18 @@ class Deployed:
         self._decoder.append(self._model.tokens(transitions))
 
     @torch.inference_mode()
-    def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B A"]:
+    def follow(self, of: Stretches, arrived: Transitions | None = None) -> Float[Tensor, "B L O"]:
+        """Logits at every state of one stretch a context, given the whole context; one transition may arrive before."""
+        joined = None if arrived is None else self._model.tokens(arrived)[:, 0]
+        final = self._decoder.stretch(self._model.stretch_tokens(of)[:, 0], joined)
+        return F.linear(final, *self._head)
+
+    def settle(self) -> None:
+        """At a time without hurry: put the transitions that arrived one by one with the others."""
+        self._decoder.settle()
+
+    @torch.inference_mode()
+    def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B O"]:
         """Logits of T_theta at a query state of each context, given the whole of it."""
         return F.linear(self._decoder.query(F.linear(self._model.features(states), *self._embed)), *self._head)
 

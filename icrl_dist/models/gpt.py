@@ -1,8 +1,9 @@
 """A causal GPT-2 trunk in two forms: ``GPT`` to train, ``Decoder`` to deploy.
 
 Context tokens come first and see only earlier context tokens; query tokens come after, and
-each sees its own prefix of the context and itself.  So one encoding of a context serves
-many queries in training, and a decision costs one token in deployment.
+each sees its own prefix of the context, those before it in its stretch, and itself.  So one
+encoding of a context serves many queries in training, and a decision costs one token in
+deployment, or as many as its stretch is long.
 """
 
 from __future__ import annotations
@@ -76,11 +77,12 @@ class GPT(nn.Module):
         return cache
 
     def query(
-        self, x: Float[Tensor, "B Q D"], cache: Cache, seen: Bool[Tensor, "B #Q T"] | None = None
+        self, x: Float[Tensor, "B Q D"], cache: Cache, seen: Bool[Tensor, "B #Q T"] | None = None, stretch: int = 1
     ) -> Float[Tensor, "B Q D"]:
         """Final states of query tokens x, each seeing the context tokens ``seen`` and itself.
 
-        ``seen=None`` shows every query the whole context.
+        ``seen=None`` shows every query the whole context.  Every ``stretch`` tokens in a row are a
+        stretch: each of them also sees those of it that come before.
         """
         for block, (keys, values) in zip(self.blocks, cache, strict=True):
             assert isinstance(block, Block)
@@ -89,11 +91,28 @@ class GPT(nn.Module):
             to_context = (q @ keys.transpose(2, 3)) * scale
             if seen is not None:
                 to_context = to_context.masked_fill(~seen[:, None], float("-inf"))
-            to_self = (q * k).sum(-1, keepdim=True) * scale
-            weight = torch.cat([to_context, to_self], dim=-1).softmax(dim=-1)
-            x = block.finish(x, weight[..., :-1] @ values + weight[..., -1:] * v)
+            weight = torch.cat([to_context, _own(q, k, stretch) * scale], dim=-1).softmax(dim=-1)
+            to_context, to_own = weight[..., :-stretch], weight[..., -stretch:]
+            own = to_own * v if stretch == 1 else (_stretches(to_own, stretch) @ _stretches(v, stretch)).flatten(2, 3)
+            x = block.finish(x, to_context @ values + own)
         result: Tensor = self.norm(x)
         return result
+
+
+def _stretches(x: Float[Tensor, "B N Q d"], stretch: int) -> Float[Tensor, "B N R L d"]:
+    return x.reshape(*x.shape[:2], -1, stretch, x.shape[3])
+
+
+def _own(q: Float[Tensor, "B N Q d"], k: Float[Tensor, "B N Q d"], stretch: int) -> Float[Tensor, "B N Q L"]:
+    """How each query scores the tokens of its own stretch: -inf for those after it."""
+    if stretch == 1:
+        return (q * k).sum(-1, keepdim=True)
+    scores = _stretches(q, stretch) @ _stretches(k, stretch).transpose(3, 4)
+    return scores.masked_fill(~_causal(stretch, q.device), float("-inf")).flatten(2, 3)
+
+
+def _causal(length: int, device: torch.device) -> Bool[Tensor, "L L"]:
+    return torch.ones(length, length, dtype=torch.bool, device=device).tril()
 
 
 Linear = tuple[Tensor, Tensor]
@@ -159,10 +178,12 @@ class Decoder:
     @property
     def length(self) -> int:
         """Tokens in each context."""
-        return self._tokens[0].shape[1] - 1
+        return self._tokens[0].shape[1] - 1 + self._recent
 
     def clear(self) -> None:
         """Forget every context."""
+        self._recent = 0
+        self._fresh = [self._norm[0].new_empty(self._batch, 0, len(self._norm[0])) for _ in self._layers]
         # The last place is a query's.  None is spare: where a gap parts one context from the next
         # the processor does not read ahead, and large batches are decided much more slowly.
         self._keep([self._norm[0].new_empty(self._batch, 1, len(self._norm[0])) for _ in self._layers])
@@ -176,6 +197,7 @@ class Decoder:
 
     def append(self, x: Float[Tensor, "B T D"]) -> None:
         """Append embedded tokens to the contexts; each sees its whole context up to itself."""
+        self.settle()
         past, (batch, new, width) = self.length, x.shape
         longer = [kept.new_empty(batch, past + new + 1, width) for kept in self._tokens]
         for kept, now in zip(self._tokens, longer, strict=True):
@@ -197,6 +219,44 @@ class Decoder:
             tokens = kept[:, None, :-1].expand(-1, layer.heads, -1, -1)
             mixed = F.scaled_dot_product_attention(q, tokens, tokens, attn_mask=seen, is_causal=past == 0, scale=1.0)
             x = layer.finish(x, mixed.transpose(1, 2).flatten(2))
+
+    def stretch(self, x: Float[Tensor, "B L D"], arrived: Float[Tensor, "B D"] | None = None) -> Float[Tensor, "B L D"]:
+        """Final states of one stretch a context: tokens that see their context, those before them, and themselves.
+
+        A token that has ``arrived`` joins the context first.
+        """
+        batch, length, width = x.shape
+        new = int(arrived is not None)
+        if arrived is not None:
+            self._make_room()
+            x = torch.cat([arrived[:, None], x], dim=1)
+        hidden = torch.cat([torch.ones(new, length, dtype=torch.bool, device=x.device), ~_causal(length, x.device)])
+        self._recent += new
+        for layer, tokens, fresh in zip(self._layers, self._tokens, self._fresh, strict=True):
+            normed = _normed(x, layer.norm_attention)
+            if new:
+                fresh[:, self._recent - 1] = normed[:, 0]
+            seen = (tokens[:, :-1], fresh[:, : self._recent], normed[:, new:])
+            q = F.linear(normed, *layer.ask).view(batch, -1, width)
+            scores = [torch.bmm(q, part.transpose(1, 2)) for part in seen]
+            scores[2].masked_fill_(hidden.repeat_interleave(layer.heads, dim=0), float("-inf"))
+            weights = torch.split(torch.cat(scores, dim=-1).softmax(-1), [part.shape[1] for part in seen], dim=-1)
+            mixed = sum(torch.bmm(weight, part) for weight, part in zip(weights, seen, strict=True))
+            x = layer.finish(x, cast(Tensor, mixed).view(batch, new + length, -1))
+        return _normed(x[:, new:], self._norm)
+
+    def _make_room(self) -> None:
+        """For one more token that arrives by itself: they stand apart, with room to spare, until they are settled."""
+        if self._recent == self._fresh[0].shape[1]:
+            self._fresh = [torch.cat([f, f.new_empty(f.shape[0], 32 + f.shape[1], f.shape[2])], dim=1) for f in self._fresh]
+
+    def settle(self) -> None:
+        """Put the tokens that arrived one by one with the others, where they are read faster."""
+        if self._recent:
+            pieces = zip(self._tokens, self._fresh, strict=True)
+            settled = [torch.cat([t[:, :-1], f[:, : self._recent], t[:, -1:]], dim=1) for t, f in pieces]
+            self._recent = 0
+            self._keep(settled)
 
     def query(self, x: Float[Tensor, "B D"]) -> Float[Tensor, "B D"]:
         """Final states of one query token a context, which sees its context and itself."""

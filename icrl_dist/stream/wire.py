@@ -274,6 +274,8 @@ def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
     for name, rows in wanted.items():
         if len(arrays[name]) != rows:
             raise WireError("shape", f"{name} has {len(arrays[name])} rows, expected {rows}")
+    if len(arrays["taken"]) > len(arrays["queries"]):
+        raise WireError("shape", f"{len(arrays['taken'])} actions were taken at {len(arrays['queries'])} queries")
     if arrays["queries"].shape[1] != arrays["observations"].shape[1]:
         shapes = arrays["queries"].shape, arrays["observations"].shape
         raise WireError("shape", f"queries and observations have shapes {shapes}: different observation components")

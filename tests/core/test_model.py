@@ -16,6 +16,7 @@ from icrl_dist.context import Batch, Examples, Pool
 from icrl_dist.models import gpt
 from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, load_weights, weights_of
 from icrl_dist.models.gpt import GPT
+from icrl_dist.models.heads import Categorical
 from icrl_dist.types import Spec
 
 SPEC = Spec(low=(0.0, 0.0), high=(4.0, 4.0), actions=5, horizon=8)
@@ -246,8 +247,9 @@ def test_loss_is_equation_1() -> None:
             partition = sum(math.exp(v) for v in logits[row, query])
             for action in range(5):
                 total -= labels[row, query, action] * math.log(math.exp(logits[row, query, action]) / partition)
-    assert pretrain.loss(torch.tensor(logits), torch.tensor(labels)).item() == pytest.approx(total / 12)
-    assert pretrain.loss(torch.zeros(2, 5), torch.eye(5)[:2]).item() == pytest.approx(math.log(5))
+    head = Categorical(5)
+    assert head.loss(torch.tensor(logits), torch.tensor(labels)).item() == pytest.approx(total / 12)
+    assert head.loss(torch.zeros(2, 5), torch.eye(5)[:2]).item() == pytest.approx(math.log(5))
 
 
 def two_cells(goal: int, rng: np.random.Generator) -> Examples:
@@ -376,8 +378,3 @@ def test_other_weights_are_refused_by_name(wrong: str) -> None:
         arrays["head.height"] = np.zeros(3, np.float32)
     with pytest.raises(RuntimeError, match=r"head\.height" if wrong == "unknown" else r"head\.weight"):
         load_weights(model, arrays)
-
-
-def test_continuous_actions_are_refused() -> None:
-    with pytest.raises(ValueError, match="discrete"):
-        PretrainedTransformer(Spec((0.0,), (1.0,), 2, 8, discrete=False), ModelConfig())

@@ -96,6 +96,7 @@ def episode(variation: Variation, seed: int) -> Trajectory:
         adversary=np.array(override, np.int16),
         queries=np.zeros((0, 2), np.float32),
         labels=np.zeros((0, 5), np.float32),
+        taken=np.zeros(0, np.int16),
         origin="none",
     )
 

@@ -39,6 +39,7 @@ def trajectory(steps: int = 5, queries: int = 3, variation: Variation = VARIATIO
         adversary=np.full(steps, -1, np.int16),
         queries=rng.normal(size=(queries, 2)).astype(np.float32),
         labels=rng.random((queries, 5)).astype(np.float32),
+        taken=rng.integers(0, 5, queries // 2).astype(np.int16),
         origin="optimal",
     )
 
