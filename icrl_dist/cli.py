@@ -76,9 +76,9 @@ class Evaluate:
     joins the context at once, and a guess once acted on is kept.  Committed if not given, for an
     agent that was trained on stretches (model.stretch); the posterior suite is about ``paper``."""
     episodes: int | None = None
-    """Online episodes; the run's own number if not given."""
+    """Online episodes; the run's own number if not given (posterior: 40)."""
     seeds: int | None = None
-    """Evaluations of every task; the run's own number if not given."""
+    """Evaluations of every task; the run's own number if not given (posterior: 2)."""
     p: tuple[float, ...] = ()
     """Override probabilities to test; the run's own if none are given (posterior: 0 0.2 0.4 0.6)."""
     prior: Literal["uniform", "unseen"] | None = None

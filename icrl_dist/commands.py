@@ -90,7 +90,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     given = {name: getattr(arguments, name) for name in ("episodes", "seeds", "p", "prior")}
     chosen = {name: value for name, value in given.items() if value not in (None, ())}
     if arguments.suite == "posterior":
-        chosen = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform"} | chosen
+        chosen = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 2} | chosen
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
     validate(run, "evaluate")
     deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or default_deployment(run.model)

@@ -74,6 +74,9 @@ class PretrainConfig:
     stretches: int = 0
     """Stretches of ``model.stretch`` states an episode, in which the optimal policy acts from a
     random state on."""
+    misled: float = 0.3
+    """Share of the stretches in which another training task's optimal policy acts, while labels are
+    this task's: from them T_theta learns to let go of a guess that was wrong."""
     steps: int = 20000
     """Optimiser steps."""
 
@@ -141,11 +144,6 @@ class ModelConfig:
     stretch: int = 1
     """States of a stretch: T_theta also reads what was done in the stretch so far (zeta of eq. 6), so
     that a guess once acted on is kept.  1: none, as in the paper's experiments."""
-    outcomes: int = 0
-    """Transitions a training context whose outcome (s', r) T_theta also predicts from those before:
-    what ``InContextAgent.surprise`` is made of.  0: none, as in the paper."""
-    outcome_weight: float = 0.1
-    """Weight of that prediction's loss beside eq. (1)."""
     dropout: float = 0.0
     """Dropout on attention and feed-forward outputs."""
 

@@ -16,10 +16,11 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Stretches(NamedTuple):
-    """R stretches of L states, the optimal actions taken in them, and the labels (zeta of eq. 6); or of each of B contexts."""
+    """R stretches of L states, what was done and gained in them (zeta of eq. 6), and the labels; or of each of B contexts."""
 
     states: Float32[np.ndarray, "*B R L S"]
     taken: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
+    gained: Float32[np.ndarray, "*B R L"]
     labels: Float32[np.ndarray, "*B R L A"]
 
     @classmethod
@@ -28,11 +29,12 @@ class Stretches(NamedTuple):
         length: int,
         states: Float32[np.ndarray, "N S"],
         taken: Integer[np.ndarray, " N"],
+        gained: Float32[np.ndarray, " N"],
         labels: Float32[np.ndarray, "N A"],
     ) -> Stretches:
         """What happened in a row as stretches of this length; what is left at the end is not used."""
         whole = len(taken) // length * length
-        columns = states.astype(np.float32), taken.astype(np.int64), labels.astype(np.float32)
+        columns = states, taken.astype(np.int64), gained, labels
         return cls(*(c[:whole].reshape(-1, length, *c.shape[1:]) for c in columns))
 
 
@@ -153,8 +155,6 @@ class Batch:
     prefix: Int64[np.ndarray, "B N"]
     stretches: Stretches | None = None
     stretch_prefix: Int64[np.ndarray, "B R"] | None = None
-    outcomes: Int64[np.ndarray, "B M"] | None = None
-    """Numbers of the transitions whose outcome is to be predicted."""
 
 
 def draw(
@@ -164,7 +164,6 @@ def draw(
     queries: int,
     transitions: int = 0,
     stretches: int = 0,
-    outcomes: int = 0,
 ) -> Batch:
     """A training batch: random variations, random contexts of them, random prefixes, queries and stretches.
 
@@ -195,8 +194,6 @@ def draw(
         drawn = [_stretches(rng, examples, length, stretches) for examples, length in zip(chosen, lengths, strict=True)]
         columns = (np.stack(column) for column in zip(*(of for of, _ in drawn), strict=True))
         made = replace(made, stretches=Stretches(*columns), stretch_prefix=np.stack([prefix for _, prefix in drawn]))
-    if outcomes:
-        made = replace(made, outcomes=np.stack([rng.integers(0, length, size=outcomes) for length in lengths]))
     return made
 
 

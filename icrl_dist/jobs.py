@@ -84,12 +84,16 @@ class _Known(NamedTuple):
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
     taken: Int16[np.ndarray, " R"]
+    gained: Float32[np.ndarray, " R"]
     origin: str
 
 
 def _nothing(spec: Spec) -> _Known:
-    zeros = np.zeros((0, spec.observation), np.float32), np.zeros((0, spec.actions), np.float32), np.zeros(0, np.int16)
-    return _Known(*zeros, "none")
+    zeros = np.zeros((0, spec.observation), np.float32), np.zeros((0, spec.actions), np.float32)
+    return _Known(*zeros, *_NO_STRETCH, "none")
+
+
+_NO_STRETCH = np.zeros(0, np.int16), np.zeros(0, np.float32)
 
 
 class _Labeller:
@@ -107,18 +111,35 @@ class _Labeller:
             self._table = heuristic_labels(self._hypotheses)
         else:
             self._table = soft_labels(self._hypotheses, _number(job, "gamma"), _number(job, "slack"))
+        if self._stretches:
+            self._guesses = self._undisturbed(job)
+
+    def _undisturbed(self, job: Job) -> Float32[np.ndarray, "M C A"]:
+        """The optimal policies of the undisturbed tasks that may be guessed."""
+        cells = job.setting("guesses")
+        assert isinstance(cells, tuple)
+        tasks = [job.variations[0].task.replace(goal=divmod(int(cell), self.size)) for cell in cells]
+        hypotheses = Hypotheses.of([Variation(task) for task in tasks])
+        return soft_labels(hypotheses, _number(job, "gamma"), _number(job, "slack"))
 
     def __call__(self, identities: Sequence[Identity], rngs: Sequence[np.random.Generator]) -> list[_Known]:
         place = np.array([self._place[identity.task, identity.variation] for identity in identities])
         alone = [self._alone(p, rng) for p, rng in zip(place.tolist(), rngs, strict=True)]
         if not self._stretches:
             return alone
-        states, taken = self._follow(place, rngs)
+        states, taken, gained = self._follow(place, rngs)
         labels = self._table[place[:, None], cell_numbers(states, self.size)]
         if self._mode == "sampled":
-            labels = np.eye(labels.shape[2], dtype=np.float32)[taken]
+            chance = np.stack([rng.random(labels.shape[1]) for rng in rngs])
+            labels = np.eye(labels.shape[2], dtype=np.float32)[[sample(*row) for row in zip(labels, chance, strict=True)]]
         return [
-            _Known(np.concatenate([one.queries, states[b]]), np.concatenate([one.labels, labels[b]]), taken[b], one.origin)
+            _Known(
+                np.concatenate([one.queries, states[b]]),
+                np.concatenate([one.labels, labels[b]]),
+                taken[b],
+                gained[b],
+                one.origin,
+            )
             for b, one in enumerate(alone)
         ]
 
@@ -128,19 +149,26 @@ class _Labeller:
         if self._mode == "sampled":
             labels = np.eye(labels.shape[1], dtype=np.float32)[sample(labels, rng.random(len(query)))]
         origin = "heuristic" if self._mode == "heuristic" else "optimal"
-        return _Known(self._states[query], labels, np.zeros(0, np.int16), origin)
+        return _Known(self._states[query], labels, *_NO_STRETCH, origin)
 
     def _follow(
         self, place: Int[np.ndarray, " B"], rngs: Sequence[np.random.Generator]
-    ) -> tuple[Float32[np.ndarray, "B R S"], Int16[np.ndarray, "B R"]]:
-        """States and actions of the labelling policy from random states on, each row's stretches one after another."""
-        rows = place.repeat(self._stretches)
+    ) -> tuple[Float32[np.ndarray, "B R S"], Int16[np.ndarray, "B R"], Float32[np.ndarray, "B R"]]:
+        """States, actions and rewards of each row's stretches, one after another, from random states on.
+
+        The labelling policy acts, or that of a wrong guess.
+        """
+        misled, stretches, guesses = _number(self._job, "misled"), self._stretches, len(self._guesses)
+        drawn = [(rng.random(stretches), rng.integers(0, guesses, size=stretches)) for rng in rngs]
+        wrong, guess = (np.concatenate(column) for column in zip(*drawn, strict=True))
+        rows = place.repeat(stretches)
+        policy = np.where((wrong < misled)[:, None, None], self._guesses[guess], self._table[rows])
         short = [self._job.variations[p] for p in rows.tolist()]
         short = [Variation(v.task.replace(start="random", horizon=self._length), v.adversary) for v in short]
-        chance = [rng for rng in rngs for _ in range(self._stretches)]
-        ran = episode(envs.batch(short), OptimalAgent(self._table[rows], self.size), chance)
-        states = ran.observations[:, :-1].reshape(len(place), self._stretches * self._length, -1)
-        return states, ran.actions.reshape(len(place), -1)
+        chance = [rng for rng in rngs for _ in range(stretches)]
+        ran = episode(envs.batch(short), OptimalAgent(policy, self.size), chance)
+        states = ran.observations[:, :-1].reshape(len(place), stretches * self._length, -1)
+        return states, ran.actions.reshape(len(place), -1), ran.rewards.reshape(len(place), -1)
 
 
 def _number(job: Job, name: str) -> float:

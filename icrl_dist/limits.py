@@ -36,6 +36,7 @@ def validate(run: Run, source: str) -> None:
     need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
     need(len(run.pretrain.behaviours) > 0, "pretrain.behaviours", run.pretrain.behaviours, "name at least one")
     need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
+    need(0 <= run.pretrain.misled <= 1, "pretrain.misled", run.pretrain.misled, "a share lies in [0, 1]")
     need(0 <= practice.new_fraction <= 1, "practice.new_fraction", practice.new_fraction, "a share lies in [0, 1]")
     need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
     need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
@@ -80,8 +81,6 @@ def validate(run: Run, source: str) -> None:
         "darkroom.split_seed": room.split_seed,
         "darkroom.label_slack": room.label_slack,
         "model.fourier": run.model.fourier,
-        "model.outcomes": run.model.outcomes,
-        "model.outcome_weight": run.model.outcome_weight,
         "practice.rounds": practice.rounds,
         "optim.transitions": optim.transitions,
         "optim.muon": optim.muon,

@@ -25,13 +25,11 @@ def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
     cache = model.encode(context)
     total = model.reads.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
     if batch.stretches is not None:
-        states, taken, labels = batch.stretches
-        followed = model.follow(Stretches(put(states), put(taken)), cache, put(batch.stretch_prefix))
+        states, taken, gained, labels = batch.stretches
+        followed = model.follow(Stretches(put(states), put(taken), put(gained)), cache, put(batch.stretch_prefix))
         count = states.shape[1] * states.shape[2]
         share = count / (count + batch.prefix.shape[1])
         total = (1 - share) * total + share * model.reads.loss(followed, put(labels))
-    if batch.outcomes is not None:
-        total = total + model.config.outcome_weight * model.outcome_loss(context, cache, put(batch.outcomes)).mean()
     return total
 
 

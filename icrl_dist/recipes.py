@@ -79,7 +79,10 @@ def _then_practice(run: Run) -> tuple[Phase, ...]:
 def _labelling(run: Run) -> Params:
     """What a collector must know to label queries."""
     room = run.darkroom
+    goals = (task.vector("goal") for task in tasks.split(run).train)
+    misled: Params = (("guesses", tuple(int(x) * room.size + int(y) for x, y in goals)), ("misled", run.pretrain.misled))
     return (
+        *(misled if run.pretrain.stretches else ()),
         ("gamma", room.gamma),
         ("labels", room.labels),
         ("queries", run.pretrain.queries),
@@ -116,11 +119,12 @@ def _jobs(
 def _practice(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
     """T^j makes a history in every training variation, started as at test; its queries are labelled as D_pre's.
 
-    By every rule that it may be deployed by, job by job, for each makes histories of its own kind.
+    By every rule that it may be deployed by, job by job, for each makes histories of its own
+    kind; two of three by Algorithm 1, whose histories D_pre is least like.
     """
     chosen = [variations(i, tasks.deployed(task)) for i, task in enumerate(tasks.split(run).train)]
     jobs = _jobs(run, phase, "adapt", chosen, run.practice.trials, _labelling(run))
-    rules: tuple[Deployment, ...] = ("committed", "paper") if run.model.stretch > 1 else ("paper",)
+    rules: tuple[Deployment, ...] = ("paper", "committed", "paper") if run.model.stretch > 1 else ("paper",)
     return tuple(
         dataclasses.replace(job, settings=(*job.settings, *_deployment(run, rules[(phase.round + number) % len(rules)])))
         for number, job in enumerate(jobs)
@@ -135,8 +139,9 @@ def _deployment(run: Run, rule: Deployment) -> Params:
 def _labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
     """A variation's episodes with the queries and stretches that were labelled when they were collected."""
     alone = np.concatenate([np.arange(len(t.queries)) < len(t.queries) - len(t.taken) for t in trials])
-    queries, labels, taken = (np.concatenate([getattr(t, name) for t in trials]) for name in ("queries", "labels", "taken"))
-    stretches = Stretches.cut(run.model.stretch, queries[~alone], taken, labels[~alone])
+    names = ("queries", "labels", "taken", "gained")
+    queries, labels, taken, gained = (np.concatenate([getattr(t, name) for t in trials]) for name in names)
+    stretches = Stretches.cut(run.model.stretch, queries[~alone], taken, gained, labels[~alone])
     return Examples.of(trials, queries[alone], labels[alone], trials[0].identity.stage == "adapt", stretches)
 
 
@@ -236,7 +241,8 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
     labels = np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
     length, horizon = run.model.stretch, len(later[0].actions)
     whole = np.arange(len(later) * horizon).reshape(-1, horizon)[:, : horizon // length * length].ravel()
-    stretches = Stretches.cut(length, queries[whole], actions[whole], labels[whole])
+    gained = np.concatenate([t.rewards for t in later])
+    stretches = Stretches.cut(length, queries[whole], actions[whole], gained[whole], labels[whole])
     return Examples.of(contexts, queries, labels, run.icaa.context == "history", stretches)
 
 

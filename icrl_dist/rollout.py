@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -87,7 +86,11 @@ class InContextPolicy:
     ) -> None:
         self._pending.append((observation, action, next_observation, reward))
         if done:
-            self._add(self._episode())
+            self._end(self._episode())
+
+    def _end(self, episode: Transitions) -> None:
+        """Take up an episode of one's own."""
+        self._add(episode)
 
     def _episode(self) -> Transitions:
         """The episode that has just ended."""
@@ -128,80 +131,37 @@ class InContextPolicy:
 class CommittedPolicy(InContextPolicy):
     """T_theta(. | s, D_on, zeta): every transition joins the context at once, and a guess once acted on is kept.
 
-    zeta are the last states and actions of the episode, as if the optimal policy had taken
-    them (eq. 6): what T_theta has begun to do it goes on with, unless the context has come to
-    speak against it.  Then the guess is refuted and zeta is empty again.  It is refuted when
-    T_theta, knowing what it knows now, would hardly have done what it did: when that has become
-    ``REFUTED`` times as likely as it was.
+    zeta is what the agent did last in this episode, as if the optimal policy had done it (eq. 6):
+    what T_theta has begun to do it goes on with.  It lets go of a guess by itself when the guess
+    proves wrong, because it also trained on stretches that wrong guesses led (``pretrain.misled``).
     """
-
-    REFUTED = 0.5
 
     def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig) -> None:
         super().__init__(model, batch, context)
-        spec, length = model.spec, model.config.stretch
-        self._rows = np.arange(batch)
-        self._states = np.zeros((batch, length, spec.observation), np.float32)
-        shape, dtype = ((), np.int64) if spec.discrete else ((spec.actions,), np.float32)
-        self._taken = np.zeros((batch, length, *shape), dtype)
-        self._said = np.zeros((batch, length))
-        self._kept = np.zeros(batch, np.int64)
-        self._arrived: Transitions | None = None
+        self._read = 0  # of self._pending, what is in the context already
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
-        outputs, taken = self._follow(observation, self._kept)
-        decided = outputs[self._rows, self._kept]
-        now = self.model.reads.log_likelihood(outputs, taken).double().cpu().numpy()
-        past = np.arange(now.shape[1]) < self._kept[:, None]
-        change = np.where(past, now - self._said[:, : now.shape[1]], 0.0).sum(axis=1)
-        refuted = change < math.log(self.REFUTED)
-        if refuted.any():
-            self._kept[refuted] = 0
-            anew, _ = self._follow(observation, np.zeros_like(self._kept))
-            decided[torch.from_numpy(refuted)] = anew[:, 0][torch.from_numpy(refuted)]
-        self._decided = decided
-        return decided
+        for step in self._pending[self._read : -1]:  # it was not asked for an action since
+            self._deployed.append(self._one(step))
+        arrived = self._one(self._pending[-1]) if self._read < len(self._pending) else None
+        self._read = len(self._pending)
+        past = self._pending[1 - self.model.config.stretch :]
+        nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
+        columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
+        states, taken, _, gained = (np.stack(column, axis=1)[:, None] for column in columns)
+        return self._deployed.follow(Stretches(*self._tensors(states, taken, gained)), arrived)
 
-    def _follow(
-        self, observation: Float32[np.ndarray, "B S"], kept: Int64[np.ndarray, " B"]
-    ) -> tuple[Float[torch.Tensor, "B L O"], torch.Tensor]:
-        """Outputs at the first ``kept`` states of zeta and at this observation after them; and the actions of zeta."""
-        length = int(kept.max()) + 1
-        states = self._states[:, :length].copy()
-        states[self._rows, kept] = observation
-        of = Stretches(*(column[:, None] for column in self._tensors(states, self._taken[:, :length])))
-        arrived, self._arrived = self._arrived, None
-        return self._deployed.follow(of, arrived), of.taken[:, 0]
+    def _one(self, step: tuple[np.ndarray, ...]) -> Transitions:
+        return Transitions(*self._tensors(*(column[:, None] for column in step)))
 
-    def observe(
-        self,
-        observation: Float32[np.ndarray, "B S"],
-        action: Actions,
-        reward: Float32[np.ndarray, " B"],
-        next_observation: Float32[np.ndarray, "B S"],
-        done: bool,
-    ) -> None:
-        self._pending.append((observation, action, next_observation, reward))
-        self._arrived = Transitions(*(column[:, None] for column in self._tensors(*self._pending[-1])))
-        self._keep(observation, action)
-        if done:
-            episode = self._episode()
-            self._kept[:] = 0
-            if not self._remember(episode):
-                self._follow(observation, self._kept)  # the last transition arrives
-            self._arrived = None
-            self._deployed.settle()
+    def _no_action(self, rows: int) -> Actions:
+        spec = self.model.spec
+        return np.zeros(rows, np.int64) if spec.discrete else np.zeros((rows, spec.actions), np.float32)
 
-    def _keep(self, observation: Float32[np.ndarray, "B S"], action: Actions) -> None:
-        """Add a step to zeta, which lets go of its first where it is full."""
-        chosen, at = torch.from_numpy(np.array(action)).to(self._decided.device), (self._rows, self._kept)
-        self._states[at], self._taken[at] = observation, action
-        self._said[at] = self.model.reads.log_likelihood(self._decided, chosen).double().cpu().numpy()
-        self._kept += 1
-        full = self._kept == self._states.shape[1]
-        for column in (self._states, self._taken, self._said):
-            column[full] = np.roll(column[full], -1, axis=1)
-        self._kept[full] -= 1
+    def _end(self, episode: Transitions) -> None:
+        read, self._read = self._read, 0
+        if not self._remember(episode):
+            self._deployed.append(Transitions(*(column[:, read:] for column in episode)))
 
 
 def in_context(

@@ -126,6 +126,7 @@ def decode(payload: bytes, names: Names) -> Trajectory:
         "queries": (queries, components),
         "labels": (queries, actions),
         "taken": (taken,),
+        "gained": (taken,),
     }
     arrays, at = {}, reader.tell()
     if len(payload) - at != sum(prod(shape) * _DTYPES[name].itemsize for name, shape in shapes.items()):

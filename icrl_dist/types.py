@@ -195,8 +195,10 @@ class Trajectory:
     labels: Float32[np.ndarray, "Q A"]
     """A distribution over actions at each query state."""
     taken: Int16[np.ndarray, " R"]
-    """The actions a* taken at the last R query states, which lie in stretches (zeta of eq. 6), one
+    """The actions taken at the last R query states, which lie in stretches (zeta of eq. 6), one
     after another; the first Q - R states stand alone."""
+    gained: Float32[np.ndarray, " R"]
+    """The reward that each of them brought."""
     origin: str
     """Where the labels came from: ``optimal``, ``heuristic`` or ``none``."""
 
@@ -217,6 +219,7 @@ ARRAYS: dict[str, tuple[str, int]] = {
     "queries": ("<f4", 2),
     "labels": ("<f4", 2),
     "taken": ("<i2", 1),
+    "gained": ("<f4", 1),
 }
 """A trajectory's arrays: their dtype and number of dimensions."""
 

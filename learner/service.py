@@ -238,9 +238,7 @@ class Service:
             key = (_FIT_DRAWS, phase.produces, step)
             rng = np.random.default_rng(np.random.SeedSequence(self._run.seed, spawn_key=key))
             torch.manual_seed(int(rng.integers(2**31)))
-            return context.draw(
-                rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches, self._run.model.outcomes
-            )
+            return context.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
 
         def progress(step: int, loss: float) -> None:
             self._partial = step  # damage may end this fit: it is taken up from here

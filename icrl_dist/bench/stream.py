@@ -47,6 +47,7 @@ def example(trial: int = 0) -> Trajectory:
         queries=rng.normal(size=(queries, observation)).astype(np.float32),
         labels=rng.random((queries, actions), np.float32),
         taken=np.zeros(0, np.int16),
+        gained=np.zeros(0, np.float32),
         origin="heuristic",
     )
 

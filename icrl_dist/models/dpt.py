@@ -31,10 +31,11 @@ class Transitions(NamedTuple):
 
 
 class Stretches(NamedTuple):
-    """R stretches of each of B contexts: L states in a row, and the action taken at each (zeta of eq. 6)."""
+    """R stretches of each of B contexts: L states in a row, the action taken at each, and its reward (zeta of eq. 6)."""
 
     states: Float[Tensor, "B R L S"]
     taken: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
+    gained: Float[Tensor, "B R L"]
 
 
 class PretrainedTransformer(nn.Module):
@@ -54,10 +55,7 @@ class PretrainedTransformer(nn.Module):
         self.embed_transition = nn.Linear(2 * features + spec.actions + 1, config.width)
         self.embed_query = nn.Linear(features, config.width)
         if config.stretch > 1:
-            self.embed_taken = nn.Linear(features + spec.actions, config.width)
-        if config.outcomes:
-            self.embed_outcome = nn.Linear(features + spec.actions, config.width)
-            self.head_outcome = nn.Linear(config.width, 2 * (spec.observation + 1))
+            self.embed_taken = nn.Linear(features + spec.actions + 1, config.width)
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
         self.head = nn.Linear(config.width, self.reads.outputs)
         for name, module in self.named_modules():
@@ -91,9 +89,9 @@ class PretrainedTransformer(nn.Module):
         return embedded
 
     def stretch_tokens(self, of: Stretches) -> Float[Tensor, "B R L D"]:
-        """The embedded tokens of stretches: a state, and what was done in the state before it."""
+        """The embedded tokens of stretches: a state, and what was done in the state before it and gained by it."""
         states = self.features(of.states)
-        before = torch.cat([states, self.reads.features(of.taken)], dim=-1)[..., :-1, :]
+        before = torch.cat([states, self.reads.features(of.taken), of.gained.unsqueeze(-1)], dim=-1)[..., :-1, :]
         tokens: Tensor = self.embed_query(states) + F.pad(self.embed_taken(before), (0, 0, 1, 0))
         return tokens
 
@@ -119,17 +117,6 @@ class PretrainedTransformer(nn.Module):
         states = self.trunk.query(self.stretch_tokens(of).flatten(1, 2), cache, seen, length)
         logits: Tensor = self.head(states).unflatten(1, (-1, length))
         return logits
-
-    def outcome_loss(self, context: Transitions, cache: Cache, at: Int[Tensor, "B M"]) -> Float[Tensor, "B M"]:
-        """-log p(s', r | s, a, D) of the transitions numbered ``at``, given those before each, in nats.
-
-        In units of which the observation's range is 2.
-        """
-        s, a, following, r = (column[torch.arange(len(at), device=at.device)[:, None], at] for column in context)
-        tokens = self.embed_outcome(torch.cat([self.features(s), self.reads.features(a)], dim=-1))
-        outputs = self.head_outcome(self.trunk.query(tokens, cache, _seen(at, cache)))
-        values = torch.cat([(following - s) * self.scale, r.unsqueeze(-1)], dim=-1)
-        return -heads.log_normal(outputs, values)
 
     def forward(
         self, context: Transitions, queries: Float[Tensor, "B Q S"], prefix: Int[Tensor, "B Q"]
@@ -167,15 +154,11 @@ class Deployed:
         self._decoder.append(self._model.tokens(transitions))
 
     @torch.inference_mode()
-    def follow(self, of: Stretches, arrived: Transitions | None = None) -> Float[Tensor, "B L O"]:
-        """Logits at every state of one stretch a context, given the whole context; one transition may arrive before."""
+    def follow(self, of: Stretches, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
+        """Outputs at the last state of one stretch a context, given the whole context; one transition may arrive before."""
         joined = None if arrived is None else self._model.tokens(arrived)[:, 0]
         final = self._decoder.stretch(self._model.stretch_tokens(of)[:, 0], joined)
         return F.linear(final, *self._head)
-
-    def settle(self) -> None:
-        """At a time without hurry: put the transitions that arrived one by one with the others."""
-        self._decoder.settle()
 
     @torch.inference_mode()
     def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B O"]:

@@ -197,7 +197,7 @@ class Decoder:
 
     def append(self, x: Float[Tensor, "B T D"]) -> None:
         """Append embedded tokens to the contexts; each sees its whole context up to itself."""
-        self.settle()
+        self._settle()
         past, (batch, new, width) = self.length, x.shape
         longer = [kept.new_empty(batch, past + new + 1, width) for kept in self._tokens]
         for kept, now in zip(self._tokens, longer, strict=True):
@@ -220,8 +220,8 @@ class Decoder:
             mixed = F.scaled_dot_product_attention(q, tokens, tokens, attn_mask=seen, is_causal=past == 0, scale=1.0)
             x = layer.finish(x, mixed.transpose(1, 2).flatten(2))
 
-    def stretch(self, x: Float[Tensor, "B L D"], arrived: Float[Tensor, "B D"] | None = None) -> Float[Tensor, "B L D"]:
-        """Final states of one stretch a context: tokens that see their context, those before them, and themselves.
+    def stretch(self, x: Float[Tensor, "B L D"], arrived: Float[Tensor, "B D"] | None = None) -> Float[Tensor, "B D"]:
+        """Final state of the last token of one stretch a context: each sees its context, those before it, and itself.
 
         A token that has ``arrived`` joins the context first.
         """
@@ -243,14 +243,14 @@ class Decoder:
             weights = torch.split(torch.cat(scores, dim=-1).softmax(-1), [part.shape[1] for part in seen], dim=-1)
             mixed = sum(torch.bmm(weight, part) for weight, part in zip(weights, seen, strict=True))
             x = layer.finish(x, cast(Tensor, mixed).view(batch, new + length, -1))
-        return _normed(x[:, new:], self._norm)
+        return _normed(x[:, -1], self._norm)
 
     def _make_room(self) -> None:
         """For one more token that arrives by itself: they stand apart, with room to spare, until they are settled."""
         if self._recent == self._fresh[0].shape[1]:
             self._fresh = [torch.cat([f, f.new_empty(f.shape[0], 32 + f.shape[1], f.shape[2])], dim=1) for f in self._fresh]
 
-    def settle(self) -> None:
+    def _settle(self) -> None:
         """Put the tokens that arrived one by one with the others, where they are read faster."""
         if self._recent:
             pieces = zip(self._tokens, self._fresh, strict=True)
@@ -260,6 +260,7 @@ class Decoder:
 
     def query(self, x: Float[Tensor, "B D"]) -> Float[Tensor, "B D"]:
         """Final states of one query token a context, which sees its context and itself."""
+        self._settle()
         for layer, place, keys, values in self._views:
             normed = _normed(x, layer.norm_attention)
             place.copy_(normed)

@@ -80,30 +80,24 @@ class Gaussian:
         return -self.log_likelihood(outputs, labels).mean()
 
     def log_likelihood(self, outputs: Float[Tensor, "*B O"], actions: Tensor) -> Float[Tensor, "*B"]:
-        return log_normal(outputs, actions)
+        mean, deviation = self._spread(outputs)
+        away = (actions - mean) / deviation
+        return (-0.5 * away**2 - deviation.log() - 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def act(self, outputs: Float[Tensor, "B O"], u: Float[np.ndarray, "B U"]) -> Float[np.ndarray, "B A"]:
-        mean, deviation = (part.cpu().numpy() for part in spread(outputs))
+        mean, deviation = (part.cpu().numpy() for part in self._spread(outputs))
         normal = ndtri(np.clip(u, 1e-6, 1 - 1e-6))
         return np.clip(mean + deviation * normal, -1.0, 1.0).astype(np.float32)
+
+    def _spread(self, outputs: Float[Tensor, "*B O"]) -> tuple[Float[Tensor, "*B A"], Float[Tensor, "*B A"]]:
+        """Mean and standard deviation, the latter at least ``FLOOR``."""
+        mean, raw = outputs.chunk(2, dim=-1)
+        return mean, FLOOR + F.softplus(raw)
 
 
 def head(spec: Spec) -> Head:
     """The head of this spec's actions."""
     return Categorical(spec.actions) if spec.discrete else Gaussian(spec.actions)
-
-
-def spread(outputs: Float[Tensor, "*B 2A"]) -> tuple[Float[Tensor, "*B A"], Float[Tensor, "*B A"]]:
-    """Mean and standard deviation, the latter at least ``FLOOR``."""
-    mean, raw = outputs.chunk(2, dim=-1)
-    return mean, FLOOR + F.softplus(raw)
-
-
-def log_normal(outputs: Float[Tensor, "*B 2A"], values: Float[Tensor, "*B A"]) -> Float[Tensor, "*B"]:
-    """Log-density of vectors of independent Gaussians, in nats."""
-    mean, deviation = spread(outputs)
-    away = (values - mean) / deviation
-    return (-0.5 * away**2 - deviation.log() - 0.5 * math.log(2 * math.pi)).sum(-1)
 
 
 def sample(probabilities: Float[np.ndarray, "B A"], u: Float[np.ndarray, " B"]) -> Int64[np.ndarray, " B"]:

@@ -271,6 +271,7 @@ def _check_kind(name: str, dtype: str, ndim: int) -> None:
 def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
     steps = len(arrays["actions"])
     wanted = {"observations": steps + 1, "rewards": steps, "adversary": steps, "labels": len(arrays["queries"])}
+    wanted["gained"] = len(arrays["taken"])
     for name, rows in wanted.items():
         if len(arrays[name]) != rows:
             raise WireError("shape", f"{name} has {len(arrays[name])} rows, expected {rows}")

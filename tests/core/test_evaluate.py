@@ -62,6 +62,19 @@ def test_rows_are_tidy(small_run):
     np.testing.assert_allclose(mean, [4.5, 5.5, 6.5])
 
 
+def test_adaptation_is_measured_beside_the_oracle():
+    def result(*episodes):
+        return evaluate.Result("x", 0.0, np.array(episodes, float).reshape(1, 1, -1), np.array([9.0]))
+
+    oracle = result(10, 10, 8, 12)
+    assert result(1, 8, 9, 10).first_over(oracle, 2) == round(9 / 20, 4)
+    assert result(1, 8, 9, 10).first_over(oracle, 10) == round(28 / 40, 4)
+    assert [result(1, 8, 9, 10).episode_of(oracle, share) for share in (0.05, 0.9, 0.95)] == [1, 3, 4]
+    assert result(1, 8, 9, 10).episode_of(oracle, 1.01) is None
+    several = evaluate.Result("x", 0.0, np.array([[[0.0, 12.0]], [[6.0, 6.0]]]), np.array([9.0, 9.0]))
+    assert several.episode_of(oracle, 0.9) == 2, "of all tasks and seeds together"
+
+
 def test_offline_rows_hold_random_and_expert_data(small_run, model):
     rows = evaluate.offline(small_run, {"T": model})
     agents = ["T", *RULES.values()]

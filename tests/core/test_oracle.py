@@ -97,6 +97,7 @@ def episode(variation: Variation, seed: int) -> Trajectory:
         queries=np.zeros((0, 2), np.float32),
         labels=np.zeros((0, 5), np.float32),
         taken=np.zeros(0, np.int16),
+        gained=np.zeros(0, np.float32),
         origin="none",
     )
 

@@ -209,6 +209,27 @@ def test_practice_adds_own_histories_from_the_origin_with_optimal_labels(small_r
     assert len({tuple(t.actions) for t in data.trials(("adapt", 0, 0, 1)) + data.trials(("adapt", 1, 0, 1))}) == 6
 
 
+def test_practice_makes_histories_by_every_rule_of_deployment(small_run):
+    """Job by job, and in each round other jobs by another; without stretches there is one rule."""
+    practice = PracticeConfig(rounds=3, trials=2)
+    plain = dataclasses.replace(small_run, method="icag", practice=practice)
+    run = dataclasses.replace(
+        plain,
+        model=dataclasses.replace(plain.model, stretch=3),
+        pretrain=dataclasses.replace(plain.pretrain, stretches=1),
+        optim=dataclasses.replace(plain.optim, stretches=1),
+    )
+
+    def rules(run, number):
+        phase = METHODS["icag"].phases(run)[number]
+        return [job.setting("deploy") for job in METHODS["icag"].ask(run, phase)]
+
+    assert set(rules(plain, 1)) == {"paper"}
+    rounds = [rules(run, number) for number in (1, 2, 3)]
+    assert all(sorted(one) == ["committed", "paper", "paper"] for one in zip(*rounds, strict=True)) and len(rounds[0]) > 1
+    assert rounds[0][:2] == ["paper", "committed"]
+
+
 def test_behaviours_take_turns(small_run):
     """Trial n of every variation walks as behaviour n modulo their number."""
     behaviours = ("sweep", "random")

@@ -79,6 +79,13 @@ def test_what_is_evaluated_is_named_once(capsys, tmp_path):
         shipped("nothing")
 
 
+def test_what_an_agent_was_not_trained_for_is_refused_in_one_line(folder, capsys):
+    assert cli.main(["evaluate", str(folder), "--deploy", "committed"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "model.stretch = 1" in line and "'paper'" in line
+    assert load_checkpoint(version_file(folder, 1)).manifest["stretch"] == 1
+
+
 def test_a_file_of_that_name_does_not_hide_the_shipped_agent(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_checkpoint(tmp_path / "darkroom", Checkpoint({}, {}))

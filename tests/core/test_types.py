@@ -28,6 +28,7 @@ def trajectory(horizon: int = 3, **changes: Any) -> Trajectory:
         "queries": np.zeros((0, 2), np.float32),
         "labels": np.zeros((0, 5), np.float32),
         "taken": np.zeros(0, np.int16),
+        "gained": np.zeros(0, np.float32),
         "origin": "none",
     }
     return Trajectory(**{**values, **changes})

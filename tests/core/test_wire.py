@@ -40,6 +40,7 @@ def trajectory(steps: int = 5, queries: int = 3, variation: Variation = VARIATIO
         queries=rng.normal(size=(queries, 2)).astype(np.float32),
         labels=rng.random((queries, 5)).astype(np.float32),
         taken=rng.integers(0, 5, queries // 2).astype(np.int16),
+        gained=rng.normal(size=queries // 2).astype(np.float32),
         origin="optimal",
     )
 
@@ -158,6 +159,7 @@ def array(name: str, shape: list[Any], content: bytes = b"", dtype: str | None =
     return put("arrays", name, [dtype or ARRAYS[name][0], shape, content])
 
 
+FOUR_TAKEN, FOUR_GAINED = ["<i2", [4], bytes(8)], ["<f4", [4], bytes(16)]
 MALFORMED: list[tuple[str, str, bytes]] = [
     ("nothing", "not-msgpack", b""),
     ("never used byte", "not-msgpack", b"\xc1"),
@@ -214,6 +216,8 @@ MALFORMED: list[tuple[str, str, bytes]] = [
     ("four actions", "shape", repack(array("actions", [4], bytes(8)))),
     ("four rewards", "shape", repack(array("rewards", [4], bytes(16)))),
     ("two labels", "shape", repack(array("labels", [2, 5], bytes(40)))),
+    ("nothing taken but something gained", "shape", repack(array("taken", [0]))),
+    ("more taken than asked", "shape", repack(lambda m: m["arrays"].update(taken=FOUR_TAKEN, gained=FOUR_GAINED))),
     ("queries of three", "shape", repack(array("queries", [3, 3], bytes(36)))),
 ]
 

@@ -117,6 +117,9 @@ def broken(trajectory):
         ("spec", changed(observations=trajectory.observations[:5], **short)),
         ("spec", changed(actions=far)),
         ("spec", changed(labels=trajectory.labels[:, :4])),
+        ("spec", changed(taken=np.full(2, 5, np.int16), gained=np.zeros(2, np.float32))),
+        ("spec", changed(taken=np.full(2, -1, np.int16), gained=np.zeros(2, np.float32))),
+        ("not-finite", changed(taken=np.zeros(2, np.int16), gained=np.full(2, np.inf, np.float32))),
         ("unexpected", changed(identity=Identity("adapt", 7, 0, 0, 0))),
         (
             "unexpected",
