@@ -104,7 +104,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
             report = heldout.posterior(run, what, display)
         answer |= heldout.show_posterior(run, folder, report, console)
     else:
-        answer |= heldout.show_offline(heldout.offline(run, what), console)
+        answer |= heldout.show_offline(heldout.offline(run, what, arguments.deploy), console)
     if arguments.json:
         print(json.dumps(answer))
     return OK

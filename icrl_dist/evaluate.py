@@ -136,7 +136,7 @@ def online(
     return results
 
 
-def offline(run: Run, agents: Mapping[str, PretrainedTransformer]) -> list[Result]:
+def offline(run: Run, agents: Mapping[str, PretrainedTransformer], deploy: Deployment | None = None) -> list[Result]:
     """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
 
     Of every model and every exact agent.
@@ -153,7 +153,7 @@ def offline(run: Run, agents: Mapping[str, PretrainedTransformer]) -> list[Resul
             results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
             ran = {}
             for name, model in agents.items():
-                policy = rollout.in_context(model, len(rows), run.context)
+                policy = rollout.in_context(model, len(rows), run.context, deploy)
                 ran[name] = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
             for rule, name in RULES.items():
                 agent = exact(run, rule)(rows)

@@ -16,13 +16,15 @@ from jaxtyping import Float32, Float64, Int
 
 from icrl_dist.oracle import Hypotheses, cell_numbers, log_likelihood, posterior
 
-Rule = Literal["paper", "every step", "stretches", "committed"]
+Rule = Literal["paper", "every step", "stretches", "committed", "zeta"]
 STRETCH = 5
+ZETA = 11
 RULES: dict[Rule, str] = {
     "paper": "exact, Algorithm 1",
     "every step": "exact, every step",
     "stretches": f"exact, stretches of {STRETCH}",
     "committed": "exact, committed",
+    "zeta": f"exact, zeta of {ZETA}",
 }
 """What tables and figures call the exact agent of each rule."""
 
@@ -34,6 +36,9 @@ class ExactAgent:
     ``every step``: the same, updated at every transition.  ``stretches``: updated at every
     transition, but a hypothesis is kept for ``STRETCH`` steps, or to the episode's end.
     ``committed``: a hypothesis is kept, from episode to episode, until a transition refutes it.
+    ``zeta``: the posterior, updated at every transition, given that the last ``ZETA`` actions of the
+    episode were right (eq. 6): what ``rollout.CommittedPolicy`` does.  Of these as many count as
+    some hypothesis agrees with, the last first.
     """
 
     def __init__(
@@ -52,6 +57,7 @@ class ExactAgent:
         self._loglik = np.zeros(self._h.p.shape)
         self._guess = self._posterior()
         self._step = 0
+        self._zeta: list[Float64[np.ndarray, "B M"]] = []
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
         labels = self._labels[self._family, cell_numbers(observation, self._size)]
@@ -76,6 +82,10 @@ class ExactAgent:
         if self._rule == "committed":
             kept = np.where(np.isneginf(seen), 0.0, self._guess)
             self._guess = kept + (1.0 - kept.sum(axis=1, keepdims=True)) * self._posterior()
+        elif self._rule == "zeta":
+            right = self._labels[self._family, cell, action]
+            self._zeta = [] if done else [*self._zeta, right][-ZETA:]
+            self._guess = self._given_zeta()
         elif done or self._rule == "every step" or (self._rule == "stretches" and self._step % STRETCH == 0):
             self._guess = self._posterior()
 
@@ -91,6 +101,14 @@ class ExactAgent:
         for t in range(actions.shape[1]):
             self._loglik += log_likelihood(self._h, cells[:, t], actions[:, t].astype(np.int64), rewards[:, t], arrived[:, t])
         self._guess = self._posterior()
+
+    def _given_zeta(self) -> Float64[np.ndarray, "B M"]:
+        weight, agreed = self._posterior(), np.ones(len(self._family), bool)
+        for right in reversed(self._zeta):
+            both = weight * right
+            agreed &= both.sum(axis=1) > 0
+            weight = np.where(agreed[:, None], both, weight)
+        return _normalised(weight)
 
     def _posterior(self) -> Float64[np.ndarray, "B M"]:
         return posterior(self._log_prior, self._loglik)

@@ -46,9 +46,9 @@ def online(run: Run, what: Path, display: Display, deploy: Deployment | None = N
     return evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
 
 
-def offline(run: Run, what: Path) -> list[evaluate.Result]:
+def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
     """Offline returns of the folder's models, given random and expert data."""
-    return evaluate.offline(run, models(what))
+    return evaluate.offline(run, models(what), deploy)
 
 
 def show_online(run: Run, folder: Path, results: list[evaluate.Result], console: Console) -> dict[str, Any]:

@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import Any
 
 COLOURS = ("#1f6feb", "#8957e5", "#d29922", "#2da44e")
-_EXACT = (("#8c959f", (0, (1, 1.2))), ("#8c959f", "-."), ("#57606a", (0, (5, 1.5))), ("#57606a", "-"))
+_EXACT = (
+    ("#8c959f", (0, (1, 1.2))),
+    ("#8c959f", "-."),
+    ("#57606a", (0, (5, 1.5))),
+    ("#57606a", "-"),
+    ("#24292f", (0, (3, 1, 1, 1))),
+)
 _GOALS = {"kl_nats": ("goals trained on", "#2da44e"), "kl_heldout": ("goals never trained on", "#cf222e")}
 _GAPS = ("paper_gap_train", "paper_gap")
 _LAWS = {"": "own adversaries", "_any": "any adversary"}
