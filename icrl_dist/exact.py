@@ -100,6 +100,7 @@ class ExactAgent:
         cells, arrived = cell_numbers(observations, self._size), cell_numbers(next_observations, self._size)
         for t in range(actions.shape[1]):
             self._loglik += log_likelihood(self._h, cells[:, t], actions[:, t].astype(np.int64), rewards[:, t], arrived[:, t])
+        self._zeta = []
         self._guess = self._posterior()
 
     def _given_zeta(self) -> Float64[np.ndarray, "B M"]:
