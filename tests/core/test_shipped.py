@@ -1,14 +1,15 @@
 """Agents as single files: exported from a run, and shipped with the package."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 import torch
 
-from icrl_dist import cli
-from icrl_dist.agent import SHIPPED, load_agent, shipped
-from icrl_dist.config import ConfigError
+from icrl_dist import cli, evaluate
+from icrl_dist.agent import SHIPPED, load_agent, model_of, shipped
+from icrl_dist.config import ConfigError, parse
 from icrl_dist.envs import tasks
 from icrl_dist.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
@@ -59,14 +60,35 @@ def test_shipped_agents_are_small_and_say_where_they_come_from():
 
 def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    words = ["evaluate", "--pretrained", "darkroom", "--episodes", "8", "--seeds", "1", "--p", "0", "--json"]
+    words = ["evaluate", "--pretrained", "darkroom", "--episodes", "5", "--seeds", "1", "--p", "0", "--json"]
     assert cli.main(words) == 0
     answer = json.loads(capsys.readouterr().out.splitlines()[-1])
     rows = {row["agent"]: row["episodes"] for row in answer["rows"]}
-    (name,) = (agent for agent in rows if agent.startswith("T^"))
-    assert rows[name][0] < 15 and rows[name][-1] > 0.6 * rows["oracle"][-1]
+    kept, frozen = (agent for agent in rows if agent.startswith("T^"))
+    assert (answer["deploy"], frozen) == ("committed", f"{kept}, Algorithm 1")
+    assert rows[kept][-1] > 0.8 * rows["oracle"][-1] and rows[frozen][0] < 5 < rows[kept][0]
+    over, soon = (answer[name]["0"] for name in ("first10_over_oracle", "episode_of_90"))
+    assert over == pytest.approx(sum(rows[kept]) / sum(rows["oracle"]), abs=1e-3) and over > 0.6
+    assert soon is None or rows[kept][soon - 1] >= 0.9 * np.mean(rows["oracle"])
     assert (tmp_path / "runs" / "darkroom-pretrained" / "report" / "adaptation.png").is_file()
     assert load_agent("darkroom").manifest["size"] == 10
+
+
+def test_what_a_shipped_agent_knows_is_in_its_weights():
+    """It knows nothing of the environment but what its weights hold: shuffled, they earn what a random policy does."""
+    checkpoint = load_checkpoint(shipped("darkroom"))
+    run = parse(checkpoint.manifest["run"], "shipped")
+    run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, episodes=3, seeds=1, p=(0.0,)))
+    model, _ = model_of(checkpoint)
+    shuffled, _ = model_of(checkpoint)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for parameter in shuffled.parameters():
+            parameter.copy_(parameter.flatten()[torch.randperm(parameter.numel())].view_as(parameter))
+    agents = {"trained": evaluate.in_context(run, model), "shuffled": evaluate.in_context(run, shuffled)}
+    agents["random"] = evaluate.random
+    trained, mixed, random = (result.returns.mean() for result in evaluate.online(run, agents))
+    assert trained > 40 and mixed < 5 and random < 5
 
 
 def test_what_is_evaluated_is_named_once(capsys, tmp_path):
