@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, NamedTuple, TypeVar, overload
+from typing import Generic, NamedTuple, Protocol, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Float32, Int64, Integer
@@ -128,12 +128,20 @@ class Shelved(Sequence[Examples], Generic[K]):
         return self._shelf.get(self._keys[index])
 
 
+class Offered(Protocol):
+    """Examples of many variations in a row, each perhaps read from the disk when it is asked for."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Examples: ...
+
+
 @dataclass(frozen=True)
 class Pool:
     """Examples of many variations, and the share of the training batches that come from them."""
 
     share: float
-    examples: Sequence[Examples]
+    examples: Offered
     episodes: int
     """Episodes in a context, at most."""
 

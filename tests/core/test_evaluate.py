@@ -78,7 +78,8 @@ def test_adaptation_is_measured_beside_the_oracle():
 def test_offline_rows_hold_random_and_expert_data(small_run, model):
     rows = evaluate.offline(small_run, {"T": model})
     agents = ["T", *RULES.values()]
-    for rows_at, source in ((rows[:6], "random data"), (rows[6:12], "expert data")):
+    count = 1 + len(agents)
+    for rows_at, source in ((rows[:count], "random data"), (rows[count : 2 * count], "expert data")):
         assert [r.agent for r in rows_at] == [source, *(f"{agent}, {source}" for agent in agents)]
     expert = next(r for r in rows if r.agent == "expert data" and r.p == 0)
     np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), expert.optimum)

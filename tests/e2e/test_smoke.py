@@ -125,7 +125,8 @@ def test_evaluate_prints_returns_beside_the_oracles(undisturbed):
     output = finish(process)
     assert process.returncode == 0, output
     rows = json.loads(output.splitlines()[-1])["rows"]
-    assert [row["p"] for row in rows] == [0.0] * 8 + [0.4] * 8
+    agents = 4 + len(RULES)
+    assert [row["p"] for row in rows] == [0.0] * agents + [0.4] * agents
     assert all(len(row["episodes"]) == 2 for row in rows)
     assert next(row for row in rows if row["agent"] == "oracle")["episodes"] == [9.0, 9.0]
 
