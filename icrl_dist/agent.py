@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from icrl_dist.config import ConfigError, ContextConfig, Deployment, parse
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
+from icrl_dist.models.outcomes import OutcomeModel
 from icrl_dist.rollout import Actions, in_context
+from icrl_dist.surprise import Surprise, calibrate
 from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist") / "agents"))
@@ -35,9 +39,12 @@ class InContextAgent:
         context: ContextConfig,
         seed: int | None = None,
         deploy: Deployment | None = None,
+        outcomes: OutcomeModel | None = None,
     ) -> None:
         """Raises ConfigError for a deployment that the model was not trained for."""
         self.model = model.eval()
+        self.outcomes = outcomes
+        """What the model expects to happen, for ``surprise``; None if nobody asked it after training."""
         self.manifest = manifest
         """Where the agent comes from: method, version, digests, seeds, versions of the
         libraries; in Dark Room also ``test_goals`` as ``[x, y]`` pairs, ``size``, ``horizon``."""
@@ -47,7 +54,25 @@ class InContextAgent:
 
     def reset_context(self, batch: int = 1) -> None:
         """Forget everything and begin anew in ``batch`` environments, with the model's weights as they are now."""
-        self._policy = in_context(self.model, batch, self._context, self._deploy)
+        self._surprise = Surprise(self.outcomes, self.model.spec, batch) if self.outcomes else None
+        watch = self._surprise.observe if self._surprise else None
+        self._policy = in_context(self.model, batch, self._context, self._deploy, watch)
+
+    @property
+    def surprise(self) -> Float[np.ndarray, " B"]:
+        """How unlike pretraining each environment has been over its last 100 transitions: when not to trust the agent.
+
+        From the loss of the model's own predictions of what its actions bring, in training tasks
+        kept apart from the fit of these predictions: 0 is their median, 1 what one stretch of time
+        in a hundred reaches there.  0 before the first transition; only transitions after an
+        ``act`` count.  Raises ConfigError for a checkpoint that was not calibrated.
+        """
+        if self._surprise is None:
+            raise ConfigError(
+                "surprise: this checkpoint was not calibrated, as the last one of a run is: "
+                "`icrl-dist train RUN --resume` calibrates a run's, `icrl-dist export` the file that it makes"
+            )
+        return self._surprise.now()
 
     def act(self, obs: ArrayLike) -> Actions:
         """One action for each observation of ``obs (B, S)``: numbers ``(B,)``, or vectors in [-1, 1] ``(B, A)``.
@@ -94,7 +119,7 @@ def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | N
     checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
     model, context = model_of(checkpoint)
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    return InContextAgent(model, manifest, context, seed, deploy)
+    return InContextAgent(model, manifest, context, seed, deploy, outcomes_of(checkpoint))
 
 
 def shipped(name: str | Path) -> Path:
@@ -107,7 +132,17 @@ def shipped(name: str | Path) -> Path:
 def slim(checkpoint: Checkpoint) -> Checkpoint:
     """What deployment needs of a checkpoint: the weights and where they come from, not the optimiser or the dataset's list."""
     manifest = {key: value for key, value in checkpoint.manifest.items() if key != "dataset"}
-    return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith("model/")}, manifest)
+    return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith(("model/", "outcomes/"))}, manifest)
+
+
+def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda episodes: None) -> Checkpoint:
+    """The checkpoint with what its model expects to happen (``surprise.calibrate``); as it is if it has that already."""
+    if checkpoint.part("outcomes"):
+        return checkpoint
+    run = parse(checkpoint.manifest["run"], "checkpoint")
+    outcomes = calibrate(run, model_of(checkpoint)[0], progress).arrays()
+    arrays = {**checkpoint.arrays, **{f"outcomes/{name}": value for name, value in outcomes.items()}}
+    return Checkpoint(arrays, checkpoint.manifest)
 
 
 def checkpoint_file(what: Path, version: int | None = None) -> Path:
@@ -135,6 +170,17 @@ def model_of(checkpoint: Checkpoint) -> tuple[PretrainedTransformer, ContextConf
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StoreError(f"checkpoint: not an agent of this version of icrl-dist ({' '.join(str(error).split())})") from None
     return model.eval(), run.context
+
+
+def outcomes_of(checkpoint: Checkpoint) -> OutcomeModel | None:
+    """What the checkpoint's model expects to happen; None if it was not calibrated.
+
+    Raises StoreError if its arrays are others than a calibrated checkpoint's.
+    """
+    try:
+        return OutcomeModel.of(checkpoint.part("outcomes"))
+    except TypeError as error:
+        raise StoreError(f"checkpoint: not calibrated by this version of icrl-dist ({error})") from None
 
 
 def spec_from(fields: dict[str, Any]) -> Spec:

@@ -27,7 +27,8 @@ def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
     from icrl_dist import heldout, launch
-    from icrl_dist.files import atomic_write
+    from icrl_dist.agent import checkpoint_file
+    from icrl_dist.files import atomic_write, save_checkpoint
     from icrl_dist.terminal import Display
 
     if not arguments.run and not arguments.source:
@@ -53,13 +54,14 @@ def train(arguments: Train, console: Console) -> int:
                 result = launch.train_ray(
                     run, folder, arguments.actors, arguments.address, display.report, arguments.oversubscribe
                 )
+            save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
             results = heldout.online(run, folder, display)
     except launch.TrainInterrupted:
         given = arguments.run or f"--from {arguments.source}"
         console.print(f"interrupted; `icrl-dist train {given} --resume` goes on from the checkpoint", markup=False)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
-    result |= heldout.show_online(run, folder / "report", results, console)
+    result |= heldout.show_online(run, folder / "report", *results, console)
     atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
@@ -98,7 +100,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     if arguments.suite == "online":
         with Display(console) as display:
             results = heldout.online(run, what, display, arguments.deploy)
-        answer |= heldout.show_online(run, folder, results, console)
+        answer |= heldout.show_online(run, folder, *results, console)
     elif arguments.suite == "posterior":
         with Display(console) as display:
             report = heldout.posterior(run, what, display)
@@ -124,14 +126,17 @@ def _evaluated(arguments: Evaluate) -> tuple[Path, Path]:
 
 def export(arguments: Export, console: Console) -> int:
     """``icrl-dist export``: an agent without what only training needs."""
+    from icrl_dist import heldout
     from icrl_dist.agent import checkpoint_file, slim
-    from icrl_dist.files import load_checkpoint, save_checkpoint
+    from icrl_dist.files import save_checkpoint
+    from icrl_dist.terminal import Display
 
     source = checkpoint_file(arguments.what)
     out = arguments.out or (arguments.what if arguments.what.is_dir() else source.parent) / "agent.npz"
     if out.is_dir():
         raise ConfigError(f"--out {out}: is a folder; name a file, such as {out / 'agent.npz'}")
-    save_checkpoint(out, slim(load_checkpoint(source)))
+    with Display(console) as display:
+        save_checkpoint(out, slim(heldout.calibrate(source, display)))
     console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)
     return OK
 

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
-from icrl_dist import evaluate, plots, truth
-from icrl_dist.agent import checkpoint_file, model_of
+from icrl_dist import evaluate, plots, rollout, surprise, truth
+from icrl_dist.agent import calibrated, checkpoint_file, model_of, outcomes_of
 from icrl_dist.config import Deployment, Run, default_deployment
 from icrl_dist.envs import tasks
 from icrl_dist.exact import RULES
-from icrl_dist.files import atomic_write, load_checkpoint
+from icrl_dist.files import Checkpoint, atomic_write, load_checkpoint
 from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.surprise import Surprise
 from icrl_dist.terminal import Display, gap_table, kl_table, returns_table
+from icrl_dist.types import Variation
 
 
 def models(what: Path) -> dict[str, PretrainedTransformer]:
@@ -29,21 +33,47 @@ def models(what: Path) -> dict[str, PretrainedTransformer]:
     return found
 
 
-def online(run: Run, what: Path, display: Display, deploy: Deployment | None = None) -> list[evaluate.Result]:
+def calibrate(what: Path, display: Display) -> Checkpoint:
+    """The newest checkpoint with what its model expects to happen, which is learned now if it was not before."""
+
+    def progress(episodes: int) -> None:
+        event = {"event": "progress", "stage": "evaluate", "phase": "calibrating surprise"}
+        display.report(event | {"step": episodes, "steps": 2 * surprise.EPISODES})
+
+    return calibrated(load_checkpoint(checkpoint_file(what)), progress)
+
+
+def online(
+    run: Run, what: Path, display: Display, deploy: Deployment | None = None
+) -> tuple[list[evaluate.Result], dict[str, Any]]:
     """Online returns of the folder's models, a random policy, the exact agents and the oracle; the newest model first.
 
     Deployed by ``deploy``, or by the better rule that they were trained for; if that is not
-    Algorithm 1, the newest is deployed by it too.
+    Algorithm 1, the newest is deployed by it too.  And the newest's surprise at the end, by p,
+    if it was calibrated.
     """
     found = models(what)
     agents: dict[str, evaluate.MakePolicy] = {name: evaluate.in_context(run, model, deploy) for name, model in found.items()}
     newest, model = next(iter(found.items()))
+    watches: list[Surprise] = []
+    if outcomes := outcomes_of(load_checkpoint(checkpoint_file(what))):
+
+        def watched(rows: Sequence[Variation]) -> rollout.Policy:
+            watches.append(Surprise(outcomes, model.spec, len(rows)))
+            return rollout.in_context(model, len(rows), run.context, deploy, watches[-1].observe)
+
+        agents[newest] = watched
     if (deploy or default_deployment(run.model)) != "paper":
         agents[f"{newest}, Algorithm 1"] = evaluate.in_context(run, model, "paper")
     agents["random"] = evaluate.random
     agents |= {name: evaluate.exact(run, rule) for rule, name in RULES.items()}
     agents[evaluate.ORACLE] = evaluate.optimal(run)
-    return evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
+    results = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
+    return results, {f"{p:g}": _spread(one.now()) for p, one in zip(run.evaluate.p, watches, strict=False)}
+
+
+def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
+    return {"median": round(float(np.median(values)), 2), "above_1": round(float((values > 1).mean()), 4)}
 
 
 def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
@@ -51,7 +81,9 @@ def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[eval
     return evaluate.offline(run, models(what), deploy)
 
 
-def show_online(run: Run, folder: Path, results: list[evaluate.Result], console: Console) -> dict[str, Any]:
+def show_online(
+    run: Run, folder: Path, results: list[evaluate.Result], surprised: dict[str, Any], console: Console
+) -> dict[str, Any]:
     """Print the table, draw the figure, keep the rows in the folder; returns them with the figure's path."""
     rows = [result.row() for result in results]
     adapted = _adaptation(results)
@@ -60,8 +92,11 @@ def show_online(run: Run, folder: Path, results: list[evaluate.Result], console:
     atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
     figure = plots.adaptation(rows, folder / "adaptation.png", title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
+    for p, one in surprised.items():
+        told = f"surprise at the end, p = {p}: median {one['median']:.2f}, above 1 in {one['above_1']:.0%}"
+        console.print(told, highlight=False, markup=False)
     console.print(f"figure {figure}", highlight=False, markup=False)
-    return {**adapted, "rows": rows, "figure": str(figure)}
+    return {**adapted, "surprise": surprised, "rows": rows, "figure": str(figure)}
 
 
 def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:

@@ -8,6 +8,7 @@ the trajectories.  The phase after which T^j exists produces weights version j.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -65,6 +66,8 @@ class Method:
     phases: Callable[[Run], tuple[Phase, ...]]
     ask: Callable[[Run, Phase], tuple[Job, ...]]
     learn: Callable[[Run, Phase, Dataset], tuple[Pool, ...]]
+    variations: Callable[[Run, int, Task, int], tuple[Variation, ...]]
+    """Those of task number i that a round trains on."""
 
 
 def _pretrain_only(run: Run) -> tuple[Phase, ...]:
@@ -160,9 +163,13 @@ def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
 # DPT (section 2): tasks without disturbance, labels from each task's optimal policy.
 
 
+def _undisturbed(run: Run, index: int, task: Task, round: int = 0) -> tuple[Variation, ...]:
+    return (Variation(task),)
+
+
 def _dpt_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
     asked = _random_contexts if phase.stage == "pretrain" else _practice
-    return asked(run, phase, lambda i, task: (Variation(task),))
+    return asked(run, phase, functools.partial(_undisturbed, run))
 
 
 def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
@@ -182,7 +189,7 @@ def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
 
 def _icag_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
     asked = _random_contexts if phase.stage == "pretrain" else _practice
-    return asked(run, phase, lambda i, task: tasks.variations(run, i, task))
+    return asked(run, phase, functools.partial(tasks.variations, run))
 
 
 # ICAA (section 4.2, Algorithm 3): D^0 is DPT's dataset; then, round by round, the model
@@ -247,7 +254,7 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
 
 
 METHODS: dict[str, Method] = {
-    "dpt": Method(_then_practice, _dpt_ask, _pretrain_learn),
-    "icag": Method(_then_practice, _icag_ask, _pretrain_learn),
-    "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn),
+    "dpt": Method(_then_practice, _dpt_ask, _pretrain_learn, _undisturbed),
+    "icag": Method(_then_practice, _icag_ask, _pretrain_learn, tasks.variations),
+    "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn, tasks.variations),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,6 +17,9 @@ from icrl_dist.models.heads import sample
 
 Actions = Int64[np.ndarray, " B"] | Float32[np.ndarray, "B A"]
 """Of B environments: numbers, or vectors in [-1, 1]."""
+
+Watch = Callable[..., object]
+"""Told of every decision of T_theta and of what came of it (``models.outcomes.Decisions``)."""
 
 
 class Policy(Protocol):
@@ -54,8 +57,8 @@ class InContextPolicy:
     whole episodes and is encoded anew, for kept keys have seen what was dropped.
     """
 
-    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig) -> None:
-        self.model, self.batch, self._config = model, batch, context
+    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
+        self.model, self.batch, self._config, self._watch = model, batch, context, watch
         self._episodes: list[Transitions] = []
         self._pending: list[tuple[np.ndarray, ...]] = []
         self._deployed = Deployed(model, batch)
@@ -84,6 +87,9 @@ class InContextPolicy:
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None:
+        if self._watch is not None and self._deployed.state is not None:
+            self._watch(self._deployed.state.cpu().numpy(), observation, action, reward, next_observation)
+            self._deployed.state = None
         self._pending.append((observation, action, next_observation, reward))
         if done:
             self._end(self._episode())
@@ -136,8 +142,8 @@ class CommittedPolicy(InContextPolicy):
     proves wrong, because it also trained on stretches that wrong guesses led (``pretrain.misled``).
     """
 
-    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig) -> None:
-        super().__init__(model, batch, context)
+    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
+        super().__init__(model, batch, context, watch)
         self._read = 0  # of self._pending, what is in the context already
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
@@ -165,9 +171,15 @@ class CommittedPolicy(InContextPolicy):
 
 
 def in_context(
-    model: PretrainedTransformer, batch: int, context: ContextConfig, deploy: Deployment | None = None
+    model: PretrainedTransformer,
+    batch: int,
+    context: ContextConfig,
+    deploy: Deployment | None = None,
+    watch: Watch | None = None,
 ) -> InContextPolicy:
     """T_theta deployed by this rule, or by the better one that it was trained for.
+
+    ``watch`` is told of every decision once its outcome is observed.
 
     Raises ConfigError for ``committed`` if it was not trained on stretches.
     """
@@ -177,7 +189,7 @@ def in_context(
             "deploy 'committed': this agent never trained on stretches (model.stretch = 1); "
             "deploy it by 'paper', or train with model.stretch, pretrain.stretches and optim.stretches"
         )
-    return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context)
+    return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context, watch)
 
 
 @dataclass(frozen=True, eq=False)

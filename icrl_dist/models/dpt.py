@@ -138,6 +138,8 @@ class Deployed:
     def __init__(self, model: PretrainedTransformer, batch: int) -> None:
         self._model, self._decoder = model, Decoder(model.trunk, batch)
         self._embed, self._head = copied(model.embed_query), copied(model.head)
+        self.state: Float[Tensor, "B D"] | None = None
+        """Final states of the trunk at the last decision."""
 
     @property
     def length(self) -> int:
@@ -157,13 +159,14 @@ class Deployed:
     def follow(self, of: Stretches, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
         """Outputs at the last state of one stretch a context, given the whole context; one transition may arrive before."""
         joined = None if arrived is None else self._model.tokens(arrived)[:, 0]
-        final = self._decoder.stretch(self._model.stretch_tokens(of)[:, 0], joined)
-        return F.linear(final, *self._head)
+        self.state = self._decoder.stretch(self._model.stretch_tokens(of)[:, 0], joined)
+        return F.linear(self.state, *self._head)
 
     @torch.inference_mode()
     def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B O"]:
         """Logits of T_theta at a query state of each context, given the whole of it."""
-        return F.linear(self._decoder.query(F.linear(self._model.features(states), *self._embed)), *self._head)
+        self.state = self._decoder.query(F.linear(self._model.features(states), *self._embed))
+        return F.linear(self.state, *self._head)
 
 
 def weights_of(model: nn.Module) -> dict[str, np.ndarray]:

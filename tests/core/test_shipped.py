@@ -35,7 +35,8 @@ def test_an_exported_agent_is_the_newest_version_without_what_only_training_need
     assert cli.main(["export", str(folder), "--to", "agent"]) == 0
     assert str(folder / "agent.npz") in capsys.readouterr().out
     source, made = load_checkpoint(version_file(folder, 1)), load_checkpoint(folder / "agent.npz")
-    assert set(made.arrays) == {name for name in source.arrays if name.startswith("model/")}
+    kept = {name for name in source.arrays if name.startswith("model/")}
+    assert set(made.arrays) == kept | {f"outcomes/{name}" for name in ("readout", "deviation", "typical", "rare")}
     assert made.manifest == {name: value for name, value in source.manifest.items() if name != "dataset"}
     whole, alone = load_agent(folder, seed=0), load_agent(folder / "agent.npz", seed=0)
     for name, value in weights_of(whole.model).items():

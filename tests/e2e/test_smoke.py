@@ -94,6 +94,12 @@ def test_the_result_is_on_the_last_line_and_in_the_folder(undisturbed):
     assert Path(result["figure"]).read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_last_version_is_calibrated(undisturbed):
+    folder, output, _ = undisturbed
+    assert set(json.loads(output.splitlines()[-1])["surprise"]) == {"0", "0.2"}
+    np.testing.assert_array_equal(load_agent(folder).surprise, [0.0])
+
+
 def test_acting_with_zeroed_weights_changes_the_actions(undisturbed):
     def actions(zero):
         agent = load_agent(undisturbed[0], seed=1)
