@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Float32, Int16, Shaped
+from jaxtyping import Bool, Float32, Int16, Shaped
 
 Value = int | float | str | tuple[int, ...] | tuple[float, ...]
 Params = tuple[tuple[str, Value], ...]
@@ -167,8 +167,12 @@ class Step(NamedTuple):
     reward: Float32[np.ndarray, " B"]
     done: bool
     """The horizon was reached: all environments of a batch end together."""
-    adversary: Int16[np.ndarray, " B"]
-    """The action the adversary put in the agent's place, or -1 where it did not."""
+    adversary: Int16[np.ndarray, " B"] | Float32[np.ndarray, "B F"]
+    """The action the adversary put in the agent's place, or -1 where it did not; in a continuous game
+    its own action, 0 where there is none."""
+    diverged: Bool[np.ndarray, " B"] | None = None
+    """Rows whose simulation has broken down in this episode: nothing of it may be learned from.
+    None for a game that cannot."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,14 @@ import numpy as np
 
 from icrl_dist import envs
 from icrl_dist.config import ConfigError
-from icrl_dist.envs import darkroom
+from icrl_dist.envs import darkroom, problems
 from icrl_dist.envs.adversary import sample_dirichlet
+from icrl_dist.envs.network import network
+from icrl_dist.tables import nearest
 from icrl_dist.types import Variation
+
+_BATCH = {"darkroom": 1024}
+_SIMULATIONS = 20
 
 
 def _darkroom(rng: np.random.Generator, batch: int) -> list[Variation]:
@@ -22,25 +27,39 @@ def _darkroom(rng: np.random.Generator, batch: int) -> list[Variation]:
     return [Variation(darkroom.task(goal), sample_dirichlet(rng, darkroom.ACTIONS, 0.2)) for goal in goals]
 
 
-_PROBLEMS = {"darkroom": _darkroom}
+def _dmc(kind: str, rng: np.random.Generator, batch: int) -> list[Variation]:
+    """Tasks of pretraining by turns, each row with a network of its own."""
+    tasks = problems.grid(kind, 4)
+    inputs, outputs = envs.spec(tasks[0]).observation, problems.problem(kind).forces["paper"].count
+    seeds = rng.integers(2**31, size=batch).tolist()
+    return [Variation(tasks[row % len(tasks)], network(seed, inputs, outputs)) for row, seed in enumerate(seeds)]
 
 
-def run(problem: str = "darkroom", batch: int = 1024, seconds: float = 3.0) -> dict[str, Any]:
+def run(problem: str = "darkroom", batch: int | None = None, seconds: float = 3.0) -> dict[str, Any]:
     """Step whole episodes of random actions for about ``seconds``.
 
-    ``steps_per_s`` counts resets and steps; actions are drawn beforehand, for choosing them
-    is the agent's work.  ``seeded_steps_per_s`` also makes each row's generator afresh from
-    an identity at every reset, as the jobs of a run do.  Raises ConfigError for an unknown
-    problem and for a batch or a time that is not above 0.
+    ``steps_per_s`` counts steps, in Dark Room also resets; actions are drawn beforehand, for
+    choosing them is the agent's work.  Dark Room: ``seeded_steps_per_s`` also makes each row's
+    generator afresh from an identity at every reset, as the jobs of a run do.  DeepMind Control:
+    ``ratio`` is our steps/s over those of a plain loop over dm_control's own environments,
+    ``limit_ratio`` over MuJoCo's ``mj_step`` alone, all three by turns.  Raises ConfigError for an
+    unknown problem and for a batch or a time that is not above 0.
     """
-    if problem not in _PROBLEMS:
-        raise ConfigError(f"bench env: problem = {problem!r}: choose one of {', '.join(sorted(_PROBLEMS))}")
+    if problem not in envs.KINDS:
+        known = ", ".join(sorted(envs.KINDS))
+        raise ConfigError(f"bench env: problem = {problem!r}{nearest(problem, envs.KINDS)}: choose one of {known}")
+    batch = _BATCH.get(problem, _SIMULATIONS) if batch is None else batch
     if batch < 1:
         raise ConfigError(f"bench env: batch = {batch}: must be above 0")
     if not seconds > 0:
         raise ConfigError(f"bench env: seconds = {seconds}: must be above 0")
+    measure = _rooms if problem == "darkroom" else partial(_simulations, problem)
+    return {"problem": problem, "batch": batch, "seconds": seconds, **measure(batch, seconds)}
+
+
+def _rooms(batch: int, seconds: float) -> dict[str, float]:
     rng = np.random.default_rng(0)
-    env = envs.batch(_PROBLEMS[problem](rng, batch))
+    env = envs.batch(_darkroom(rng, batch))
     actions = rng.integers(0, env.spec.actions, size=(env.spec.horizon, batch))
     kept = _seeded(0, batch)
 
@@ -60,9 +79,6 @@ def run(problem: str = "darkroom", batch: int = 1024, seconds: float = 3.0) -> d
         plain += [episode(lambda: kept) for _ in range(3)]
         seeded.append(episode(partial(_seeded, len(seeded), batch)))
     return {
-        "problem": problem,
-        "batch": batch,
-        "seconds": seconds,
         "steps_per_s": actions.size * len(plain) / sum(plain),
         "seeded_steps_per_s": actions.size * len(seeded) / sum(seeded),
     }
@@ -72,8 +88,64 @@ def _seeded(episode: int, batch: int) -> list[np.random.Generator]:
     return [np.random.default_rng(np.random.SeedSequence(0, spawn_key=(episode, row))) for row in range(batch)]
 
 
+def _simulations(kind: str, batch: int, seconds: float) -> dict[str, float]:
+    import mujoco
+
+    from icrl_dist.envs.dmc import suite_environment
+
+    rng = np.random.default_rng(0)
+    ours = envs.batch(_dmc(kind, rng, batch))
+    theirs = [suite_environment(kind) for _ in range(batch)]
+    actions = rng.uniform(-1, 1, (ours.spec.horizon, batch, ours.spec.actions)).astype(np.float32)
+    substeps = round(theirs[0].control_timestep() / theirs[0].physics.timestep())
+
+    def batched() -> None:
+        for now in actions:
+            ours.step(now)
+
+    def plain() -> None:
+        for now in actions:
+            for env, action in zip(theirs, now, strict=True):
+                step = env.step(action)
+                np.concatenate([np.ravel(part) for part in step.observation.values()])
+
+    def raw() -> None:
+        for now in actions:
+            for env, action in zip(theirs, now, strict=True):
+                model, data = env.physics.model.ptr, env.physics.data.ptr
+                data.ctrl[:] = action
+                mujoco.mj_step(model, data, substeps)
+
+    took: dict[str, list[float]] = {"ours": [], "dm_control": [], "mj_step": []}
+    end = time.perf_counter() + seconds
+    while not took["ours"] or time.perf_counter() < end:
+        for name, loop in (("ours", batched), ("dm_control", plain), ("mj_step", raw)):
+            if name == "ours":
+                ours.reset(_seeded(len(took[name]), batch))
+            else:
+                for env in theirs:
+                    env.reset()
+            began = time.process_time()
+            loop()
+            took[name].append(time.process_time() - began)
+    # Medians: a neighbour on the machine slows some rounds and not others.
+    steps = {name: actions.shape[0] * batch / float(np.median(times)) for name, times in took.items()}
+    return {
+        "steps_per_s": steps["ours"],
+        "dm_control_steps_per_s": steps["dm_control"],
+        "mj_step_steps_per_s": steps["mj_step"],
+        "ratio": steps["ours"] / steps["dm_control"],
+        "limit_ratio": steps["ours"] / steps["mj_step"],
+    }
+
+
 def describe(result: dict[str, Any]) -> str:
     """The result in one line for people."""
+    if "ratio" in result:
+        return (
+            f"{result['problem']}: {result['steps_per_s']:,.0f} control steps/s of {result['batch']} pushed variations on one "
+            f"core, {result['ratio']:.2f} times a plain dm_control loop, {result['limit_ratio']:.2f} of mj_step alone"
+        )
     return (
         f"{result['problem']}: {result['steps_per_s'] / 1e6:.1f} million steps/s in batches of {result['batch']:,} "
         f"on one core, {result['seeded_steps_per_s'] / 1e6:.1f} with a generator keyed anew to every row and episode"

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
-from icrl_dist.envs import darkroom
+from icrl_dist.envs import darkroom, problems
 from icrl_dist.envs.variation import VariationEnv
+from icrl_dist.tables import nearest
 from icrl_dist.types import Spec, Step, Task, Variation
 
 
@@ -21,16 +22,16 @@ class Batch(Protocol):
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float[np.ndarray, "B S"]: ...
 
-    def step(self, actions: Int[np.ndarray, " B"]) -> Step: ...
+    def step(self, actions: Int[np.ndarray, " B"] | Float32[np.ndarray, "B A"]) -> Step: ...
 
 
-_BATCHES = {"darkroom": darkroom.DarkRoom}
-_SPECS = {"darkroom": darkroom.spec}
+KINDS = ("darkroom", *problems.PROBLEMS)
+"""Every problem there is: the kinds of tasks."""
 
 
 def _known(kind: str) -> None:
-    if kind not in _BATCHES:
-        raise ValueError(f"task {kind!r}: no such problem; known: {', '.join(sorted(_BATCHES))}")
+    if kind not in KINDS:
+        raise ValueError(f"task {kind!r}: no such problem{nearest(kind, KINDS)}; known: {', '.join(KINDS)}")
 
 
 def batch(variations: Sequence[Variation]) -> Batch:
@@ -39,19 +40,23 @@ def batch(variations: Sequence[Variation]) -> Batch:
     if len(kinds) != 1:
         raise ValueError(f"a batch holds variations of one problem, not {kinds}")
     _known(kinds[0])
-    return _BATCHES[kinds[0]](variations)
+    if kinds[0] == "darkroom":
+        return darkroom.DarkRoom(variations)
+    from icrl_dist.envs import dmc  # MuJoCo takes a moment to import: for those who simulate
+
+    return dmc.Variations(variations)
 
 
 def spec(task: Task) -> Spec:
     """Shape of the task's observations and actions."""
     _known(task.kind)
-    return _SPECS[task.kind](task)
+    return darkroom.spec(task) if task.kind == "darkroom" else problems.spec(task)
 
 
 def make(variation: Variation) -> VariationEnv:
     """One variation environment (tau, phi) as a ``gymnasium.Env``.
 
     The adversary is part of the environment: the agent sees neither it nor its action,
-    except in ``info["adversary"]`` (the overriding action, or -1).
+    except in ``info["adversary"]`` (see ``Step.adversary``).
     """
     return VariationEnv(variation, batch([variation]))

@@ -14,12 +14,15 @@ if TYPE_CHECKING:
     from icrl_dist.envs import Batch
 
 Observation = np.ndarray[Any, np.dtype[np.float32]]
+Action = np.int64 | np.ndarray[Any, np.dtype[np.float32]]
+"""A number, or a vector in [-1, 1]."""
 
 
-class VariationEnv(gymnasium.Env[Observation, np.int64]):
+class VariationEnv(gymnasium.Env[Observation, Action]):
     """The MDP (S, A, P_{tau,phi}, R_{tau,phi}, gamma, rho_tau) of section 4.1.
 
-    An episode is truncated at the horizon and never terminates.
+    An episode is truncated at the horizon, or where the simulation breaks down (``info["diverged"]``),
+    and never terminates.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - gymnasium declares it so
@@ -30,14 +33,23 @@ class VariationEnv(gymnasium.Env[Observation, np.int64]):
         self._batch = batch
         low, high = (np.array(bound, dtype=np.float32) for bound in (batch.spec.low, batch.spec.high))
         self.observation_space = spaces.Box(low, high)
-        self.action_space = spaces.Discrete(batch.spec.actions)
+        spec = batch.spec
+        self.action_space = spaces.Discrete(spec.actions) if spec.discrete else spaces.Box(-1.0, 1.0, (spec.actions,))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         return self._batch.reset([self.np_random])[0], {}
 
-    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         if not self.action_space.contains(action):
-            raise ValueError(f"action {action!r} is not one of 0..{self._batch.spec.actions - 1}")
+            actions = self._batch.spec.actions
+            known = f"one of 0..{actions - 1}" if self._batch.spec.discrete else f"{actions} float32 numbers in [-1, 1]"
+            raise ValueError(f"action {action!r} is not {known}")
         step = self._batch.step(np.array([action]))
-        return step.observation[0], float(step.reward[0]), False, step.done, {"adversary": int(step.adversary[0])}
+        adversary = step.adversary[0]
+        info: dict[str, Any] = {"adversary": int(adversary) if adversary.ndim == 0 else adversary}
+        over = step.done
+        if step.diverged is not None:
+            info["diverged"] = bool(step.diverged[0])
+            over = over or info["diverged"]
+        return step.observation[0], float(step.reward[0]), False, over, info

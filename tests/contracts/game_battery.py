@@ -29,8 +29,8 @@ def _episode(env: VariationEnv, seed: int) -> list[Any]:
     env.action_space.seed(seed)
     seen: list[Any] = [env.reset(seed=seed)[0].tobytes()]
     for _ in range(envs.spec(env.variation.task).horizon):
-        observation, *rest = env.step(env.action_space.sample())
-        seen.append((observation.tobytes(), *rest))
+        observation, *rest, info = env.step(env.action_space.sample())
+        seen.append((observation.tobytes(), *rest, {name: np.asarray(value).tolist() for name, value in info.items()}))
     return seen
 
 

@@ -30,10 +30,21 @@ def test_every_row_is_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len({v.adversary for v in seen}) == 32
 
 
+def test_a_simulated_problem_is_held_to_dm_control_and_to_raw_physics() -> None:
+    result = env.run("dmc-reacher-hard", batch=2, seconds=0.01)
+    assert (result["problem"], result["batch"]) == ("dmc-reacher-hard", 2)
+    assert result["ratio"] == pytest.approx(result["steps_per_s"] / result["dm_control_steps_per_s"])
+    assert result["limit_ratio"] == pytest.approx(result["steps_per_s"] / result["mj_step_steps_per_s"])
+    assert result["mj_step_steps_per_s"] > result["dm_control_steps_per_s"] > 1e2
+    assert json.loads(json.dumps(result)) == result
+    assert f"{result['ratio']:.2f} times a plain dm_control loop" in env.describe(result)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"problem": "lightroom"}, r"problem = 'lightroom': choose one of darkroom"),
+        ({"problem": "lightroom"}, r"problem = 'lightroom'.*choose one of darkroom"),
+        ({"problem": "dmc-walker-rum"}, r"did you mean 'dmc-walker-run'"),
         ({"batch": 0}, r"batch = 0"),
         ({"seconds": 0.0}, r"seconds = 0\.0"),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrl_dist import envs
-from icrl_dist.envs import darkroom
+from icrl_dist.envs import darkroom, network, problems
 from icrl_dist.types import Adversary, Task, Variation
 from tests.contracts.game_battery import BATTERY, MakeVariation
 
@@ -21,7 +21,22 @@ def quiet_room() -> Variation:
     return Variation(darkroom.task((3, 0), 4, 6))
 
 
-@pytest.mark.parametrize("make_variation", [disturbed_room, quiet_room])
+def pushed(kind: str) -> Callable[[], Variation]:
+    """A problem of DeepMind Control, in short episodes, pushed by a fixed network."""
+
+    def make() -> Variation:
+        task = problems.grid(kind, 2)[1].replace(horizon=12)
+        forces = problems.problem(kind).forces["paper"].count
+        return Variation(task, network.network(1, envs.spec(task).observation, forces))
+
+    make.__name__ = kind
+    return make
+
+
+GAMES = [disturbed_room, quiet_room, *map(pushed, problems.PROBLEMS)]
+
+
+@pytest.mark.parametrize("make_variation", GAMES, ids=lambda make: make.__name__)
 @pytest.mark.parametrize("law", BATTERY)
 def test_contract(law: Callable[[MakeVariation], None], make_variation: MakeVariation) -> None:
     law(make_variation)

@@ -26,7 +26,9 @@ def decisions(spec, steps, seed, noise=0.1):
     made = []
     for _ in range(steps):
         state = rng.normal(size=(B, D)).astype(np.float32)
-        action = rng.integers(spec.actions, size=B) if spec.discrete else rng.uniform(-1, 1, (B, spec.actions)).astype(np.float32)
+        action = (
+            rng.integers(spec.actions, size=B) if spec.discrete else rng.uniform(-1, 1, (B, spec.actions)).astype(np.float32)
+        )
         taken = np.eye(spec.actions)[action] if spec.discrete else action
         comes = np.einsum("bd,ba,dao->bo", state, taken, law) + noise * rng.normal(size=(B, spec.observation + 1))
         before = rng.uniform(0, 1, (B, spec.observation)).astype(np.float32)

@@ -1,0 +1,67 @@
+"""ICAG's adversary of the continuous games: a network with fixed random weights (appendix C.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32
+
+from icrl_dist.types import NULL, Adversary, Spec
+
+HIDDEN = 64
+"""Units of its two hidden layers."""
+_GAIN = 3.0  # of the last layer: outputs that reach their bounds now and then, and change sign within an episode
+
+
+def network(seed: int, inputs: int, outputs: int, strength: float = 1.0) -> Adversary:
+    """The adversary whose weights are drawn from ``seed``: observation to action, at most ``strength`` either way."""
+    return Adversary.of("network", seed=seed, inputs=inputs, outputs=outputs, strength=strength)
+
+
+def networks(rng: np.random.Generator, count: int, spec: Spec, outputs: int, strength: float) -> tuple[Adversary, ...]:
+    """K adversaries of one task; the first is always phi_0 (section 4.1)."""
+    seeds = rng.integers(2**31, size=count - 1)
+    return (NULL, *(network(int(seed), spec.observation, outputs, strength) for seed in seeds))
+
+
+def weights(adversary: Adversary) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Weights and biases of the three layers in turn, rebuilt bit for bit from the seed."""
+    inputs, outputs = int(adversary.number("inputs")), int(adversary.number("outputs"))
+    rng = np.random.default_rng(int(adversary.number("seed")))
+    layers: list[np.ndarray] = []
+    for rows, columns, gain in ((inputs, HIDDEN, 1.0), (HIDDEN, HIDDEN, 1.0), (HIDDEN, outputs, _GAIN)):
+        layers.append((gain * rng.standard_normal((rows, columns)) / np.sqrt(rows)).astype(np.float32))
+        layers.append(rng.standard_normal(columns).astype(np.float32) * np.float32(0.1))
+    return tuple(layers)  # type: ignore[return-value]
+
+
+class Networks:
+    """The adversaries of B variations, each asked about its own row."""
+
+    def __init__(self, adversaries: Sequence[Adversary], spec: Spec, outputs: int) -> None:
+        """Raises ValueError for an adversary of another family, or made for other widths."""
+        for one in adversaries:
+            if one.kind not in ("null", "network"):
+                raise ValueError(f"adversary {one.kind!r}: a continuous game knows null and network")
+            if one.kind == "network" and (one["inputs"], one["outputs"]) != (spec.observation, outputs):
+                raise ValueError(
+                    f"adversary of {one['inputs']} inputs and {one['outputs']} outputs: this game has {spec.observation} "
+                    f"observation components and {outputs} of disturbance; make it with network(seed, inputs, outputs)"
+                )
+        self._rows = [row for row, one in enumerate(adversaries) if one.kind == "network"]
+        self._layers = [np.stack(same) for same in zip(*(weights(adversaries[row]) for row in self._rows), strict=True)]
+        self._strength = np.array([[adversaries[row].number("strength")] for row in self._rows], np.float32)
+        self._shape = (len(adversaries), outputs)
+        low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
+
+    def act(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B F"]:
+        """Each row's disturbance, 0 where there is no adversary."""
+        out = np.zeros(self._shape, np.float32)
+        if self._rows:
+            x = ((observation[self._rows] - self._middle) / self._half)[:, None]
+            for number in range(0, len(self._layers), 2):
+                x = np.tanh(x @ self._layers[number] + self._layers[number + 1][:, None])
+            out[self._rows] = x[:, 0] * self._strength
+        return out

@@ -1,0 +1,201 @@
+"""What dm_control's six domains show and reward, for a whole batch of simulations at once.
+
+The same formulas as ``dm_control.suite``, on the arrays of all rows together: there a step spends
+most of its time in indexing by name, here it is paid once for the batch.  Tests hold both to each
+other, step by step, under forces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from dm_control.utils.rewards import tolerance
+from jaxtyping import Float64, Int64
+
+Array = Float64[np.ndarray, "B ..."]
+_XX, _XZ, _ZZ = 0, 2, 8  # places in a rotation matrix
+
+
+class Rows:
+    """The data of B simulations of one model's shape, by MuJoCo's names, stacked when they are asked for."""
+
+    def __init__(self, models: Sequence[mujoco.MjModel], data: Sequence[mujoco.MjData]) -> None:
+        self.model = models[0]
+        """The shape that all share; masses, frictions and positions are each row's own."""
+        self._models, self._data = models, data
+        self._fields: dict[str, tuple[list[np.ndarray], np.ndarray, np.ndarray]] = {}
+        self._numbers: dict[tuple[mujoco.mjtObj, str], int] = {}
+        self._readings: dict[tuple[Any, ...], Int64[np.ndarray, " R"]] = {}
+
+    def __call__(self, field: str) -> Array:
+        """This field of ``MjData`` in every row, ``(B, ...)``: valid until it is asked for again."""
+        if field not in self._fields:
+            views = [getattr(data, field) for data in self._data]
+            stacked = np.stack(views)
+            self._fields[field] = [view.reshape(-1) for view in views], stacked.reshape(-1), stacked
+        flat, into, stacked = self._fields[field]
+        np.concatenate(flat, out=into)
+        return stacked
+
+    def body(self, name: str) -> int:
+        """Number of the body of this name."""
+        return self._number(mujoco.mjtObj.mjOBJ_BODY, name)
+
+    def geom(self, name: str) -> int:
+        """Number of the geom of this name."""
+        return self._number(mujoco.mjtObj.mjOBJ_GEOM, name)
+
+    def sensor(self, *names: str) -> Array:
+        """The readings of sensors, one after the other."""
+        if names not in self._readings:
+            self._readings[names] = self._places([self._number(mujoco.mjtObj.mjOBJ_SENSOR, name) for name in names])
+        return self("sensordata")[:, self._readings[names]]
+
+    def sensors(self, *kinds: mujoco.mjtSensor) -> Array:
+        """The readings of all sensors of these kinds, in the model's order."""
+        if kinds not in self._readings:
+            ids = np.flatnonzero(np.isin(self.model.sensor_type, [kind.value for kind in kinds]))
+            self._readings[kinds] = self._places(ids.tolist())
+        return self("sensordata")[:, self._readings[kinds]]
+
+    def _number(self, kind: mujoco.mjtObj, name: str) -> int:
+        if (kind, name) not in self._numbers:
+            self._numbers[kind, name] = int(mujoco.mj_name2id(self.model, kind, name))
+        return self._numbers[kind, name]
+
+    def _places(self, sensors: Sequence[int]) -> Int64[np.ndarray, " R"]:
+        first, size = self.model.sensor_adr, self.model.sensor_dim
+        return np.concatenate([np.arange(first[i], first[i] + size[i], dtype=np.int64) for i in sensors])
+
+    def sizes(self, geom: str) -> Array:
+        """First size of a geom in every row."""
+        number = self.geom(geom)
+        return np.array([model.geom_size[number, 0] for model in self._models])
+
+
+class Domain(NamedTuple):
+    """What one domain of the suite shows, and what each of its tasks pays."""
+
+    observe: Callable[[Rows], list[Array]]
+    rewards: dict[str, Callable[[Rows], Array]]
+
+
+def _flat(array: Array) -> Array:
+    return array.reshape(len(array), -1)
+
+
+def _cartpole_shows(rows: Rows) -> list[Array]:
+    return [rows("qpos")[:, :1], rows("xmat")[:, 2, [_ZZ, _XZ]], rows("qvel")]
+
+
+def _balanced(rows: Rows) -> Array:
+    upright = (rows("xmat")[:, 2, _ZZ] + 1) / 2
+    centered = (1 + tolerance(rows("qpos")[:, 0], margin=2)) / 2
+    small_control = (4 + tolerance(rows("ctrl")[:, 0], margin=1, value_at_margin=0, sigmoid="quadratic")) / 5
+    small_velocity = (1 + tolerance(rows("qvel")[:, 1], margin=5)) / 2
+    return np.asarray(upright * small_control * small_velocity * centered)
+
+
+def _planar_shows(rows: Rows) -> list[Array]:
+    return [rows("qpos")[:, 1:], rows("qvel")]
+
+
+def _speed(rows: Rows) -> Array:
+    return rows.sensor("torso_subtreelinvel")[:, 0]
+
+
+def _ran(rows: Rows) -> Array:
+    return _fast(_speed(rows), 10.0, 10.0, 0.0)
+
+
+def _fast(speed: Array, least: float, margin: float, at_margin: float) -> Array:
+    return np.asarray(
+        tolerance(speed, bounds=(least, float("inf")), margin=margin, value_at_margin=at_margin, sigmoid="linear")
+    )
+
+
+def _hopper_shows(rows: Rows) -> list[Array]:
+    return [*_planar_shows(rows), np.log1p(rows.sensor("touch_toe", "touch_heel"))]
+
+
+def _on_its_foot(rows: Rows) -> Array:
+    places = rows("xipos")
+    return np.asarray(tolerance(places[:, rows.body("torso"), 2] - places[:, rows.body("foot"), 2], (0.6, 2)))
+
+
+def _stood(rows: Rows) -> Array:
+    small_control = tolerance(rows("ctrl"), margin=1, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
+    return np.asarray(_on_its_foot(rows) * (small_control + 4) / 5)
+
+
+def _hopped(rows: Rows) -> Array:
+    return np.asarray(_on_its_foot(rows) * _fast(_speed(rows), 2.0, 1.0, 0.5))
+
+
+def _to_target(rows: Rows) -> Array:
+    places = rows("geom_xpos")
+    return places[:, rows.geom("target"), :2] - places[:, rows.geom("finger"), :2]
+
+
+def _reacher_shows(rows: Rows) -> list[Array]:
+    return [rows("qpos"), _to_target(rows), rows("qvel")]
+
+
+def _reached(rows: Rows) -> Array:
+    radii = rows.sizes("target") + rows.sizes("finger")
+    return (np.linalg.norm(_to_target(rows), axis=1) <= radii).astype(np.float64)
+
+
+def _walker_shows(rows: Rows) -> list[Array]:
+    height = rows("xpos")[:, [rows.body("torso")], 2]
+    return [_flat(rows("xmat")[:, 1:, [_XX, _XZ]]), height, rows("qvel")]
+
+
+def _walked(least: float) -> Callable[[Rows], Array]:
+    def reward(rows: Rows) -> Array:
+        torso = rows.body("torso")
+        standing = tolerance(rows("xpos")[:, torso, 2], bounds=(1.2, float("inf")), margin=0.6)
+        stands = (3 * standing + (1 + rows("xmat")[:, torso, _ZZ]) / 2) / 4
+        return np.asarray(stands * (5 * _fast(_speed(rows), least, least / 2, 0.5) + 1) / 6)
+
+    return reward
+
+
+def _quadruped_shows(rows: Rows) -> list[Array]:
+    model, kind = rows.model, mujoco.mjtSensor
+    hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE.value)
+    return [
+        rows("qpos")[:, model.jnt_qposadr[hinges]],
+        rows("qvel")[:, model.jnt_dofadr[hinges]],
+        rows("act"),
+        rows.sensor("velocimeter"),
+        rows("xmat")[:, [rows.body("torso")], _ZZ],
+        rows.sensors(kind.mjSENS_GYRO, kind.mjSENS_ACCELEROMETER),
+        np.arcsinh(rows.sensors(kind.mjSENS_FORCE, kind.mjSENS_TORQUE)),
+    ]
+
+
+def _moved(least: float) -> Callable[[Rows], Array]:
+    def reward(rows: Rows) -> Array:
+        upright = _fast(rows("xmat")[:, rows.body("torso"), _ZZ], 1.0, 2.0, 0.0)
+        return np.asarray(upright * _fast(rows.sensor("velocimeter")[:, 0], least, least, 0.5))
+
+    return reward
+
+
+DOMAINS: dict[str, Domain] = {
+    "cartpole": Domain(_cartpole_shows, {"balance": _balanced, "swingup": _balanced}),
+    "cheetah": Domain(_planar_shows, {"run": _ran}),
+    "hopper": Domain(_hopper_shows, {"stand": _stood, "hop": _hopped}),
+    "quadruped": Domain(_quadruped_shows, {"walk": _moved(0.5), "run": _moved(5.0)}),
+    "reacher": Domain(_reacher_shows, {"easy": _reached, "hard": _reached}),
+    "walker": Domain(_walker_shows, {"walk": _walked(1.0), "run": _walked(8.0)}),
+}
+
+
+def observed(rows: Rows, domain: str) -> Array:
+    """The observation of every row: dm_control's dict, flattened in its order."""
+    return np.concatenate(DOMAINS[domain].observe(rows), axis=1)
