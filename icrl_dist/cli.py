@@ -112,12 +112,13 @@ class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
     name: tyro.conf.Positional[Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext"]]
-    """``env``: environment steps a second, of simulated problems beside dm_control's own loop; ``stream``: trajectories a second through the stream
-    and, in the same run, as Ray actor returns; ``ingest``: trajectories a second onto the disk, with
-    and without fsync; ``broadcast``: weights to eight processes, beside ``ray.put`` and ``get``;
-    ``recovery``: how soon a run is at work again after a worker or the learner was killed;
-    ``soak``: does any process of a long run grow; ``fuzz``: 100,000 hostile inputs to every reader
-    of bytes; ``incontext``: deployment and training of the model, beside DPT's official layout."""
+    """``env``: environment steps a second, of simulated problems beside dm_control's own loop;
+    ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
+    ``ingest``: trajectories a second onto the disk, with and without fsync; ``broadcast``: weights
+    to eight processes, beside ``ray.put`` and ``get``; ``recovery``: how soon a run is at work again
+    after a worker or the learner was killed; ``soak``: does any process of a long run grow;
+    ``fuzz``: 100,000 hostile inputs to every reader of bytes; ``incontext``: deployment and
+    training of the model, beside DPT's official layout."""
     problem: str = "darkroom"
     """Which environment (env only): ``darkroom``, or one such as ``dmc-cheetah-run``."""
     seconds: float | None = None

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from icrl_dist.envs import darkroom, problems
+from icrl_dist.envs import darkroom, pick_place, problems
 from icrl_dist.envs.variation import VariationEnv
 from icrl_dist.tables import nearest
 from icrl_dist.types import Spec, Step, Task, Variation
@@ -25,7 +25,7 @@ class Batch(Protocol):
     def step(self, actions: Int[np.ndarray, " B"] | Float32[np.ndarray, "B A"]) -> Step: ...
 
 
-KINDS = ("darkroom", *problems.PROBLEMS)
+KINDS = ("darkroom", pick_place.KIND, *problems.PROBLEMS)
 """Every problem there is: the kinds of tasks."""
 
 
@@ -42,7 +42,12 @@ def batch(variations: Sequence[Variation]) -> Batch:
     _known(kinds[0])
     if kinds[0] == "darkroom":
         return darkroom.DarkRoom(variations)
-    from icrl_dist.envs import dmc  # MuJoCo takes a moment to import: for those who simulate
+    # MuJoCo takes a moment to import: only for those who simulate.
+    if kinds[0] == pick_place.KIND:
+        from icrl_dist.envs import metaworld
+
+        return metaworld.PickPlace(variations)
+    from icrl_dist.envs import dmc
 
     return dmc.Variations(variations)
 
@@ -50,7 +55,8 @@ def batch(variations: Sequence[Variation]) -> Batch:
 def spec(task: Task) -> Spec:
     """Shape of the task's observations and actions."""
     _known(task.kind)
-    return darkroom.spec(task) if task.kind == "darkroom" else problems.spec(task)
+    of = {"darkroom": darkroom.spec, pick_place.KIND: pick_place.spec}.get(task.kind, problems.spec)
+    return of(task)
 
 
 def make(variation: Variation) -> VariationEnv:

@@ -17,10 +17,8 @@ from jaxtyping import Float32
 
 from icrl_dist.envs.network import Networks
 from icrl_dist.envs.problems import AXES, HORIZON, Preset, problem, spec
-from icrl_dist.envs.suite import DOMAINS, Rows, observed
+from icrl_dist.envs.suite import BROKEN, DOMAINS, Rows, observed
 from icrl_dist.types import Step, Task, Variation
-
-_BAD = [mujoco.mjtWarning.mjWARN_BADQPOS.value, mujoco.mjtWarning.mjWARN_BADQVEL.value, mujoco.mjtWarning.mjWARN_BADQACC.value]
 
 
 def suite_environment(kind: str) -> Any:
@@ -96,7 +94,7 @@ class DMC:
                 push[:] = wrench
                 self._advance(model, data)
         self._h += 1
-        self._diverged |= np.stack(self._warnings)[:, _BAD].any(axis=1)
+        self._diverged |= np.stack(self._warnings)[:, BROKEN].any(axis=1)
         reward = np.where(self._diverged, 0.0, self._reward(self._rows)).astype(np.float32)
         self._shown = np.where(self._diverged[:, None], self._shown, self._observe())
         return Step(self._shown, reward, self._h == self.spec.horizon, pushes, self._diverged.copy())

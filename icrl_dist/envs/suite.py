@@ -16,6 +16,8 @@ from dm_control.utils.rewards import tolerance
 from jaxtyping import Float64, Int64
 
 Array = Float64[np.ndarray, "B ..."]
+BROKEN = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{of}").value for of in ("POS", "VEL", "ACC")]
+"""MuJoCo's warnings of a simulation that has broken down, which it then begins anew."""
 _XX, _XZ, _ZZ = 0, 2, 8  # places in a rotation matrix
 
 

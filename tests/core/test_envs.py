@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icrl_dist import envs
-from icrl_dist.envs import darkroom, network, problems
+from icrl_dist.envs import darkroom, network, pick_place, problems
 from icrl_dist.types import Adversary, Task, Variation
-from tests.contracts.game_battery import BATTERY, MakeVariation
+from tests.contracts.game_battery import BATTERY, MakeVariation, an_unseeded_reset_goes_on
 
 
 def disturbed_room() -> Variation:
@@ -33,12 +33,20 @@ def pushed(kind: str) -> Callable[[], Variation]:
     return make
 
 
-GAMES = [disturbed_room, quiet_room, *map(pushed, problems.PROBLEMS)]
+def blurred_reach() -> Variation:
+    """Meta-World's pick-place, seen through a fixed network."""
+    task = pick_place.task((0.02, 0.65, 0.02), (0.05, 0.85, 0.2), horizon=12)
+    return Variation(task, network.network(1, 39, pick_place.MOVED))
+
+
+GAMES = [disturbed_room, quiet_room, blurred_reach, *map(pushed, problems.PROBLEMS)]
 
 
 @pytest.mark.parametrize("make_variation", GAMES, ids=lambda make: make.__name__)
 @pytest.mark.parametrize("law", BATTERY)
 def test_contract(law: Callable[[MakeVariation], None], make_variation: MakeVariation) -> None:
+    if law is an_unseeded_reset_goes_on and make_variation is blurred_reach:
+        pytest.skip("a task of Meta-World begins always alike: nothing in an episode is drawn but the actions")
     law(make_variation)
 
 
