@@ -112,7 +112,7 @@ class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
     name: tyro.conf.Positional[Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext"]]
-    """``env``: environment steps a second, of simulated problems beside dm_control's own loop;
+    """``env``: environment steps a second, of simulated problems beside their library's own loop;
     ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
     ``ingest``: trajectories a second onto the disk, with and without fsync; ``broadcast``: weights
     to eight processes, beside ``ray.put`` and ``get``; ``recovery``: how soon a run is at work again

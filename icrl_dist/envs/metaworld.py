@@ -70,7 +70,7 @@ class PickPlace:
         self._adversaries = Networks([v.adversary for v in variations], self.spec, pick_place.MOVED)
         self._metres = pick_place.disturbance(tasks[0])
         self._shows_goal = bool(tasks[0].get("goal_shown", 0))
-        self._envs = [_environment(one) for one in tasks]
+        self._envs = [environment(one) for one in tasks]
         self._goals = np.array([one.vector("goal") for one in tasks])
         self._low, self._high = (np.array(bound, np.float32) for bound in (self.spec.low, self.spec.high))
         self._h = self.spec.horizon
@@ -123,7 +123,7 @@ class PickPlace:
         return np.clip(shown, self._low, self._high), moved
 
 
-def _environment(task: Task) -> Any:
+def environment(task: Task) -> Any:
     """Meta-World's environment, its object and goal fixed to the task's."""
     from metaworld.envs import SawyerPickPlaceEnvV3
     from metaworld.types import Task as TheirTask
