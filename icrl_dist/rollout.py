@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int16, Int64
+from jaxtyping import Bool, Float, Float32, Int16, Int64
 
 from icrl_dist.config import ConfigError, ContextConfig, Deployment, default_deployment
 from icrl_dist.envs import Batch
@@ -199,7 +199,9 @@ class Episodes:
     actions: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H A"]
     observations: Float32[np.ndarray, "B H+1 S"]
     rewards: Float32[np.ndarray, "B H"]
-    adversary: Int16[np.ndarray, "B H"]
+    adversary: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H F"]
+    diverged: Bool[np.ndarray, " B"] | None = None
+    """Rows that nothing may be learned from; None for a game that cannot break down."""
 
     @property
     def returns(self) -> Float[np.ndarray, " B"]:
@@ -233,6 +235,7 @@ def episode(env: Batch, policy: Policy | InContextPolicy, rngs: Sequence[np.rand
         actions=np.stack(actions, axis=1),
         rewards=np.stack(rewards, axis=1),
         adversary=np.stack(adversary, axis=1),
+        diverged=step.diverged,
     )
 
 
