@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from icrl_dist.games import ControlConfig, SACConfig
 from icrl_dist.limits import validate
 from icrl_dist.tables import ConfigError, build, dumps, nearest
 
@@ -199,7 +200,8 @@ class EvaluateConfig:
     episodes: int = 40
     """Online episodes a task."""
     p: tuple[float, ...] = (0.0, 0.2)
-    """Override probabilities that are tested."""
+    """Override probabilities that are tested; in a continuous game, strengths of its adversary, of
+    which 1 is ``control.strength``."""
     prior: Literal["uniform", "unseen"] = "unseen"
     """The test adversary's law: ``unseen`` Dirichlet priors, or ``uniform`` over the actions."""
     seeds: int = 10
@@ -258,7 +260,12 @@ class Run:
     """Which method of section 4 pretrains the transformer."""
     seed: int = 0
     """Every random draw of the run is keyed by this and by the identity of the work."""
+    problem: str = "darkroom"
+    """What it is about: ``darkroom``, ``metaworld-pick-place``, or one of DeepMind Control such as
+    ``dmc-cheetah-run``."""
     darkroom: DarkRoomConfig = field(default_factory=DarkRoomConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     practice: PracticeConfig = field(default_factory=PracticeConfig)
