@@ -63,12 +63,8 @@ class Lockstep:
         self._output_gradient = torch.empty(experts, config.batch, actor.sizes[-1], device=device)
         self._counts: list[Tensor] = []
         temperature = (arrays, "log_temperature", self._log_temperature, self._temperature_gradient, config.temperature_rate)
-        self._actor_adam = self._adam(
-            (arrays, "actor", self._actor.flat, self._actor.gradient, config.actor_rate), temperature
-        )
-        self._critic_adam = self._adam(
-            (arrays, "critic", self._critic.flat, self._critic.gradient, config.critic_rate)
-        )
+        self._actor_adam = self._adam((arrays, "actor", self._actor.flat, self._actor.gradient, config.actor_rate), temperature)
+        self._critic_adam = self._adam((arrays, "critic", self._critic.flat, self._critic.gradient, config.critic_rate))
 
     def _adam(self, *parts: tuple[Mapping[str, Tensor], str, Tensor, Tensor, float]) -> torch.optim.Adam:
         """Fused Adam whose moments are the ones that ``arrays`` holds."""
@@ -116,9 +112,7 @@ class Lockstep:
         self._target.flat.lerp_(self._critic.flat, self._config.tau)
         self._target.refresh()
 
-    def _descend_actor(
-        self, now: Drawn, by_action: Float[Tensor, "G B A"], temperature: Float[Tensor, " G"]
-    ) -> None:
+    def _descend_actor(self, now: Drawn, by_action: Float[Tensor, "G B A"], temperature: Float[Tensor, " G"]) -> None:
         """Down the mean of temperature * log likelihood - smaller value; the temperature towards entropy -A."""
         count, actions = now.actions.shape[1:]
         weight = (temperature / count).view(-1, 1, 1)

@@ -52,10 +52,12 @@ class Replay:
         """``batch`` transitions of each expert, each drawn alone, with replacement.  Raises IndexError if there are none."""
         if not self.added:
             raise IndexError("nothing to sample from: add transitions first")
-        experts, capacity, width = self._rows.shape
+        experts, _, width = self._rows.shape
         drawn = torch.randint(len(self), (experts, batch), generator=generator, device=self._rows.device)
         rows = self._rows.view(-1, width).index_select(0, (drawn + self._first).flatten())
-        observations, actions, rewards, following = rows.view(experts, batch, width).split(self._widths, dim=2)
+        observations, actions, rewards, following = torch.split_with_sizes(
+            rows.view(experts, batch, width), self._widths, dim=2
+        )
         return Transitions(observations, actions, rewards.squeeze(2), following)
 
     def state(self) -> dict[str, np.ndarray]:

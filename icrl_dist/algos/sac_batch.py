@@ -7,7 +7,7 @@ never their mean, so an expert learns the same in any company.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -21,12 +21,10 @@ from icrl_dist.algos.lockstep import Lockstep
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.stacked import Shape, outputs
+from icrl_dist.envs import Batch
 from icrl_dist.types import Spec
 
 Products = Literal["float32", "bfloat16"]
-
-_AT_ONCE = 2**20
-"""Numbers in the hidden layers of one pass, at most: beyond it they leave a processor's cache before they are read."""
 
 
 def pick(device: str) -> torch.device:
@@ -77,14 +75,7 @@ class SACBatch:
         self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        size = config.batch * max(config.hidden)
-        together = experts if self.device.type != "cpu" else max(1, _AT_ONCE // size)
-        self._parts = [slice(at, min(at + together, experts)) for at in range(0, experts, together)]
-        shapes, dtype = (self.actor_shape, self.critic_shape), getattr(torch, products)
-        self._locksteps = [
-            Lockstep({name: array[part] for name, array in self.arrays.items()}, *shapes, config, dtype)
-            for part in self._parts
-        ]
+        self._lockstep = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
 
     @torch.no_grad()
@@ -111,9 +102,20 @@ class SACBatch:
 
         ``noise`` is standard normal: the actions' at the observations, then at the following ones.
         """
-        for part, lockstep in zip(self._parts, self._locksteps, strict=True):
-            lockstep.update(Transitions(*(column[part] for column in batch)), noise[:, part])
+        self._lockstep.update(batch, noise)
         self.updates += 1
+
+    def remember(
+        self,
+        observations: Float32[np.ndarray, "N S"],
+        actions: Float32[np.ndarray, "N A"],
+        rewards: Float32[np.ndarray, " N"],
+        following: Float32[np.ndarray, "N S"],
+    ) -> None:
+        """One step of every expert's environment, for its replay."""
+        columns = (observations, actions, rewards, following)
+        self.replay.add(*(torch.from_numpy(np.ascontiguousarray(column)).to(self.device) for column in columns))
+        self.steps += 1
 
     def learn(self, generator: torch.Generator) -> None:
         """One update from the replay; ``generator``, on the experts' device, draws batch and noise."""
@@ -163,5 +165,55 @@ class SACBatch:
         for name, array in self.arrays.items():
             array.copy_(arrays[name])
         self.updates = updates
-        for lockstep in self._locksteps:
-            lockstep.refresh(updates)
+        self._lockstep.refresh(updates)
+
+
+def train(
+    env: Batch,
+    config: SACConfig,
+    steps: int,
+    seed: int,
+    progress: Callable[[SACBatch, Float[np.ndarray, " N"]], None] = lambda experts, returns: None,
+    device: str = "auto",
+    products: Products = "float32",
+    state: Mapping[str, np.ndarray] | None = None,
+) -> SACBatch:
+    """An expert for each of the N environments of ``env``, after ``steps`` steps in it.
+
+    ``progress`` hears the experts and their returns after every episode.  All draws are keyed by
+    ``seed`` and the episode: from a ``state`` that was taken in ``progress`` training goes on as if
+    it had never stopped.  Raises ValueError for a state within an episode, FloatingPointError if an
+    expert's weights stop being numbers.
+    """
+    horizon = env.spec.horizon
+    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps))
+    if state is not None:
+        experts.load(state)
+    if experts.steps % horizon:
+        raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon}: take it in `progress`")
+    while experts.steps < steps:
+        episode, total = experts.steps // horizon, np.zeros(experts.experts)
+        rng, *rngs = (np.random.default_rng(_key(seed, episode, row)) for row in range(experts.experts + 1))
+        generator = torch.Generator(experts.device).manual_seed(int(_key(seed, episode).generate_state(1, np.uint64)[0] >> 1))
+        seen = np.asarray(env.reset(rngs), np.float32)
+        for _ in range(min(horizon, steps - experts.steps)):
+            if experts.steps < config.random_steps:
+                action = rng.uniform(-1, 1, (experts.experts, env.spec.actions)).astype(np.float32)
+            else:
+                action = experts.act(seen, rng)
+            step = env.step(action)
+            experts.remember(seen, action, step.reward, step.observation)
+            if experts.steps > config.warmup and experts.steps % config.update_every == 0:
+                experts.learn(generator)
+            seen, total = step.observation, total + step.reward
+        lost = [i for i, row in enumerate(experts.arrays["actor"]) if not row.isfinite().all()]
+        if lost:
+            raise FloatingPointError(
+                f"weights of experts {lost} are not numbers at step {experts.steps}: lower the learning rates"
+            )
+        progress(experts, total)
+    return experts
+
+
+def _key(*key: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(key[0], spawn_key=key[1:])
