@@ -35,7 +35,7 @@ def draw(output: Float[Tensor, "G R O"], noise: Float[Tensor, "G R A"]) -> Drawn
     """The squashed Gaussian of the actor's outputs, at the noise given."""
     mean, raw = output.chunk(2, dim=2)
     log_deviation = raw.clamp(_LEAST, _MOST)
-    free = (raw == log_deviation).float()
+    free = (raw == log_deviation).to(raw.dtype)
     scaled = log_deviation.exp() * noise
     actions = (mean + scaled).tanh()
     inner = 1 - actions * actions

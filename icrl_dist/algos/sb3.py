@@ -79,8 +79,8 @@ def _pairs(
     model: stable_baselines3.SAC, shapes: Shapes, arrays: Mapping[str, Tensor], moments: bool
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Views of the same numbers, ours and theirs: every parameter and, if asked for, Adam's moments of it."""
-    heads = [model.actor.mu, model.actor.log_std]  # side by side in our last layer
-    networks = {
+    heads: list[Any] = [model.actor.mu, model.actor.log_std]  # side by side in our last layer
+    networks: dict[str, tuple[Shape, list[list[list[nn.Linear]]]]] = {
         "actor": (shapes[0], [[*_linear(model.actor.latent_pi), heads]]),
         "critic": (shapes[1], [_linear(part) for part in model.critic.q_networks]),
         "target": (shapes[1], [_linear(part) for part in model.critic_target.q_networks]),
