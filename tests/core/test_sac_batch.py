@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch
+from dm_control import suite
 from stable_baselines3.common.buffers import ReplayBufferSamples
 from stable_baselines3.common.logger import configure
 
@@ -145,7 +146,7 @@ def test_a_law_and_its_derivatives_are_those_of_torch_in_float64():
     output[..., A:] = output[..., A:] * 12 - 6
     output.requires_grad_()
     mean, raw = output.chunk(2, 2)
-    assert 0 < int((raw < -20).sum()) and 0 < int((raw > 2).sum())
+    assert int((raw < -20).sum()) > 0 and int((raw > 2).sum()) > 0
     normal = torch.distributions.Normal(mean, raw.clamp(-20, 2).exp())
     u = mean + raw.clamp(-20, 2).exp() * noise
     likelihood = (normal.log_prob(u) - (1 - u.tanh() ** 2 + 1e-6).log()).sum(2)
@@ -392,3 +393,56 @@ def test_what_it_cannot_be_made_of_is_refused(monkeypatch):
         state = SACBatch(2, SPEC, SMALL, 0, "cpu").state()
         engine = SACBatch(1, SPEC, SMALL, 0, "cpu")
         engine._take({name: torch.from_numpy(state[name]) for name in engine.arrays}, 0)
+
+
+class CartPole:
+    """dm_control's cartpole balance in N rows: 200 steps an episode, observations laid end to end."""
+
+    def __init__(self, batch):
+        self.spec, self.batch = Spec((-np.inf,) * 5, (np.inf,) * 5, 1, 200, discrete=False), batch
+        self._envs = [suite.load("cartpole", "balance") for _ in range(batch)]
+
+    def _step(self, steps):
+        self.time += 1
+        seen = [np.concatenate([np.ravel(part) for part in step.observation.values()]) for step in steps]
+        return np.array(seen, np.float32)
+
+    def reset(self, rngs):
+        self.time = -1
+        for env, rng in zip(self._envs, rngs, strict=True):
+            env.task._random = np.random.RandomState(rng.integers(2**31))
+        return self._step([env.reset() for env in self._envs])
+
+    def step(self, actions):
+        steps = [env.step(action) for env, action in zip(self._envs, actions, strict=True)]
+        rewards = np.array([step.reward for step in steps], np.float32)
+        return Step(self._step(steps), rewards, self.time == 200, np.full(self.batch, -1, np.int16))
+
+
+class Learned(Exception):
+    pass
+
+
+@pytest.mark.timeout(200)
+def test_an_expert_learns_to_balance_the_pole_within_12000_steps():
+    """Its mean action, in ten episodes of its own that it does not learn from, looked at every 1,000 steps."""
+    env, heard = CartPole(1), []
+    rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
+    config = SACConfig(hidden=(64, 64), batch=128, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
+
+    def look(experts, _):
+        if experts.steps % 1000:
+            return
+        total = 0.0
+        for episode in range(10):
+            seen = env.reset([np.random.default_rng((1, episode))])
+            for _ in range(200):
+                seen, reward, *_ = env.step(experts.act(seen, None, deterministic=True))
+                total += float(reward[0])
+        heard.append(total / 10)
+        if heard[-1] >= 190:
+            raise Learned
+
+    with pytest.raises(Learned):
+        train(CartPole(1), config, 12_000, 0, look, "cpu")
+    assert heard[0] < 170, "there was nothing to learn"
