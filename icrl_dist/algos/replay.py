@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -42,10 +42,19 @@ class Replay:
         actions: Float[Tensor, "N A"],
         rewards: Float[Tensor, " N"],
         following: Float[Tensor, "N S"],
+        lost: Bool[Tensor, " N"] | None = None,
     ) -> None:
-        """One transition of each expert, in the oldest's place if there is no other."""
+        """One transition of each expert, in the oldest's place if there is no other.
+
+        Nothing may be learned from those that are ``lost``: the expert's transition before stands in
+        their place once more (zeros, if it is the first).
+        """
         row = torch.cat([observations, actions, rewards.unsqueeze(1), following], dim=1)
-        self._rows[:, self.added % self._rows.shape[1]] = row
+        capacity = self._rows.shape[1]
+        if lost is not None:
+            before = self._rows[:, (self.added - 1) % capacity] if self.added else torch.zeros_like(row)
+            row = torch.where(lost.unsqueeze(1), before, row)
+        self._rows[:, self.added % capacity] = row
         self.added += 1
 
     def sample(self, batch: int, generator: torch.Generator) -> Transitions:

@@ -22,7 +22,7 @@ from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.stacked import Shape, outputs
 from icrl_dist.envs import Batch
-from icrl_dist.types import Spec
+from icrl_dist.types import Spec, Step
 
 Products = Literal["float32", "bfloat16"]
 
@@ -105,15 +105,9 @@ class SACBatch:
         self._lockstep.update(batch, noise)
         self.updates += 1
 
-    def remember(
-        self,
-        observations: Float32[np.ndarray, "N S"],
-        actions: Float32[np.ndarray, "N A"],
-        rewards: Float32[np.ndarray, " N"],
-        following: Float32[np.ndarray, "N S"],
-    ) -> None:
-        """One step of every expert's environment, for its replay."""
-        columns = (observations, actions, rewards, following)
+    def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
+        """One step of every expert's environment, for its replay; a simulation that has broken down teaches nothing."""
+        columns = (observations, actions, step.reward, step.observation, *(() if step.diverged is None else (step.diverged,)))
         self.replay.add(*(torch.from_numpy(np.ascontiguousarray(column)).to(self.device) for column in columns))
         self.steps += 1
 
@@ -202,7 +196,7 @@ def train(
             else:
                 action = experts.act(seen, rng)
             step = env.step(action)
-            experts.remember(seen, action, step.reward, step.observation)
+            experts.remember(seen, action, step)
             if experts.steps > config.warmup and experts.steps % config.update_every == 0:
                 experts.learn(generator)
             seen, total = step.observation, total + step.reward

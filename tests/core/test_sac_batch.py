@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch
-from dm_control import suite
 from stable_baselines3.common.buffers import ReplayBufferSamples
 from stable_baselines3.common.logger import configure
 
+from icrl_dist import envs
 from icrl_dist.algos.lockstep import draw
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.sac import Expert, SACConfig
 from icrl_dist.algos.sac_batch import SACBatch, pick, train
 from icrl_dist.algos.stacked import outputs
-from icrl_dist.types import Spec, Step
+from icrl_dist.envs import problems
+from icrl_dist.types import Spec, Step, Variation
 
 S, A, N = 17, 6, 3
 SPEC = Spec((-10.0,) * S, (10.0,) * S, A, 200, discrete=False)
@@ -244,7 +245,8 @@ def test_no_update_touches_the_global_generators(tmp_path):
     engine = SACBatch(1, SPEC, SMALL, 0, "cpu")
     engine.save_sb3(0, tmp_path / "expert.zip")
     engine.load_sb3([tmp_path / "expert.zip"])
-    engine.remember(*(np.ones(shape, np.float32) for shape in ((1, S), (1, A), (1,), (1, S))))
+    seen, acted = np.ones((1, S), np.float32), np.ones((1, A), np.float32)
+    engine.remember(seen, acted, Step(seen, np.ones(1, np.float32), False, np.zeros((1, 2), np.float32)))
     engine.learn(torch.Generator().manual_seed(0))
     assert torch.equal(before[0], torch.get_rng_state()) and before[1] == np.random.get_state()[1].tolist()
 
@@ -308,6 +310,15 @@ class Line:
         return Step(self._seen(), self.at, self.time == self.spec.horizon, np.full(self.batch, -1, np.int16))
 
 
+class Broken(Line):
+    """The second row breaks down at step 3, and shows no numbers from then on."""
+
+    def step(self, actions):
+        made = super().step(actions)
+        lost = np.array([False, self.time >= 3])
+        return made._replace(reward=np.where(lost, np.nan, made.reward).astype(np.float32), diverged=lost)
+
+
 LINE = SACConfig(hidden=(8,), batch=4, random_steps=5, warmup=10, update_every=3, replay=1000)
 
 
@@ -369,15 +380,26 @@ def test_a_training_draws_by_its_seed_alone_and_goes_on_from_a_state():
         train(Line(2), LINE, 70, 5, device="cpu", state=cut)
 
 
+class Wild(Broken):
+    """Says nothing of it."""
+
+    def step(self, actions):
+        return super().step(actions)._replace(diverged=None)
+
+
+def test_a_simulation_that_breaks_down_teaches_nothing():
+    engine = train(Broken(2), LINE, 28, 0, device="cpu")
+    rows = engine.replay.state()["rows"]
+    assert np.isfinite(rows).all() and engine.updates > 0
+    assert rows[0, :7, 1].tolist() == [0, 1, 2, 3, 4, 5, 6] and rows[1, :8, 1].tolist() == [0, 1, 1, 1, 1, 1, 1, 0]
+    first = Replay(1, 4, 2, 1, torch.device("cpu"))
+    first.add(torch.ones(1, 2), torch.ones(1, 1), torch.ones(1), torch.ones(1, 2), torch.tensor([True]))
+    assert not first.state()["rows"].any()
+
+
 def test_weights_that_are_no_numbers_stop_a_training():
     with pytest.raises(FloatingPointError, match=r"experts \[1\] .* step 14: lower the learning rates"):
-        train(Broken(2), LINE, 28, 0, device="cpu")
-
-
-class Broken(Line):
-    def step(self, actions):
-        made = super().step(actions)
-        return made._replace(reward=np.array([0.0, np.nan], np.float32))
+        train(Wild(2), LINE, 28, 0, device="cpu")
 
 
 def test_what_it_cannot_be_made_of_is_refused(monkeypatch):
@@ -395,38 +417,15 @@ def test_what_it_cannot_be_made_of_is_refused(monkeypatch):
         engine._take({name: torch.from_numpy(state[name]) for name in engine.arrays}, 0)
 
 
-class CartPole:
-    """dm_control's cartpole balance in N rows: 200 steps an episode, observations laid end to end."""
-
-    def __init__(self, batch):
-        self.spec, self.batch = Spec((-np.inf,) * 5, (np.inf,) * 5, 1, 200, discrete=False), batch
-        self._envs = [suite.load("cartpole", "balance") for _ in range(batch)]
-
-    def _step(self, steps):
-        self.time += 1
-        seen = [np.concatenate([np.ravel(part) for part in step.observation.values()]) for step in steps]
-        return np.array(seen, np.float32)
-
-    def reset(self, rngs):
-        self.time = -1
-        for env, rng in zip(self._envs, rngs, strict=True):
-            env.task._random = np.random.RandomState(rng.integers(2**31))
-        return self._step([env.reset() for env in self._envs])
-
-    def step(self, actions):
-        steps = [env.step(action) for env, action in zip(self._envs, actions, strict=True)]
-        rewards = np.array([step.reward for step in steps], np.float32)
-        return Step(self._step(steps), rewards, self.time == 200, np.full(self.batch, -1, np.int16))
-
-
-class Learned(Exception):
+class LearnedError(Exception):
     pass
 
 
 @pytest.mark.timeout(200)
 def test_an_expert_learns_to_balance_the_pole_within_12000_steps():
     """Its mean action, in ten episodes of its own that it does not learn from, looked at every 1,000 steps."""
-    env, heard = CartPole(1), []
+    pole, heard = [Variation(problems.task("dmc-cartpole-balance"))], []
+    env = envs.batch(pole)
     rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
     config = SACConfig(hidden=(64, 64), batch=128, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
 
@@ -441,8 +440,8 @@ def test_an_expert_learns_to_balance_the_pole_within_12000_steps():
                 total += float(reward[0])
         heard.append(total / 10)
         if heard[-1] >= 190:
-            raise Learned
+            raise LearnedError
 
-    with pytest.raises(Learned):
-        train(CartPole(1), config, 12_000, 0, look, "cpu")
+    with pytest.raises(LearnedError):
+        train(envs.batch(pole), config, 12_000, 0, look, "cpu")
     assert heard[0] < 170, "there was nothing to learn"
