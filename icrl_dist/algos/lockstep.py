@@ -14,6 +14,11 @@ from icrl_dist.algos.replay import Transitions
 from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.stacked import Buffers, Perceptrons, Shape
 
+TRAINED = ("actor", "critic", "log_temperature")
+"""What Adam trains."""
+MOMENTS = ("exp_avg", "exp_avg_sq")
+"""Adam's averages of gradients and of their squares, by torch's names."""
+
 _SLACK = 1e-6  # stable-baselines3's: keeps the logarithm of 1 - a^2 finite
 _LEAST, _MOST = -20.0, 2.0  # of the logarithm of the standard deviation, as in stable-baselines3
 
@@ -51,7 +56,8 @@ class Lockstep:
         self, arrays: Mapping[str, Tensor], actor: Shape, critic: Shape, config: SACConfig, dtype: torch.dtype
     ) -> None:
         """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place."""
-        self._config, experts, device = config, len(arrays["actor"]), arrays["actor"].device
+        experts, device = len(arrays["actor"]), arrays["actor"].device
+        self._config, self._arrays = config, arrays
         both = {name: arrays[name].view(2 * experts, -1) for name in ("critic", "target")}
         self._actor = Perceptrons(actor, arrays["actor"], dtype)
         self._critic = Perceptrons(critic, both["critic"], dtype)
@@ -62,19 +68,20 @@ class Lockstep:
         self._critic_buffers = Buffers(critic, 2 * experts, config.batch, dtype, device)
         self._output_gradient = torch.empty(experts, config.batch, actor.sizes[-1], device=device)
         self._counts: list[Tensor] = []
-        temperature = (arrays, "log_temperature", self._log_temperature, self._temperature_gradient, config.temperature_rate)
-        self._actor_adam = self._adam((arrays, "actor", self._actor.flat, self._actor.gradient, config.actor_rate), temperature)
-        self._critic_adam = self._adam((arrays, "critic", self._critic.flat, self._critic.gradient, config.critic_rate))
+        self._actor_adam = self._adam(
+            ("actor", self._actor.flat, self._actor.gradient, config.actor_rate),
+            ("log_temperature", self._log_temperature, self._temperature_gradient, config.temperature_rate),
+        )
+        self._critic_adam = self._adam(("critic", self._critic.flat, self._critic.gradient, config.critic_rate))
 
-    def _adam(self, *parts: tuple[Mapping[str, Tensor], str, Tensor, Tensor, float]) -> torch.optim.Adam:
-        """Fused Adam whose moments are the ones that ``arrays`` holds."""
-        made = torch.optim.Adam([{"params": [flat], "lr": rate} for _, _, flat, _, rate in parts], fused=True)
-        for arrays, name, flat, gradient, _ in parts:
-            flat.grad = gradient
-            count = torch.zeros((), device=flat.device)
-            moments = {moment: arrays[f"{name}/{moment}"].view_as(flat) for moment in ("exp_avg", "exp_avg_sq")}
-            made.state[flat] = {"step": count, **moments}
-            self._counts.append(count)
+    def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> torch.optim.Adam:
+        """Fused Adam of parameters (name, numbers, gradient, learning rate), on the moments that the arrays hold."""
+        made = torch.optim.Adam([{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts], fused=True)
+        for name, numbers, gradient, _ in parts:
+            numbers.grad = gradient
+            self._counts.append(torch.zeros((), device=numbers.device))
+            moments = {moment: self._arrays[f"{name}/{moment}"].view_as(numbers) for moment in MOMENTS}
+            made.state[numbers] = {"step": self._counts[-1], **moments}
         return made
 
     def refresh(self, updates: int) -> None:

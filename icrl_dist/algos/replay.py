@@ -75,7 +75,7 @@ class Replay:
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """The inverse of ``state``.  Raises ValueError for another number of experts, capacity or width."""
-        rows, added = torch.from_numpy(state["rows"]), int(state["added"])
+        rows, added = torch.from_numpy(np.array(state["rows"])), int(state["added"])
         experts, capacity, width = self._rows.shape
         if rows.shape != (experts, min(added, capacity), width):
             raise ValueError(

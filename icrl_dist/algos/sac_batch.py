@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from icrl_dist.algos import sb3
-from icrl_dist.algos.lockstep import Lockstep
+from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.stacked import Shape, outputs
@@ -71,7 +71,7 @@ class SACBatch:
             "target": critic.clone(),
             "log_temperature": torch.full((experts,), config.temperature).log(),
         }
-        first |= {f"{name}/{moment}": torch.zeros_like(first[name]) for name in sb3.TRAINED for moment in sb3.MOMENTS}
+        first |= {f"{name}/{moment}": torch.zeros_like(first[name]) for name in TRAINED for moment in MOMENTS}
         self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
@@ -86,8 +86,8 @@ class SACBatch:
 
         ``rng`` draws them unless ``deterministic``, which gives the mean squashed.
         """
-        flat = np.asarray(observations, np.float32).reshape(self.experts, -1, self.spec.observation)
-        given = torch.from_numpy(np.ascontiguousarray(flat)).to(self.device)
+        flat = np.array(observations, np.float32).reshape(self.experts, -1, self.spec.observation)
+        given = torch.from_numpy(flat).to(self.device)
         mean, spread = outputs(self.actor_shape, self.arrays["actor"], given).chunk(2, dim=2)
         if not deterministic:
             if rng is None:
@@ -108,7 +108,7 @@ class SACBatch:
     def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
         """One step of every expert's environment, for its replay; a simulation that has broken down teaches nothing."""
         columns = (observations, actions, step.reward, step.observation, *(() if step.diverged is None else (step.diverged,)))
-        self.replay.add(*(torch.from_numpy(np.ascontiguousarray(column)).to(self.device) for column in columns))
+        self.replay.add(*(torch.from_numpy(np.array(column)).to(self.device) for column in columns))
         self.steps += 1
 
     def learn(self, generator: torch.Generator) -> None:
@@ -126,7 +126,7 @@ class SACBatch:
     def load(self, state: Mapping[str, np.ndarray]) -> None:
         """The inverse of ``state``.  Raises ValueError if it is another shape's."""
         self.replay.load({name: state[f"replay/{name}"] for name in ("rows", "added")})
-        self._take({name: torch.from_numpy(state[name]) for name in self.arrays}, int(state["updates"]))
+        self._take({name: torch.from_numpy(np.array(state[name])) for name in self.arrays}, int(state["updates"]))
         self.steps = int(state["steps"])
 
     def save_sb3(self, index: int, path: Path) -> None:
@@ -176,8 +176,8 @@ def train(
 
     ``progress`` hears the experts and their returns after every episode.  All draws are keyed by
     ``seed`` and the episode: from a ``state`` that was taken in ``progress`` training goes on as if
-    it had never stopped.  Raises ValueError for a state within an episode, FloatingPointError if an
-    expert's weights stop being numbers.
+    it had never stopped.  On a CPU give torch one thread: two are slower.  Raises ValueError for a
+    state within an episode, FloatingPointError if an expert's weights stop being numbers.
     """
     horizon = env.spec.horizon
     experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps))

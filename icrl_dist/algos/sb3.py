@@ -12,14 +12,10 @@ import stable_baselines3
 import torch
 from torch import Tensor, nn
 
+from icrl_dist.algos.lockstep import MOMENTS, TRAINED
 from icrl_dist.algos.sac import Expert, SACConfig, expert
 from icrl_dist.algos.stacked import Shape
 from icrl_dist.types import Spec
-
-TRAINED = ("actor", "critic", "log_temperature")
-"""What Adam trains."""
-MOMENTS = ("exp_avg", "exp_avg_sq")
-"""Adam's averages of gradients and of their squares, by torch's names."""
 
 Shapes = tuple[Shape, Shape]
 """The actor's and a critic's."""
