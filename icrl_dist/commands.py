@@ -186,9 +186,9 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import broadcast, env, fuzz, incontext, ingest, recovery, soak, stream
+    from icrl_dist.bench import broadcast, env, experts, fuzz, incontext, ingest, recovery, soak, stream
 
-    if arguments.seconds is not None and arguments.name in ("broadcast", "fuzz", "incontext", "recovery"):
+    if arguments.seconds is not None and arguments.name in ("broadcast", "experts", "fuzz", "incontext", "recovery"):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
@@ -213,6 +213,10 @@ def bench(arguments: Bench, console: Console) -> int:
             with console.status("incontext") as status:
                 result = incontext.run(arguments.folder, arguments.quick, lambda said: status.update(f"incontext: {said}"))
             text = incontext.describe(result)
+        case "experts":
+            with console.status("experts"):
+                result = experts.run(arguments.quick)
+            text = experts.describe(result)
     console.print(text, highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))

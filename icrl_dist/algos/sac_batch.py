@@ -1,0 +1,213 @@
+"""Soft actor-critic for N experts of one shape in lockstep: one product a layer for all of them.
+
+The mathematics, step for step, is that of ``stable_baselines3.SAC.train``; tests hold both together
+from the same weights, batches and noise.  Each expert has its own losses: their sum is descended,
+never their mean, so an expert learns the same in any company.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from icrl_dist.algos import sb3
+from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
+from icrl_dist.algos.replay import Replay, Transitions
+from icrl_dist.algos.sac import SACConfig
+from icrl_dist.algos.stacked import Shape, outputs
+from icrl_dist.envs import Batch
+from icrl_dist.types import Spec, Step
+
+Products = Literal["float32", "bfloat16"]
+
+
+def pick(device: str) -> torch.device:
+    """``auto``: a GPU if there is one.  Raises ValueError for a GPU where there is none."""
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"device = {device!r}: torch finds no GPU here: choose 'auto' or 'cpu'")
+    return torch.device(device)
+
+
+class SACBatch:
+    """N experts: parameters, Adam's moments, temperatures, and what each remembers."""
+
+    def __init__(
+        self,
+        experts: int,
+        spec: Spec,
+        config: SACConfig,
+        seed: int,
+        device: str = "auto",
+        products: Products = "float32",
+        capacity: int | None = None,
+    ) -> None:
+        """``seed`` draws the first parameters, the same on every device; ``products`` are of float32 or
+        bfloat16 numbers, parameters and Adam of float32; ``capacity`` of the replay is ``config.replay``
+        if not given.  Raises ValueError for discrete actions or no expert.
+        """
+        if spec.discrete or experts < 1:
+            raise ValueError(f"SAC: {experts} experts, discrete = {spec.discrete}: at least 1, and actions in [-1, 1]^A")
+        self.experts, self.spec, self.config, self.device = experts, spec, config, pick(device)
+        self.steps = 0
+        """Environment steps that ``train`` has made in each expert's environment."""
+        self.updates = 0
+        S, A = spec.observation, spec.actions
+        self.actor_shape = Shape((S, *config.hidden, 2 * A))
+        self.critic_shape = Shape((S + A, *config.hidden, 1))
+        generator = torch.Generator().manual_seed(seed)
+        actor = self.actor_shape.draw(experts, generator)
+        critic = self.critic_shape.draw(2 * experts, generator).view(experts, 2, -1)
+        first = {
+            "actor": actor,
+            "critic": critic,
+            "target": critic.clone(),
+            "log_temperature": torch.full((experts,), config.temperature).log(),
+        }
+        first |= {f"{name}/{moment}": torch.zeros_like(first[name]) for name in TRAINED for moment in MOMENTS}
+        self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
+        """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
+        ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
+        self._lockstep = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
+        self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
+
+    @torch.no_grad()
+    def act(
+        self, observations: Float[np.ndarray, "N *E S"], rng: np.random.Generator | None, deterministic: bool = False
+    ) -> Float32[np.ndarray, "N *E A"]:
+        """Actions in [-1, 1] of each expert in its environment, or in its E environments.
+
+        ``rng`` draws them unless ``deterministic``, which gives the mean squashed.
+        """
+        flat = np.array(observations, np.float32).reshape(self.experts, -1, self.spec.observation)
+        given = torch.from_numpy(flat).to(self.device)
+        mean, spread = outputs(self.actor_shape, self.arrays["actor"], given).chunk(2, dim=2)
+        if not deterministic:
+            if rng is None:
+                raise ValueError("act: rng = None draws no actions: give a generator, or deterministic=True")
+            normal = torch.from_numpy(rng.standard_normal(mean.shape, dtype=np.float32)).to(self.device)
+            mean = mean + normal * spread.clamp(-20.0, 2.0).exp()
+        chosen: np.ndarray = mean.tanh().cpu().numpy()
+        return chosen.reshape(*np.shape(observations)[:-1], self.spec.actions)
+
+    def update(self, batch: Transitions, noise: Float[Tensor, "2 N B A"]) -> None:
+        """One update of every expert by ``config.batch`` transitions of its own.
+
+        ``noise`` is standard normal: the actions' at the observations, then at the following ones.
+        """
+        self._lockstep.update(batch, noise)
+        self.updates += 1
+
+    def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
+        """One step of every expert's environment, for its replay; a simulation that has broken down teaches nothing."""
+        columns = (observations, actions, step.reward, step.observation, *(() if step.diverged is None else (step.diverged,)))
+        self.replay.add(*(torch.from_numpy(np.array(column)).to(self.device) for column in columns))
+        self.steps += 1
+
+    def learn(self, generator: torch.Generator) -> None:
+        """One update from the replay; ``generator``, on the experts' device, draws batch and noise."""
+        batch = self.replay.sample(self.config.batch, generator)
+        size = (2, self.experts, self.config.batch, self.spec.actions)
+        self.update(batch, torch.randn(size, generator=generator, device=self.device))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that further training depends on, as plain arrays."""
+        own = {name: array.cpu().numpy().copy() for name, array in self.arrays.items()}
+        counts = {"steps": np.array(self.steps), "updates": np.array(self.updates)}
+        return own | counts | {f"replay/{name}": array for name, array in self.replay.state().items()}
+
+    def load(self, state: Mapping[str, np.ndarray]) -> None:
+        """The inverse of ``state``.  Raises ValueError if it is another shape's."""
+        self.replay.load({name: state[f"replay/{name}"] for name in ("rows", "added")})
+        self._take({name: torch.from_numpy(np.array(state[name])) for name in self.arrays}, int(state["updates"]))
+        self.steps = int(state["steps"])
+
+    def save_sb3(self, index: int, path: Path) -> None:
+        """Expert ``index`` as a file that ``stable_baselines3.SAC.load`` opens and can train on."""
+        one = {name: array[index].cpu() for name, array in self.arrays.items()}
+        sb3.save(path, self.spec, self.config, (self.actor_shape, self.critic_shape), one, self.updates)
+
+    def load_sb3(self, paths: Sequence[Path]) -> None:
+        """Take expert i's parameters and moments from file i; the replays stay as they are.
+
+        Raises ValueError unless there is a file for each expert, all of this shape and with the
+        same number of updates.
+        """
+        if len(paths) != self.experts:
+            raise ValueError(f"{len(paths)} files for {self.experts} experts: give one for each")
+        shapes = (self.actor_shape, self.critic_shape)
+        found = [sb3.load(path, self.spec, self.config, shapes) for path in paths]
+        updates = sorted({count for _, count in found})
+        if len(updates) != 1:
+            raise ValueError(f"experts after {updates} updates cannot go on in lockstep: load those of one length together")
+        self._take({name: torch.stack([one[name] for one, _ in found]) for name in self.arrays}, updates[0])
+
+    def _take(self, arrays: Mapping[str, Tensor], updates: int) -> None:
+        for name, array in self.arrays.items():
+            if arrays[name].shape != array.shape:
+                raise ValueError(
+                    f"{name} has the shape {tuple(arrays[name].shape)}, not {tuple(array.shape)}: "
+                    "load it into as many experts, of the same spec and hidden layers"
+                )
+        for name, array in self.arrays.items():
+            array.copy_(arrays[name])
+        self.updates = updates
+        self._lockstep.refresh(updates)
+
+
+def train(
+    env: Batch,
+    config: SACConfig,
+    steps: int,
+    seed: int,
+    progress: Callable[[SACBatch, Float[np.ndarray, " N"]], None] = lambda experts, returns: None,
+    device: str = "auto",
+    products: Products = "float32",
+    state: Mapping[str, np.ndarray] | None = None,
+) -> SACBatch:
+    """An expert for each of the N environments of ``env``, after ``steps`` steps in it.
+
+    ``progress`` hears the experts and their returns after every episode.  All draws are keyed by
+    ``seed`` and the episode: from a ``state`` that was taken in ``progress`` training goes on as if
+    it had never stopped.  On a CPU give torch one thread: two are slower.  Raises ValueError for a
+    state within an episode, FloatingPointError if an expert's weights stop being numbers.
+    """
+    horizon = env.spec.horizon
+    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps))
+    if state is not None:
+        experts.load(state)
+    if experts.steps % horizon:
+        raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon}: take it in `progress`")
+    while experts.steps < steps:
+        episode, total = experts.steps // horizon, np.zeros(experts.experts)
+        rng, *rngs = (np.random.default_rng(_key(seed, episode, row)) for row in range(experts.experts + 1))
+        generator = torch.Generator(experts.device).manual_seed(int(_key(seed, episode).generate_state(1, np.uint64)[0] >> 1))
+        seen = np.asarray(env.reset(rngs), np.float32)
+        for _ in range(min(horizon, steps - experts.steps)):
+            if experts.steps < config.random_steps:
+                action = rng.uniform(-1, 1, (experts.experts, env.spec.actions)).astype(np.float32)
+            else:
+                action = experts.act(seen, rng)
+            step = env.step(action)
+            experts.remember(seen, action, step)
+            if experts.steps > config.warmup and experts.steps % config.update_every == 0:
+                experts.learn(generator)
+            seen, total = step.observation, total + step.reward
+        lost = [i for i, row in enumerate(experts.arrays["actor"]) if not row.isfinite().all()]
+        if lost:
+            raise FloatingPointError(
+                f"weights of experts {lost} are not numbers at step {experts.steps}: lower the learning rates"
+            )
+        progress(experts, total)
+    return experts
+
+
+def _key(*key: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(key[0], spawn_key=key[1:])
