@@ -79,23 +79,24 @@ class SACConfig:
     """Where histories and experts are kept, so that a later run need not train them again; empty: nowhere."""
 
     def __post_init__(self) -> None:
-        above = (
+        """Raises ConfigError, naming the number, for one that cannot be."""
+        for name in (
             "actor_rate",
             "critic_rate",
             "temperature_rate",
-            "tau",
             "batch",
             "replay",
             "temperature",
             "update_every",
             "steps",
-        )
-        for name in above:
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"sac.{name} = {getattr(self, name)}: must be above 0")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ConfigError(f"sac.hidden = {list(self.hidden)}: name at least one layer, each of at least 1 unit")
-        if self.random_steps < 0 or self.warmup < 1:
-            raise ConfigError(f"sac.random_steps = {self.random_steps}, sac.warmup = {self.warmup}: at least 0 and 1")
-        if self.tau > 1 or not 0 <= self.gamma < 1:
-            raise ConfigError(f"sac.tau = {self.tau}, sac.gamma = {self.gamma}: at most 1, and in [0, 1)")
+        ):
+            self._need(name, getattr(self, name) > 0, "above 0")
+        self._need("hidden", min(self.hidden, default=0) > 0, "at least one layer, of at least 1 unit each")
+        self._need("tau", 0 < self.tau <= 1, "above 0 and at most 1")
+        self._need("gamma", 0 <= self.gamma < 1, "in [0, 1)")
+        self._need("random_steps", self.random_steps >= 0, "at least 0")
+        self._need("warmup", self.warmup >= 1, "at least 1")
+
+    def _need(self, name: str, given: bool, what: str) -> None:
+        if not given:
+            raise ConfigError(f"sac.{name} = {getattr(self, name)!r}: must be {what}")

@@ -129,7 +129,7 @@ def test_values_land_where_they_belong() -> None:
         ('problem = "metaworld-pick-place"\n[control]\ndisturbance = 1', ["control.disturbance = 1.0", "0.1 metres"]),
         ('[control]\nforces = "strong"', ["control.forces = 'strong'", "'paper', 'qarl'"]),
         ("[sac]\nsteps = 0", ["sac.steps = 0", "above 0"]),
-        ("[sac]\nhidden = []", ["sac.hidden = []", "at least one layer"]),
+        ("[sac]\nhidden = []", ["sac.hidden = ()", "at least one layer"]),
         ("[sac]\nhiden = [64]", ["sac.hiden", "did you mean 'hidden'"]),
         ("[sac]\ngamma = 1.0", ["sac.gamma = 1.0"]),
         # Broken TOML.
