@@ -73,6 +73,13 @@ def deployed(task: Task) -> Task:
     return task.replace(start=(0, 0)) if task.kind == "darkroom" else task
 
 
+def evaluated(run: Run) -> tuple[Task, ...]:
+    """The tasks of online evaluation: those never learned from; in DeepMind Control, as in the paper
+    (appendix D.4), those that its experts were trained in.
+    """
+    return split(run).train if run.problem.startswith("dmc-") else split(run).test
+
+
 def disturbance(run: Run) -> int:
     """Components of the adversary's action in a continuous game."""
     if run.problem == pick_place.KIND:
