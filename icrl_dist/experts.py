@@ -42,8 +42,8 @@ _PHYSICS = ("dm-control", "metaworld", "mujoco", "torch")
 class History:
     """E episodes of one expert's training, what the expert would have done in them, and the expert."""
 
-    observations: Float32[np.ndarray, "E H+1 S"]
     actions: Float32[np.ndarray, "E H A"]
+    observations: Float32[np.ndarray, "E H+1 S"]
     rewards: Float32[np.ndarray, "E H"]
     adversary: Float32[np.ndarray, "E H F"]
     labels: Float32[np.ndarray, "E H A"]

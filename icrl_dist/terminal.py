@@ -80,7 +80,7 @@ def _name(event: dict[str, Any]) -> str:
         return str(event["phase"])
     if event["stage"] == "fit":
         return f"fit T^{event['version'] + 1}"
-    return "random contexts, D^0" if event["phase"] == "pretrain" else f"round {event['round']}: T^{event['version']} rolls out"
+    return "contexts, D^0" if event["phase"] == "pretrain" else f"round {event['round']}: T^{event['version']} rolls out"
 
 
 def _info(event: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from icrl_dist import config
+from icrl_dist import config, envs, games
 from icrl_dist.config import ConfigError, Run, StreamConfig
 
 
@@ -181,7 +181,7 @@ def test_load_of_a_missing_file(name: str, tmp_path: Path, monkeypatch: pytest.M
         config.load(name)
 
 
-PACKAGED = sorted(f.name.removesuffix(".toml") for f in (resources.files("icrl_dist") / "runs").iterdir() if ".toml" in f.name)
+PACKAGED = config.packaged_runs()
 
 
 @pytest.mark.parametrize("name", PACKAGED)
@@ -195,7 +195,18 @@ def test_an_unknown_packaged_run_names_the_nearest(name: str) -> None:
 
 
 def test_there_are_packaged_runs() -> None:
-    assert PACKAGED
+    """A file each, but for the 11 problems of DeepMind Control, which share two."""
+    files = {f.name.removesuffix(".toml") for f in (resources.files("icrl_dist") / "runs").iterdir() if ".toml" in f.name}
+    problems = {name for name in PACKAGED if name.startswith("dmc-")}
+    assert set(PACKAGED) - problems == files - {"dmc", "dmc-laptop"} and "demo" in files and len(problems) == 22
+
+
+def test_the_problems_are_those_that_there_are_environments_of() -> None:
+    assert set(games.PROBLEMS) == set(envs.KINDS)
+    assert {config.load(name).problem for name in PACKAGED} == set(games.PROBLEMS)
+    assert config.load("dmc-walker-run-laptop").problem == "dmc-walker-run"
+    with pytest.raises(ConfigError, match="no packaged run of that name"):
+        config.load("dmc")
 
 
 @pytest.mark.parametrize("name", PACKAGED)

@@ -1,0 +1,248 @@
+"""Histories of SAC experts: what is sent, what is kept, and what a kill or a breakdown costs."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist import envs, experts, jobs
+from icrl_dist.algos import sac_batch
+from icrl_dist.config import AdversaryConfig
+from icrl_dist.envs import metaworld, tasks
+from icrl_dist.envs.network import Networks
+from icrl_dist.experts import ExpertPolicy, History, ScriptedPolicy
+from icrl_dist.games import ControlConfig, SACConfig
+from icrl_dist.recipes import METHODS, self_labelled
+from icrl_dist.stream import wire
+from icrl_dist.types import NULL
+from tests.core.test_recipes import Fixed
+
+HORIZON, EPISODES = 20, 10
+
+
+@pytest.fixture
+def run(small_run, tmp_path):
+    """Four tasks of reacher, a null and a pushing adversary in each, experts of ten short episodes."""
+    sac = SACConfig(hidden=(8, 8), batch=16, random_steps=40, warmup=40, update_every=2, steps=HORIZON * EPISODES)
+    return dataclasses.replace(
+        small_run,
+        problem="dmc-reacher-easy",
+        control=ControlConfig(train_tasks=4, test_tasks=2, horizon=HORIZON),
+        adversary=AdversaryConfig(count=2),
+        sac=dataclasses.replace(sac, cache=str(tmp_path / "experts")),
+        pretrain=dataclasses.replace(small_run.pretrain, contexts=8 * 3, queries=6),
+    )
+
+
+def asked(run, method="icag"):
+    return METHODS[method].ask(run, METHODS[method].phases(run)[0])
+
+
+def digests(trajectories):
+    return [wire.trajectory_digest(t) for t in trajectories]
+
+
+def test_a_job_is_all_variations_of_a_few_tasks_with_the_numbers_of_sac(run):
+    first, second = asked(run)
+    assert first.kind == "train_expert" and (first.trials, first.tasks, second.task) == (3, 2, 2)
+    assert [v.adversary == NULL for v in first.variations] == [True, False] * 2
+    assert experts.sac_of(wire.decode_job(wire.encode_job(first))) == run.sac
+    assert {v.adversary for job in asked(run, "dpt") for v in job.variations} == {NULL}
+
+
+def test_contexts_are_episodes_of_the_training_and_labels_what_its_expert_would_do(run):
+    job = asked(run)[0]
+    sent = list(jobs.do(job, None, "w"))
+    assert [t.identity for t in sent] == list(job.identities())
+    histories = [experts.kept(v, run.sac, run.seed) for v in job.variations]
+    for t in sent:
+        row = job.variations.index(t.variation)
+        history = histories[row]
+        assert history.rewards.shape == (EPISODES, HORIZON) and t.origin == "expert" and t.weights == -1
+        number = [0, 4, 9][t.identity.trial]  # evenly spaced, from the first random one to the last
+        for name in ("observations", "actions", "rewards", "adversary"):
+            np.testing.assert_array_equal(getattr(t, name), getattr(history, name)[number])
+        states = history.observations[:, :-1].reshape(-1, 6)
+        assert all((states == query).all(axis=1).any() for query in t.queries) and len(t.queries) == 6
+        policy = ExpertPolicy([history] * 6, envs.spec(t.variation.task), run.sac)
+        np.testing.assert_allclose(t.labels, policy.act(t.queries, np.zeros((6, 2))), atol=1e-5)
+        pushes = Networks([t.variation.adversary] * HORIZON, envs.spec(t.variation.task), 2).act(t.observations[:-1])
+        np.testing.assert_allclose(t.adversary, pushes, atol=1e-6)
+    assert np.abs(sent[-1].adversary).max() > 0.1 and not sent[0].adversary.any()
+    assert len({t.queries.tobytes() for t in sent}) == len(sent)
+
+
+def test_the_same_job_gives_the_same_bytes_with_or_without_a_cache(run, tmp_path):
+    job = asked(run)[0]
+    here = digests(jobs.do(job, None, "w0"))
+    assert digests(jobs.do(job, None, "w1")) == here, "from the cache"
+    none = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=""))
+    assert digests(jobs.do(asked(none)[0], None, "w")) == here, "without one"
+    other = dataclasses.replace(none, seed=1)
+    assert digests(jobs.do(asked(other)[0], None, "w")) != here
+
+
+def test_nothing_is_trained_that_is_in_the_cache_and_all_of_it_if_something_is_not(run, monkeypatch, caplog):
+    trained = []
+    real = sac_batch.train
+    monkeypatch.setattr(sac_batch, "train", lambda env, *rest, **more: trained.append(env.batch) or real(env, *rest, **more))
+    job = asked(run)[0]
+    first = digests(jobs.do(job, None, "w"))
+    assert trained == [4]
+    assert digests(jobs.do(dataclasses.replace(job, trials=2), None, "w")) != first and trained == [4]
+    file = experts._file(run.sac, experts.key(job.variations[2], run.sac, run.seed))
+    whole = file.read_bytes()
+    for damage in (whole[: len(whole) // 2], b"nothing"):
+        file.write_bytes(damage)
+        assert digests(jobs.do(job, None, "w")) == first
+    assert trained == [4, 4, 4] and "made anew" in caplog.text and file.read_bytes() == whole
+
+
+def test_what_decides_a_history_decides_where_it_is_kept(run, monkeypatch):
+    job = asked(run)[0]
+    one = experts.key(job.variations[0], run.sac, 0)
+    changed = [
+        experts.key(job.variations[1], run.sac, 0),
+        experts.key(job.variations[2], run.sac, 0),
+        experts.key(job.variations[0], run.sac, 1),
+        *(
+            experts.key(job.variations[0], dataclasses.replace(run.sac, **{name: value}), 0)
+            for name, value in {"hidden": (8, 9), "gamma": 0.5, "steps": 400, "update_every": 3}.items()
+        ),
+    ]
+    assert len({one, *changed}) == 1 + len(changed)
+    assert experts.key(job.variations[0], dataclasses.replace(run.sac, cache="/elsewhere"), 0) == one
+    monkeypatch.setattr(experts.metadata, "version", lambda name: "0")
+    assert experts.key(job.variations[0], run.sac, 0) != one, "other physics is other data"
+
+
+class KilledError(Exception):
+    pass
+
+
+def test_a_killed_training_goes_on_from_its_checkpoint_to_the_same_bytes(run, monkeypatch):
+    job = asked(run)[0]
+    undisturbed = digests(jobs.do(asked(dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache="")))[0], None, "w"))
+    monkeypatch.setattr(experts, "CHECKPOINT_S", 0.0)
+    real, begun = experts.save_checkpoint, []
+
+    def killed(path, checkpoint):
+        real(path, checkpoint)
+        begun.append(path.name)
+        if len(begun) in (4, 7):
+            raise KilledError
+
+    monkeypatch.setattr(experts, "save_checkpoint", killed)
+    for _ in range(2):
+        with pytest.raises(KilledError):
+            list(jobs.do(job, None, "w"))
+    assert all(name.startswith("part-") for name in begun) and len(begun) == 7
+    assert digests(jobs.do(job, None, "w")) == undisturbed
+    assert len([name for name in begun if name.startswith("part-")]) == EPISODES, "no episode was trained twice"
+    assert not list(experts._file(run.sac, "").parent.glob("part-*"))
+
+
+class Breaking:
+    """Rows 1 and 3 break down, in the first two episodes or in all."""
+
+    def __init__(self, env, always):
+        self.spec, self.batch, self._env, self._always, self._episode = env.spec, env.batch, env, always, -1
+
+    def reset(self, rngs):
+        self._episode += 1
+        return self._env.reset(rngs)
+
+    def step(self, actions):
+        step = self._env.step(actions)
+        broken = np.zeros(self.batch, bool)
+        broken[[1, 3]] = self._always or self._episode < 2
+        return step._replace(diverged=broken)
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_episodes_that_broke_down_are_no_data(run, monkeypatch, always):
+    real = envs.batch
+    monkeypatch.setattr(experts.envs, "batch", lambda variations: Breaking(real(variations), always))
+    job = asked(run)[0]
+    if always:
+        with pytest.raises(RuntimeError, match="broke down in every episode"):
+            list(jobs.do(job, None, "w"))
+        return
+    list(jobs.do(job, None, "w"))
+    lengths = [len(experts.kept(v, run.sac, run.seed).rewards) for v in job.variations]
+    assert lengths == [EPISODES, EPISODES - 2, EPISODES, EPISODES - 2]
+
+
+def test_a_rollout_that_broke_down_is_no_data(run, monkeypatch):
+    icaa = dataclasses.replace(run, method="icaa")
+    job = METHODS["icaa"].ask(icaa, METHODS["icaa"].phases(icaa)[1])[0]
+    policies = Fixed(tasks.spec(icaa), icaa.model)
+    assert len(list(jobs.do(job, policies, "w"))) == len(list(job.identities()))
+    real = envs.batch
+    monkeypatch.setattr(jobs.envs, "batch", lambda variations: Breaking(real(variations), True))
+    with pytest.raises(RuntimeError, match=r"adapt/0/0/1/0, adapt/0/1/1/0: the simulation broke down"):
+        list(jobs.do(job, policies, "w"))
+
+
+def test_a_models_own_vectors_become_labels(run):
+    icaa = dataclasses.replace(run, method="icaa")
+    job = METHODS["icaa"].ask(icaa, METHODS["icaa"].phases(icaa)[1])[0]
+    trials = list(jobs.do(job, Fixed(tasks.spec(icaa), icaa.model), "w"))
+    own = [t for t in trials if t.identity[:4] == trials[0].identity[:4]]
+    examples = self_labelled(icaa, own)
+    later = own[icaa.icaa.context_trials + 1 :]
+    np.testing.assert_array_equal(examples.labels, np.concatenate([t.actions for t in later]))
+    np.testing.assert_array_equal(examples.queries, np.concatenate([t.observations[:-1] for t in later]))
+    assert examples.actions.dtype == np.float32 and examples.actions.shape[2] == 2
+
+
+def test_in_meta_world_the_scripted_policy_labels_what_it_alone_sees_whole(small_run):
+    sac = SACConfig(hidden=(8,), batch=8, random_steps=10, warmup=10, steps=60, cache="")
+    run = dataclasses.replace(
+        small_run,
+        problem="metaworld-pick-place",
+        control=ControlConfig(train_tasks=2, test_tasks=1, horizon=30),
+        adversary=AdversaryConfig(count=2),
+        sac=sac,
+        pretrain=dataclasses.replace(small_run.pretrain, contexts=8, queries=5),
+    )
+    (job,) = asked(run)
+    sent = list(jobs.do(job, None, "w"))
+    assert len(sent) == 8
+    for t in sent:
+        assert not t.observations[:, 36:].any() and not t.queries[:, 36:].any(), "the goal stays hidden"
+        if t.variation.adversary == NULL:  # then what is shown is true, but for the goal
+            truth = t.queries.astype(np.float64)
+            truth[:, 36:] = t.variation.task.vector("goal")
+            np.testing.assert_allclose(t.labels, metaworld.expert(truth), atol=1e-3)
+    pushed = [t for t in sent if t.variation.adversary != NULL]
+    blind = [np.abs(metaworld.expert(t.queries.astype(np.float64)) - t.labels).max() for t in pushed]
+    assert min(blind) > 0.05, "labels of what is shown would be others"
+
+
+def test_experts_act_each_in_its_row(run):
+    torch.manual_seed(0)
+    spec = envs.spec(tasks.split(run).train[0])
+    batch = sac_batch.SACBatch(3, spec, run.sac, 0, "cpu")
+    empty = {"rewards": np.zeros((0, 1), np.float32), "observations": np.zeros((0, 2, 2), np.float32)}
+    shape = {name: np.zeros((0, 1, 2), np.float32) for name in ("actions", "adversary", "labels")}
+    actors = batch.arrays["actor"].numpy()
+    policy = ExpertPolicy([History(**shape, **empty, actor=actor) for actor in actors], spec, run.sac)
+    seen = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
+    np.testing.assert_allclose(policy.act(seen, np.zeros((3, 2))), batch.act(seen, None, deterministic=True), atol=1e-6)
+
+
+def test_the_scripted_policy_acts_by_the_truth_of_the_environment_that_it_met():
+    env = metaworld.PickPlace([envs_variation() for _ in range(2)])
+    policy = ScriptedPolicy()
+    policy.meet(env)
+    seen = env.reset([np.random.default_rng(0)] * 2)
+    np.testing.assert_array_equal(policy.act(seen * 0, np.zeros((2, 4))), metaworld.expert(env.truth))
+
+
+def envs_variation():
+    from icrl_dist.envs import pick_place
+    from icrl_dist.types import Variation
+
+    return Variation(pick_place.task((0.02, 0.65, 0.02), (0.05, 0.85, 0.2)))
