@@ -95,6 +95,8 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
         chosen = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 2} | chosen
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
     validate(run, "evaluate")
+    if run.problem != "darkroom" and arguments.suite != "online":
+        raise ConfigError(f"--suite {arguments.suite}: only Dark Room has that so far; {run.problem} has --suite online")
     deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or default_deployment(run.model)
     answer: dict[str, Any] = {"suite": arguments.suite, "deploy": deploy, "what": str(what)}
     if arguments.suite == "online":

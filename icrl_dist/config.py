@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from icrl_dist.games import PROBLEMS, ControlConfig, SACConfig
 from icrl_dist.limits import validate
 from icrl_dist.tables import ConfigError, build, dumps, nearest
 
@@ -199,7 +200,8 @@ class EvaluateConfig:
     episodes: int = 40
     """Online episodes a task."""
     p: tuple[float, ...] = (0.0, 0.2)
-    """Override probabilities that are tested."""
+    """Override probabilities that are tested; in a continuous game, strengths of its adversary, of
+    which 1 is ``control.strength``."""
     prior: Literal["uniform", "unseen"] = "unseen"
     """The test adversary's law: ``unseen`` Dirichlet priors, or ``uniform`` over the actions."""
     seeds: int = 10
@@ -258,7 +260,12 @@ class Run:
     """Which method of section 4 pretrains the transformer."""
     seed: int = 0
     """Every random draw of the run is keyed by this and by the identity of the work."""
+    problem: str = "darkroom"
+    """What it is about: ``darkroom``, ``metaworld-pick-place``, or one of DeepMind Control such as
+    ``dmc-cheetah-run``."""
     darkroom: DarkRoomConfig = field(default_factory=DarkRoomConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     practice: PracticeConfig = field(default_factory=PracticeConfig)
@@ -286,15 +293,27 @@ def load(name_or_path: str) -> Run:
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"run file {name_or_path!r}: cannot be read: {error}") from None
     else:
+        small = name_or_path.removesuffix("-laptop")
+        if small.startswith("dmc-") and small in PROBLEMS:  # 11 problems share two files
+            text = (packaged / f"dmc{name_or_path.removeprefix(small)}.toml").read_text(encoding="utf-8")
+            return parse(f'problem = "{small}"\n{text}', name_or_path)
         file = packaged / f"{name_or_path}.toml"
-        if not file.is_file():
-            names = sorted(f.name.removesuffix(".toml") for f in packaged.iterdir() if f.name.endswith(".toml"))
+        if not file.is_file() or name_or_path in ("dmc", "dmc-laptop"):
+            names = packaged_runs()
             raise ConfigError(
                 f"run {name_or_path!r}: no packaged run of that name{nearest(name_or_path, names)}; "
                 f"there are {', '.join(names)}; a path must end in .toml"
             )
         text = file.read_text(encoding="utf-8")
     return parse(text, name_or_path)
+
+
+def packaged_runs() -> list[str]:
+    """The names that ``load`` knows."""
+    files = (resources.files("icrl_dist") / "runs").iterdir()
+    alone = {file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")} - {"dmc", "dmc-laptop"}
+    problems = [name for name in PROBLEMS if name.startswith("dmc-")]
+    return sorted([*alone, *problems, *(f"{name}-laptop" for name in problems)])
 
 
 def parse(text: str, source: str) -> Run:

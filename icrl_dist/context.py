@@ -28,14 +28,19 @@ class Stretches(NamedTuple):
         cls,
         length: int,
         states: Float32[np.ndarray, "N S"],
-        taken: Integer[np.ndarray, " N"],
+        taken: Integer[np.ndarray, " N"] | Float32[np.ndarray, "N A"],
         gained: Float32[np.ndarray, " N"],
         labels: Float32[np.ndarray, "N A"],
     ) -> Stretches:
         """What happened in a row as stretches of this length; what is left at the end is not used."""
         whole = len(taken) // length * length
-        columns = states, taken.astype(np.int64), gained, labels
+        columns = states, _actions(taken), gained, labels
         return cls(*(c[:whole].reshape(-1, length, *c.shape[1:]) for c in columns))
+
+
+def _actions(actions: np.ndarray) -> np.ndarray:
+    """As a model takes them: numbers as int64, vectors as they are."""
+    return actions if actions.dtype == np.float32 else actions.astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +73,7 @@ class Examples:
         if not episodes or not len(queries):
             raise ValueError(f"examples need an episode and a label, got {len(episodes)} and {len(queries)}")
         return cls(
-            np.stack([t.actions for t in episodes]).astype(np.int64),
+            _actions(np.stack([t.actions for t in episodes])),
             np.stack([t.observations for t in episodes]),
             np.stack([t.rewards for t in episodes]),
             np.asarray(queries, np.float32),

@@ -10,31 +10,34 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from icrl_dist import envs, rollout
+from icrl_dist import envs, experts, rollout
 from icrl_dist.config import DarkRoomConfig, Deployment, Run
 from icrl_dist.envs import darkroom, tasks
 from icrl_dist.envs.darkroom import ACTIONS
 from icrl_dist.exact import RULES, ExactAgent, OptimalAgent, Rule
+from icrl_dist.experts import ScriptedPolicy
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.oracle import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.recipes import Dataset, Phase, self_labelled
-from icrl_dist.rollout import Policy, RandomPolicy, deploy_offline, deploy_online, episode
+from icrl_dist.rollout import Actor, Policy, RandomActor, RandomPolicy, deploy_offline, deploy_online, episode
 from icrl_dist.stats import mean_and_error
 from icrl_dist.types import Adversary, Identity, Task, Variation
 
-MakePolicy = Callable[[Sequence[Variation]], Policy]
+MakePolicy = Callable[[Sequence[Variation]], Policy | Actor]
 ORACLE = "oracle"
+EXPERT, SCRIPTED = "SAC expert", "scripted expert"
+"""Of a continuous game: the experts of the undisturbed tasks, and Meta-World's policy that is told the goal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Returns of one agent at one disturbance, and the exact optimum of the same variations."""
+    """Returns of one agent at one disturbance, and the exact optimum of the same variations where it is known."""
 
     agent: str
     p: float
     returns: Float[np.ndarray, "tasks seeds episodes"]
-    optimum: Float[np.ndarray, " tasks"]
-    """Expected return of the optimal policy in each task's variation, by value iteration."""
+    optimum: Float[np.ndarray, " tasks"] | None
+    """Expected return of the optimal policy in each task's variation, by value iteration; None in a continuous game."""
 
     def last(self, episodes: int) -> float:
         """Mean return over the last episodes."""
@@ -52,20 +55,21 @@ class Result:
     def row(self) -> dict[str, Any]:
         """The result as plain values, for JSON."""
         mean, error = mean_and_error(self.returns)
+        best = None if self.optimum is None else float(self.optimum.mean())
         return {
             "agent": self.agent,
             "p": self.p,
             "episodes": [round(float(m), 3) for m in mean],
             "standard_error": [None if np.isnan(e) else round(float(e), 3) for e in error],
-            "optimum": round(float(self.optimum.mean()), 3),
+            "optimum": None if best is None else round(best, 3),
             "last5": round(self.last(5), 3),
-            "last5_over_optimum": round(self.last(5) / float(self.optimum.mean()), 4),
+            "last5_over_optimum": None if best is None else round(self.last(5) / best, 4),
         }
 
 
 def variations(run: Run, p: float, goals: Sequence[Task] | None = None) -> tuple[Variation, ...]:
-    """Every held-out task (or these) under its test adversary of strength p, started in the origin."""
-    chosen = tasks.split(run).test if goals is None else goals
+    """Every evaluated task (or these) under its test adversary of strength p, started in the origin."""
+    chosen = tasks.evaluated(run) if goals is None else goals
     return tuple(
         Variation(tasks.deployed(t), tasks.test_adversary(run, i, p, run.evaluate.prior)) for i, t in enumerate(chosen)
     )
@@ -79,6 +83,25 @@ def in_context(run: Run, model: PretrainedTransformer, deploy: Deployment | None
 def random(rows: Sequence[Variation]) -> Policy:
     """The uniform policy."""
     return RandomPolicy(ACTIONS)
+
+
+def random_vectors(rows: Sequence[Variation]) -> Actor:
+    """Uniform over vectors."""
+    return RandomActor()
+
+
+def scripted(rows: Sequence[Variation]) -> Actor:
+    """Meta-World's scripted policy."""
+    return ScriptedPolicy()
+
+
+def expert(run: Run, chosen: Sequence[Task]) -> MakePolicy | None:
+    """The SAC experts of these tasks, undisturbed, if they were trained on this machine."""
+    histories = {task: experts.kept(Variation(task), run.sac, run.seed) for task in chosen}
+    found = {task: history for task, history in histories.items() if history is not None}
+    if len(found) < len(histories):
+        return None
+    return lambda rows: experts.ExpertPolicy([found[row.task] for row in rows], tasks.spec(run), run.sac)
 
 
 def optimal(run: Run) -> MakePolicy:
@@ -122,13 +145,16 @@ def online(
     results = []
     for level, p in enumerate(run.evaluate.p):
         chosen = variations(run, p, goals)
-        optimum = optimal_returns(Hypotheses.of(chosen))
+        optimum = optimal_returns(Hypotheses.of(chosen)) if run.problem == "darkroom" else None
         rows, ids = _rows(run, chosen, level)
         for name, make in agents.items():
             env = envs.batch(rows)
             trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
             returns = []
-            for ran in deploy_online(env, make(rows), trials):
+            policy = make(rows)
+            if isinstance(policy, ScriptedPolicy):
+                policy.meet(env)
+            for ran in deploy_online(env, policy, trials):
                 returns.append(ran.returns)
                 progress(name, p, len(returns))
             shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
@@ -177,7 +203,7 @@ def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
     the trials that became contexts and of those that gave labels; the optimum beside them.
     Empty for a phase whose labels are not the model's own.
     """
-    if phase.stage != "adapt" or run.method != "icaa":
+    if phase.stage != "adapt" or run.method != "icaa" or run.problem != "darkroom":
         return {}
     agreement, early, late, best = [], [], [], []
     for trials in map(data.trials, data.variations(phase.stage, phase.round)):

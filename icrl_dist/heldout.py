@@ -48,6 +48,8 @@ def online(
 ) -> tuple[list[evaluate.Result], dict[str, Any]]:
     """Online returns of the folder's models, a random policy, the exact agents and the oracle; the newest model first.
 
+    In a continuous game experts stand in for the exact agents, where there are any on this machine.
+
     Deployed by ``deploy``, or by the better rule that they were trained for; if that is not
     Algorithm 1, the newest is deployed by it too.  And the newest's surprise at the end, by p,
     if it was calibrated.
@@ -65,11 +67,22 @@ def online(
         agents[newest] = watched
     if (deploy or default_deployment(run.model)) != "paper":
         agents[f"{newest}, Algorithm 1"] = evaluate.in_context(run, model, "paper")
-    agents["random"] = evaluate.random
-    agents |= {name: evaluate.exact(run, rule) for rule, name in RULES.items()}
-    agents[evaluate.ORACLE] = evaluate.optimal(run)
+    agents |= _others(run)
     results = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
     return results, {f"{p:g}": _spread(one.now()) for p, one in zip(run.evaluate.p, watches, strict=False)}
+
+
+def _others(run: Run) -> dict[str, evaluate.MakePolicy]:
+    """Who the models stand beside."""
+    if run.problem == "darkroom":
+        agents: dict[str, evaluate.MakePolicy] = {"random": evaluate.random}
+        agents |= {name: evaluate.exact(run, rule) for rule, name in RULES.items()}
+        return agents | {evaluate.ORACLE: evaluate.optimal(run)}
+    agents = {"random": evaluate.random_vectors}
+    if run.problem.startswith("metaworld"):
+        return agents | {evaluate.SCRIPTED: evaluate.scripted}
+    trained = evaluate.expert(run, tasks.evaluated(run))
+    return agents if trained is None else agents | {evaluate.EXPERT: trained}
 
 
 def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
@@ -87,8 +100,7 @@ def show_online(
     """Print the table, draw the figure, keep the rows in the folder; returns them with the figure's path."""
     rows = [result.row() for result in results]
     adapted = _adaptation(results)
-    size, count = run.darkroom.size, len(results[0].optimum)
-    title = f"{run.method.upper()} on {count} held-out goals of a {size}x{size} Dark Room, {run.evaluate.seeds} seeds"
+    title = f"{run.method.upper()} on {_tasks(run, len(results[0].returns))}, {run.evaluate.seeds} seeds"
     atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
     figure = plots.adaptation(rows, folder / "adaptation.png", title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
@@ -102,11 +114,19 @@ def show_online(
 def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:
     """How soon the newest model acts well, by p, beside the oracle: see ``Result.first_over`` and ``Result.episode_of``."""
     oracle = {result.p: result for result in results if result.agent == evaluate.ORACLE}
+    if not oracle:
+        return {}
     newest = [result for result in results if result.agent == results[0].agent]
     return {
         "first10_over_oracle": {f"{one.p:g}": one.first_over(oracle[one.p], 10) for one in newest},
         "episode_of_90": {f"{one.p:g}": one.episode_of(oracle[one.p], 0.9) for one in newest},
     }
+
+
+def _tasks(run: Run, count: int) -> str:
+    if run.problem == "darkroom":
+        return f"{count} held-out goals of a {run.darkroom.size}x{run.darkroom.size} Dark Room"
+    return f"{count} {'training' if run.problem.startswith('dmc-') else 'held-out'} tasks of {run.problem}"
 
 
 def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:

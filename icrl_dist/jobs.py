@@ -13,6 +13,7 @@ from icrl_dist.behaviour import Walks
 from icrl_dist.config import ContextConfig, Deployment
 from icrl_dist.envs.darkroom import cells
 from icrl_dist.exact import OptimalAgent
+from icrl_dist.experts import train_expert
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.heads import sample
 from icrl_dist.oracle import Hypotheses, cell_numbers, heuristic_labels, soft_labels
@@ -35,9 +36,11 @@ def do(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
     """
     if job.kind == "random_context":
         return random_context(job, worker)
+    if job.kind == "train_expert":
+        return train_expert(job, worker)
     if job.kind == "adapt":
         return adapt(job, policies, worker)
-    raise ValueError(f"job kind {job.kind!r}: this worker knows random_context and adapt")
+    raise ValueError(f"job kind {job.kind!r}: this worker knows random_context, train_expert and adapt")
 
 
 def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
@@ -73,6 +76,9 @@ def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
     for row, chance, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
+        if ran.diverged is not None and ran.diverged.any():
+            lost = [str(identity) for identity, gone in zip(row, ran.diverged, strict=True) if gone]
+            raise RuntimeError(f"{', '.join(lost)}: the simulation broke down, and nothing may be learned from it")
         known = labeller(row, chance) if labeller else [_nothing(env.spec)] * len(row)
         for b, identity in enumerate(row):
             yield _trajectory(job, identity, ran, b, worker, digest, known[b])
@@ -83,14 +89,15 @@ class _Known(NamedTuple):
 
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
-    taken: Int16[np.ndarray, " R"]
+    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     gained: Float32[np.ndarray, " R"]
     origin: str
 
 
 def _nothing(spec: Spec) -> _Known:
     zeros = np.zeros((0, spec.observation), np.float32), np.zeros((0, spec.actions), np.float32)
-    return _Known(*zeros, *_NO_STRETCH, "none")
+    taken = _NO_STRETCH[0] if spec.discrete else np.zeros((0, spec.actions), np.float32)
+    return _Known(*zeros, taken, _NO_STRETCH[1], "none")
 
 
 _NO_STRETCH = np.zeros(0, np.int16), np.zeros(0, np.float32)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from icrl_dist import endpoints
-from icrl_dist.tables import ConfigError
+from icrl_dist.games import PROBLEMS
+from icrl_dist.tables import ConfigError, nearest
 
 if TYPE_CHECKING:
     from icrl_dist.config import Run
@@ -19,6 +21,9 @@ def validate(run: Run, source: str) -> None:
         if not condition:
             raise ConfigError(f"{source}: {where} = {value!r}: {remedy}")
 
+    if run.problem not in PROBLEMS:
+        known = f"choose one of {', '.join(PROBLEMS)}"
+        raise ConfigError(f"{source}: problem = {run.problem!r}{nearest(run.problem, PROBLEMS)}: {known}")
     room, icaa, practice, optim = run.darkroom, run.icaa, run.practice, run.optim
     need(room.size >= 2, "darkroom.size", room.size, "a room has at least 2 cells a side")
     need(room.horizon >= 1, "darkroom.horizon", room.horizon, "an episode has at least 1 step")
@@ -32,6 +37,9 @@ def validate(run: Run, source: str) -> None:
     for p in run.evaluate.p:
         need(0 <= p <= 1, "evaluate.p", p, "a probability lies in [0, 1]")
     need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
+    if run.problem != "darkroom":
+        train = run.control.train_tasks
+        _validate_control(run, need)
     need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
     need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
     need(len(run.pretrain.behaviours) > 0, "pretrain.behaviours", run.pretrain.behaviours, "name at least one")
@@ -45,9 +53,11 @@ def validate(run: Run, source: str) -> None:
     for where, stretches in (("pretrain.stretches", run.pretrain.stretches), ("optim.stretches", optim.stretches)):
         remedy = "above 0 exactly if model.stretch is above 1"
         need((stretches > 0) == (run.model.stretch > 1), where, stretches, remedy)
-    need(run.model.stretch <= room.horizon, "model.stretch", run.model.stretch, "at most darkroom.horizon")
+    longest = 500 if run.problem.startswith("metaworld") else 200
+    horizon = room.horizon if run.problem == "darkroom" else run.control.horizon or longest
+    need(run.model.stretch <= horizon, "model.stretch", run.model.stretch, f"at most the horizon, {horizon} steps")
     need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
-    need(run.context.max >= room.horizon, "context.max", run.context.max, "must hold at least one episode")
+    need(run.context.max >= horizon, "context.max", run.context.max, "must hold at least one episode")
     need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
     need(run.learner.device in ("auto", "cpu", "cuda"), "learner.device", run.learner.device, "use auto, cpu or cuda")
     for name, endpoint, remedy in endpoints.objections(run.stream.endpoint, run.stream.connect, run.stream.certificates):
@@ -93,3 +103,28 @@ def validate(run: Run, source: str) -> None:
     }
     for where, value in not_negative.items():
         need(0 <= value < math.inf, where, value, "must not be negative, and be finite")
+
+
+Need = Callable[[bool, str, object, str], None]
+
+
+def _validate_control(run: Run, need: Need) -> None:
+    """What a run of a continuous game may be."""
+    control, count = run.control, run.control.train_tasks
+    if run.problem.startswith("dmc-"):
+        need(count in (4, 16, 36), "control.train_tasks", count, "the centre of the grid has 4, 16 or 36 tasks")
+        need(
+            0 < control.test_tasks <= 64 - count, "control.test_tasks", control.test_tasks, f"the grid has {64 - count} others"
+        )
+    else:
+        most = 50 - control.test_tasks
+        need(0 < count <= most, "control.train_tasks", count, f"ML1 has 50 tasks: use 1 to {most}, or test fewer")
+        need(control.test_tasks > 0, "control.test_tasks", control.test_tasks, "at least 1")
+        need(control.horizon <= 500, "control.horizon", control.horizon, "Meta-World allows at most 500 steps")
+        need(0 <= control.disturbance <= 0.1, "control.disturbance", control.disturbance, "0 to 0.1 metres")
+    need(control.horizon >= 0, "control.horizon", control.horizon, "at least 0, which is the problem's own")
+    need(0 <= control.strength < math.inf, "control.strength", control.strength, "must not be negative, and be finite")
+    need(
+        run.practice.rounds == 0, "practice.rounds", run.practice.rounds, "only Dark Room's labels can be had of new histories"
+    )
+    need(run.pretrain.stretches == 0, "pretrain.stretches", run.pretrain.stretches, "only in Dark Room so far: use 0")

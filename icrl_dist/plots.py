@@ -44,16 +44,21 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
             high = [m + e for m, e in zip(row["episodes"], error, strict=True)]
             axis.plot(episodes, row["episodes"], color=colour, label=row["agent"], linewidth=1.8)
             axis.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
-        axis.axhline(here[0]["optimum"], color="black", linewidth=0.8, label="oracle (knows the goal)")
-        axis.set_title("no disturbance" if p == 0 else f"actions overridden with p = {p:g}", fontsize=10)
+        if here[0]["optimum"] is not None:
+            axis.axhline(here[0]["optimum"], color="black", linewidth=0.8, label="oracle (knows the goal)")
+        axis.set_title("no disturbance" if p == 0 else f"{_disturbed(here)} = {p:g}", fontsize=10)
         axis.set_xlabel("online episode")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.set_ylim(0, 1.08 * max(row["optimum"] for row in rows))
+        axis.set_ylim(0, 1.08 * max(row["optimum"] or max(row["episodes"]) for row in rows))
         axis.grid(alpha=0.25)
-    axes[0][0].set_ylabel("return on goals never trained on")
+    axes[0][0].set_ylabel("return on goals never trained on" if rows[0]["optimum"] is not None else "return")
     figure.legend(*axes[0][0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(title, fontsize=11)
     return _saved(figure, path)
+
+
+def _disturbed(rows: Sequence[Mapping[str, Any]]) -> str:
+    return "adversary's strength" if rows[0]["optimum"] is None else "actions overridden with p"
 
 
 def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:

@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from icrl_dist import experts
 from icrl_dist.config import Deployment, Run, default_deployment
 from icrl_dist.context import Examples, Pool, Shelf, Shelved, Stretches
 from icrl_dist.envs import tasks
@@ -98,12 +99,16 @@ def _labelling(run: Run) -> Params:
 def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
     """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
 
-    All methods and all K share out the same ``pretrain.contexts`` episodes.
+    All methods and all K share out the same ``pretrain.contexts`` episodes.  In a continuous game
+    contexts are histories of SAC experts.
     """
-    settings: Params = (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
+    if run.problem == "darkroom":
+        kind, settings = "random_context", (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
+    else:
+        kind, settings = "train_expert", (("queries", run.pretrain.queries), *experts.settings(run.sac))
     chosen = [variations(i, task) for i, task in enumerate(tasks.split(run).train)]
     trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
-    return _jobs(run, phase, "random_context", chosen, trials, settings)
+    return _jobs(run, phase, kind, chosen, trials, settings)
 
 
 def _jobs(
@@ -245,7 +250,7 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
         return None
     queries = np.concatenate([t.observations[:-1] for t in later])
     actions = np.concatenate([t.actions for t in later])
-    labels = np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
+    labels = actions if actions.ndim == 2 else np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
     length, horizon = run.model.stretch, len(later[0].actions)
     whole = np.arange(len(later) * horizon).reshape(-1, horizon)[:, : horizon // length * length].ravel()
     gained = np.concatenate([t.rewards for t in later])

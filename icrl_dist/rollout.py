@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int16, Int64
+from jaxtyping import Bool, Float, Float32, Int16, Int64
 
 from icrl_dist.config import ConfigError, ContextConfig, Deployment, default_deployment
 from icrl_dist.envs import Batch
@@ -35,6 +35,34 @@ class Policy(Protocol):
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None: ...
+
+
+@runtime_checkable
+class Actor(Protocol):
+    """Acts in B environments at once, by actions of any kind."""
+
+    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
+        """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
+        ...
+
+    def observe(
+        self,
+        observation: Float32[np.ndarray, "B S"],
+        action: Actions,
+        reward: Float32[np.ndarray, " B"],
+        next_observation: Float32[np.ndarray, "B S"],
+        done: bool,
+    ) -> None: ...
+
+
+class RandomActor:
+    """Uniform over vectors in [-1, 1]."""
+
+    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Float32[np.ndarray, "B U"]:
+        return (2 * u - 1).astype(np.float32)
+
+    def observe(self, *transition: object) -> None:
+        """Nothing to learn."""
 
 
 class RandomPolicy:
@@ -199,7 +227,9 @@ class Episodes:
     actions: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H A"]
     observations: Float32[np.ndarray, "B H+1 S"]
     rewards: Float32[np.ndarray, "B H"]
-    adversary: Int16[np.ndarray, "B H"]
+    adversary: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H F"]
+    diverged: Bool[np.ndarray, " B"] | None = None
+    """Rows that nothing may be learned from; None for a game that cannot break down."""
 
     @property
     def returns(self) -> Float[np.ndarray, " B"]:
@@ -207,13 +237,13 @@ class Episodes:
         return self.rewards.sum(axis=1, dtype=np.float64)
 
 
-def _act(policy: Policy | InContextPolicy, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
-    if isinstance(policy, InContextPolicy):
+def _act(policy: Policy | Actor, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
+    if isinstance(policy, Actor):
         return policy.act(observation, u)
     return sample(policy.probabilities(observation), u[:, 0])
 
 
-def episode(env: Batch, policy: Policy | InContextPolicy, rngs: Sequence[np.random.Generator]) -> Episodes:
+def episode(env: Batch, policy: Policy | Actor, rngs: Sequence[np.random.Generator]) -> Episodes:
     """One episode; row b's chance, the agent's included, comes from ``rngs[b]`` alone."""
     observation = env.reset(rngs)
     shape = (env.spec.horizon, 1 if env.spec.discrete else env.spec.actions)
@@ -233,10 +263,11 @@ def episode(env: Batch, policy: Policy | InContextPolicy, rngs: Sequence[np.rand
         actions=np.stack(actions, axis=1),
         rewards=np.stack(rewards, axis=1),
         adversary=np.stack(adversary, axis=1),
+        diverged=step.diverged,
     )
 
 
-def deploy_online(env: Batch, policy: Policy, trials: Iterable[Sequence[np.random.Generator]]) -> Iterator[Episodes]:
+def deploy_online(env: Batch, policy: Policy | Actor, trials: Iterable[Sequence[np.random.Generator]]) -> Iterator[Episodes]:
     """Lines 9 to 17: one episode a trial, the context growing from nothing."""
     for rngs in trials:
         yield episode(env, policy, rngs)

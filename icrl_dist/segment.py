@@ -26,7 +26,7 @@ import msgpack
 import numpy as np
 
 from icrl_dist.stream import strict, wire
-from icrl_dist.types import ARRAYS, STAGES, Identity, Trajectory, Variation
+from icrl_dist.types import ARRAYS, STAGES, VECTORS, Identity, Trajectory, Variation
 
 _HEADER = struct.Struct("<4sIII")
 _HEAD, _CHECKSUM = struct.Struct("<4sII"), struct.Struct("<I")
@@ -35,7 +35,7 @@ NAME, TRAJECTORY, SEAL = b"icrN", b"icrT", b"icrS"
 HEADER_BYTES = _HEADER.size
 SEAL_BYTES = HEADER_BYTES + 32
 _NUMBERS = 15
-_DTYPES = {name: np.dtype(dtype) for name, (dtype, _) in ARRAYS.items()}
+_DTYPES, _VECTOR_DTYPES = ({name: np.dtype(dtype) for name, (dtype, _) in kinds.items()} for kinds in (ARRAYS, VECTORS))
 
 
 def frame(magic: bytes, payload: bytes) -> bytes:
@@ -103,7 +103,8 @@ def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
         numbers.append(number)
         fresh.append(new)
     shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.taken))
-    head = msgpack.packb([*t.identity.key(), t.weights, *numbers, *shape])
+    disturbance = () if t.adversary.ndim == 1 else (t.adversary.shape[1],)
+    head = msgpack.packb([*t.identity.key(), t.weights, *numbers, *shape, *disturbance])
     return b"".join(fresh), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
 
 
@@ -113,25 +114,30 @@ def decode(payload: bytes, names: Names) -> Trajectory:
     Raises ValueError for a payload that is none, MissingName if it refers to a name that is lost.
     """
     reader = _reader(payload[:256])
-    numbers = [strict.integer(n, "frame", -1) for n in strict.as_list(_next(reader), "frame", _NUMBERS)]
+    numbers = [strict.integer(n, "frame", -1) for n in strict.as_list(_next(reader), "frame")]
+    vectors = len(numbers) == _NUMBERS + 1  # the last is their adversary's components
+    if len(numbers) != _NUMBERS and not vectors:
+        raise ValueError(f"a trajectory frame of {len(numbers)} numbers")
+    disturbance = numbers.pop() if vectors else 0
     stage, round_, task, variation, trial, weights, phi, digest, worker, origin, *sizes = numbers
     steps, components, queries, actions, taken = sizes
-    if min(numbers[:5] + numbers[6:]) < 0 or max(numbers) >= 1 << 31 or stage >= len(STAGES):
+    if min(numbers[:5] + numbers[6:] + [disturbance]) < 0 or max(*numbers, disturbance) >= 1 << 31 or stage >= len(STAGES):
         raise ValueError(f"a trajectory frame of {numbers}")
+    width = (actions,) if vectors else ()
     shapes = {
         "observations": (steps + 1, components),
-        "actions": (steps,),
+        "actions": (steps, *width),
         "rewards": (steps,),
-        "adversary": (steps,),
+        "adversary": (steps, disturbance) if vectors else (steps,),
         "queries": (queries, components),
         "labels": (queries, actions),
-        "taken": (taken,),
+        "taken": (taken, *width),
         "gained": (taken,),
     }
-    arrays, at = {}, reader.tell()
-    if len(payload) - at != sum(prod(shape) * _DTYPES[name].itemsize for name, shape in shapes.items()):
+    arrays, at, dtypes = {}, reader.tell(), _VECTOR_DTYPES if vectors else _DTYPES
+    if len(payload) - at != sum(prod(shape) * dtypes[name].itemsize for name, shape in shapes.items()):
         raise ValueError(f"a trajectory frame of {len(payload)} bytes that claims the shapes {shapes}")
-    for name, dtype in _DTYPES.items():
+    for name, dtype in dtypes.items():
         count = prod(shapes[name])
         arrays[name] = np.frombuffer(payload, dtype, count, at).reshape(shapes[name])
         at += count * dtype.itemsize
@@ -150,7 +156,7 @@ def _reader(payload: bytes) -> msgpack.Unpacker:
     """A reader of whole numbers, and of lists as short as ours; the limits keep a list's claims from filling the memory."""
     reader = msgpack.Unpacker(
         max_buffer_size=max(1, len(payload)),
-        max_array_len=_NUMBERS,
+        max_array_len=_NUMBERS + 1,
         max_map_len=0,
         max_str_len=0,
         max_bin_len=0,

@@ -52,7 +52,10 @@ def build(cls: type, table: dict[str, Any], source: str, prefix: str = "") -> ob
             known = list(hints)
             raise ConfigError(f"{source}: unknown key {prefix}{key}{nearest(key, known)}; known keys here: {', '.join(known)}")
     values = {key: _value(hints[key], value, source, prefix + key) for key, value in table.items()}
-    return cls(**values)
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
 
 
 def _value(hint: Any, value: Any, source: str, where: str) -> Any:

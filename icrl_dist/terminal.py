@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from icrl_dist.evaluate import ORACLE, Result
+from icrl_dist.evaluate import EXPERT, ORACLE, SCRIPTED, Result
 
 _PERIOD_S = 10.0
 
@@ -105,11 +105,15 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
     for e in shown:
         table.add_column(f"ep {e}", justify="right")
     table.add_column(f"last {last}", justify="right")
-    table.add_column("of oracle", justify="right")
-    ceilings = {r.p: r.last(last) for r in results if r.agent == ORACLE}
+    present = [name for name in (ORACLE, SCRIPTED, EXPERT) if any(r.agent == name for r in results)]
+    best = next(iter(present), ORACLE if results[0].optimum is not None else "")
+    if best:
+        table.add_column(f"of {best}", justify="right")
+    ceilings = {r.p: r.last(last) for r in results if r.agent == best}
     for result in results:
         mean = result.returns.mean(axis=(0, 1))
-        ceiling = ceilings.get(result.p, float(np.mean(result.optimum)))
+        if not present and result.optimum is not None:
+            ceilings[result.p] = float(np.mean(result.optimum))
         cells = [f"{mean[e - 1]:.1f}" for e in shown]
         first = results[max(0, results.index(result) - 1)].p == result.p and results.index(result) > 0
         table.add_row(
@@ -117,7 +121,7 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
             result.agent,
             *cells,
             f"{result.last(last):.1f}",
-            f"{result.last(last) / ceiling:.0%}",
+            *([f"{result.last(last) / ceilings[result.p]:.0%}"] if best else []),
         )
     return table
 

@@ -190,21 +190,23 @@ class Trajectory:
     digest: str
     """Digest of those weights; empty for a policy without weights."""
     worker: str
-    actions: Int16[np.ndarray, " H"]
+    actions: Int16[np.ndarray, " H"] | Float32[np.ndarray, "H A"]
+    """Numbers, or vectors in [-1, 1]."""
     observations: Float32[np.ndarray, "H+1 S"]
     rewards: Float32[np.ndarray, " H"]
-    adversary: Int16[np.ndarray, " H"]
+    adversary: Int16[np.ndarray, " H"] | Float32[np.ndarray, "H F"]
+    """See ``Step.adversary``: numbers where actions are numbers, else vectors."""
     queries: Float32[np.ndarray, "Q S"]
     """Query states s_query; none (Q = 0) if the collector knew no labels."""
     labels: Float32[np.ndarray, "Q A"]
-    """A distribution over actions at each query state."""
-    taken: Int16[np.ndarray, " R"]
+    """A distribution over actions at each query state; of vectors, the right one."""
+    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     """The actions taken at the last R query states, which lie in stretches (zeta of eq. 6), one
     after another; the first Q - R states stand alone."""
     gained: Float32[np.ndarray, " R"]
     """The reward that each of them brought."""
     origin: str
-    """Where the labels came from: ``optimal``, ``heuristic`` or ``none``."""
+    """Where the labels came from: ``optimal``, ``heuristic``, ``expert`` or ``none``."""
 
     @property
     def episode_return(self) -> float:
@@ -226,6 +228,8 @@ ARRAYS: dict[str, tuple[str, int]] = {
     "gained": ("<f4", 1),
 }
 """A trajectory's arrays: their dtype and number of dimensions."""
+VECTORS: dict[str, tuple[str, int]] = ARRAYS | dict.fromkeys(("actions", "adversary", "taken"), ("<f4", 2))
+"""The same where actions are vectors."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -246,7 +250,7 @@ class Job:
     """
 
     kind: str
-    """A function of ``jobs.py``: ``random_context`` or ``adapt``."""
+    """A function of ``jobs.py``: ``random_context``, ``train_expert`` or ``adapt``."""
     stage: str
     round: int
     task: int

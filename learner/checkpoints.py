@@ -25,22 +25,30 @@ PARTIAL = "partial.npz"
 
 def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]:
     """What a checkpoint says of itself: enough to deploy it, and to know where it comes from."""
-    split = tasks.split(run)
     room = run.darkroom
     return {
         "method": run.method,
         "version": version,
         "run": dumps(run),
         "spec": dataclasses.asdict(spec),
+        "problem": run.problem,
         "seed": run.seed,
         "split_seed": room.split_seed,
-        "size": room.size,
-        "horizon": room.horizon,
+        "horizon": spec.horizon,
         "stretch": run.model.stretch,
-        "test_goals": [[int(c) for c in task.vector("goal")] for task in split.test],
+        **_tasks(run),
         "threads": threads,
         "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},
     }
+
+
+def _tasks(run: Run) -> dict[str, Any]:
+    """Which tasks it was trained on, and which it was not."""
+    split = tasks.split(run)
+    if run.problem == "darkroom":
+        return {"size": run.darkroom.size, "test_goals": [[int(c) for c in task.vector("goal")] for task in split.test]}
+    plain = [[dict(task.params) for task in part] for part in (split.train, split.test)]
+    return {"train_tasks": plain[0], "test_tasks": plain[1]}
 
 
 def save(path: Path, model: PretrainedTransformer, opt: Optimiser, about: Mapping[str, Any]) -> None:

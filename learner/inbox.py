@@ -42,9 +42,12 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
         raise Rejected("spec", f"{identity}: observations {trajectory.observations.shape}, this run needs {size}")
     if trajectory.queries.shape[1] != spec.observation or trajectory.labels.shape[1] != spec.actions:
         raise Rejected("spec", f"{identity}: queries {trajectory.queries.shape}, labels {trajectory.labels.shape}")
-    for chosen in (trajectory.actions, trajectory.taken):
-        if len(chosen) and (chosen.min() < 0 or chosen.max() >= spec.actions):
-            raise Rejected("spec", f"{identity}: an action lies outside 0..{spec.actions - 1}")
+    if (trajectory.actions.ndim == 1) != spec.discrete:
+        raise Rejected("spec", f"{identity}: actions {trajectory.actions.shape} are of the other kind than this run's")
+    low, high = (0, spec.actions - 1) if spec.discrete else (-1, 1)
+    for chosen in (trajectory.actions, trajectory.taken, *(() if spec.discrete else (trajectory.labels,))):
+        if len(chosen) and (chosen.min() < low or chosen.max() > high):
+            raise Rejected("spec", f"{identity}: an action lies outside {low}..{high}")
     if not all(map(_finite, trajectory.arrays().values())):
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
     if trajectory.variation != job.variation(identity):

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from icrl_dist.algos.replay import Transitions
-from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.stacked import Buffers, Perceptrons, Shape
+from icrl_dist.games import SACConfig
 
 TRAINED = ("actor", "critic", "log_temperature")
 """What Adam trains."""

@@ -6,7 +6,6 @@ has the paper's own for each.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import gymnasium
@@ -15,46 +14,7 @@ import stable_baselines3
 from stable_baselines3.common.noise import ActionNoise
 from torch.optim import Optimizer
 
-
-@dataclasses.dataclass(frozen=True)
-class SACConfig:
-    """Table 1 of the paper; where it is silent or misprinted, QARL's code."""
-
-    hidden: tuple[int, ...] = (256, 256, 256)
-    """Widths of the hidden layers, ReLU, of the actor and of each of the two critics (Table 1)."""
-    actor_rate: float = 1e-4
-    """Adam's learning rate for the actor (Table 1)."""
-    critic_rate: float = 3e-4
-    """Adam's learning rate for the critics (Table 1)."""
-    temperature_rate: float = 3e-4
-    """Adam's learning rate for the logarithm of the temperature (Table 1)."""
-    tau: float = 0.005
-    """Share of the critics that the target critics take up at each update (Table 1)."""
-    gamma: float = 0.9
-    """Discount a step (section 5)."""
-    batch: int = 256
-    """Transitions an update (Table 1)."""
-    random_steps: int = 3_000
-    """Steps of uniformly random actions at the start (Table 1)."""
-    warmup: int = 5_000
-    """Steps before the first update (Table 1)."""
-    replay: int = 1_000_000
-    """Transitions remembered, at most (Table 1)."""
-    temperature: float = 5e-3
-    """The first temperature (QARL's code; Table 1's 5*10^3 has lost its sign).  The entropy that it
-    is tuned to is -A for A action components."""
-    update_every: int = 3
-    """Steps an update (QARL's code)."""
-
-    def __post_init__(self) -> None:
-        for name, value in dataclasses.asdict(self).items():
-            least = 0 if name in ("random_steps", "warmup", "gamma") else np.nextafter(0, 1)
-            if min(value, default=0) < least if isinstance(value, tuple) else value < least:
-                raise ValueError(f"SAC: {name} = {value}: must be {'0 or more' if least == 0 else 'above 0'}")
-        if self.warmup < 1 or self.tau > 1 or self.gamma >= 1:
-            raise ValueError(
-                f"SAC: warmup = {self.warmup}, tau = {self.tau}, gamma = {self.gamma}: must be at least 1, at most 1, below 1"
-            )
+from icrl_dist.games import SACConfig
 
 
 class Expert(stable_baselines3.SAC):

@@ -19,9 +19,9 @@ from torch import Tensor
 from icrl_dist.algos import sb3
 from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
 from icrl_dist.algos.replay import Replay, Transitions
-from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.stacked import Shape, outputs
 from icrl_dist.envs import Batch
+from icrl_dist.games import SACConfig
 from icrl_dist.types import Spec, Step
 
 Products = Literal["float32", "bfloat16"]

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from icrl_dist.algos.lockstep import MOMENTS, TRAINED
-from icrl_dist.algos.sac import Expert, SACConfig, expert
+from icrl_dist.algos.sac import Expert, expert
 from icrl_dist.algos.stacked import Shape
+from icrl_dist.games import SACConfig
 from icrl_dist.types import Spec
 
 Shapes = tuple[Shape, Shape]

@@ -17,9 +17,9 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
-from icrl_dist.algos.sac import SACConfig
 from icrl_dist.algos.sac_batch import Products, SACBatch
 from icrl_dist.algos.sb3 import blank
+from icrl_dist.games import SACConfig
 from icrl_dist.types import Spec
 
 SPEC = Spec((-np.inf,) * 17, (np.inf,) * 17, 6, 200, discrete=False)

@@ -65,13 +65,20 @@ def targets() -> dict[str, Target]:
     job = Job("adapt", "adapt", 1, 2, variations, 4, 0, 2**40, (("beta", 1.0),))
     many = dataclasses.replace(job, variations=variations * 200)
     message = wire.encode_message("hello", a=[1, {"b": None}], c=b"x", d=1.5, e="worker", f=-(2**40))
+    steps, queries, taken = (len(array) for array in (one.actions, one.queries, one.taken))
+    shapes = {"actions": (steps, 4), "adversary": (steps, 2), "labels": (queries, 4), "taken": (taken, 4)}
+    arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    vectors = dataclasses.replace(one, **arrays)
     trajectory = wire.encode_trajectory(one)
     answers = strict.pack("answers", {"reasons": ["", "busy"]})
     name, frame = segment.encode(one, names)
+    frames = [frame[segment.HEADER_BYTES :], segment.encode(vectors, names)[1][segment.HEADER_BYTES :]]
     first = name[segment.HEADER_BYTES :][: int.from_bytes(name[4:8], "little")]
     refusal = wire.WireError
     return {
-        "trajectory": Target(lambda data: wire.decode_trajectory(data, LIMIT), refusal, [trajectory]),
+        "trajectory": Target(
+            lambda data: wire.decode_trajectory(data, LIMIT), refusal, [trajectory, wire.encode_trajectory(vectors)]
+        ),
         "weights": Target(lambda data: wire.decode_weights(data, LIMIT), refusal, [small, large]),
         "job": Target(lambda data: wire.decode_job(data, LIMIT), refusal, [wire.encode_job(job), wire.encode_job(many)]),
         "message": Target(
@@ -81,7 +88,7 @@ def targets() -> dict[str, Target]:
             lambda data: batch.split(_Query(data), LIMIT), refusal, [batch.join([message] * 3), batch.join([large])]
         ),
         "answers": Target(lambda data: batch.reasons(data, 2), refusal, [answers]),
-        "frame": Target(lambda data: segment.decode(data, names), ValueError, [frame[segment.HEADER_BYTES :]]),
+        "frame": Target(lambda data: segment.decode(data, names), ValueError, frames),
         "name": Target(lambda data: segment.Names().read(data), ValueError, [first]),
     }
 

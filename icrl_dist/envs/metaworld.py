@@ -6,6 +6,7 @@ labeller sees the true state, goal included.
 
 from __future__ import annotations
 
+import functools
 import pickle
 import warnings
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ _HAND, _OBJECT, _GOAL = slice(0, 3), slice(4, 7), slice(36, 39)
 _NOW, _BEFORE = slice(0, 18), slice(18, 36)
 
 
+@functools.lru_cache(maxsize=8)
 def ml1_tasks(count: int = 20, seed: int = 0) -> tuple[Task, ...]:
     """The first of ML1's own seeded training tasks: where the object lies and where it has to go, in metres.
 

@@ -32,7 +32,20 @@ from icrl_dist.stream.strict import (
     to_array,
     unpack,
 )
-from icrl_dist.types import ARRAYS, STAGES, Adversary, Identity, Job, Params, Task, Trajectory, Value, Variation, Weights
+from icrl_dist.types import (
+    ARRAYS,
+    STAGES,
+    VECTORS,
+    Adversary,
+    Identity,
+    Job,
+    Params,
+    Task,
+    Trajectory,
+    Value,
+    Variation,
+    Weights,
+)
 
 __all__ = ["REASONS", "VERSION", "WireError"]
 
@@ -46,8 +59,9 @@ _LARGEST = (1 << 31) - 1
 def encode_trajectory(trajectory: Trajectory) -> bytes:
     """The trajectory as bytes.  The producer's mistakes are refused here, as the reader would refuse them."""
     arrays = trajectory.arrays()
+    kinds = ARRAYS if arrays["actions"].ndim == 1 else VECTORS
     for name, array in arrays.items():
-        _check_kind(name, array.dtype.str, array.ndim)
+        _check_kind(name, array.dtype.str, array.ndim, *kinds[name])
     _check_lengths(arrays)
     return pack(
         "trajectory",
@@ -70,9 +84,8 @@ def decode_trajectory(data: bytes, limit: int) -> Trajectory:
     """
     fields = _fields(data, limit, "trajectory", _TRAJECTORY)
     raw = exactly(fields["arrays"], "arrays", ARRAYS.keys())
-    arrays = {}
-    for name, (dtype, ndim) in ARRAYS.items():
-        arrays[name] = to_array(name, raw[name], (dtype,), ndim)
+    kinds = VECTORS if as_list(raw["actions"], "actions", 3)[0] == VECTORS["actions"][0] else ARRAYS
+    arrays = {name: to_array(name, raw[name], (dtype,), ndim) for name, (dtype, ndim) in kinds.items()}
     _check_lengths(arrays)
     return Trajectory(
         identity=_to_identity(fields["identity"]),
@@ -260,8 +273,7 @@ def to_variation(value: object) -> Variation:
     )
 
 
-def _check_kind(name: str, dtype: str, ndim: int) -> None:
-    expected, rank = ARRAYS[name]
+def _check_kind(name: str, dtype: str, ndim: int, expected: str, rank: int) -> None:
     if dtype != expected:
         raise WireError("dtype", f"{name} is {dtype}, expected {expected}")
     if ndim != rank:
@@ -280,6 +292,9 @@ def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
     if arrays["queries"].shape[1] != arrays["observations"].shape[1]:
         shapes = arrays["queries"].shape, arrays["observations"].shape
         raise WireError("shape", f"queries and observations have shapes {shapes}: different observation components")
+    if arrays["actions"].ndim == 2 and len({arrays[name].shape[1] for name in ("actions", "taken", "labels")}) != 1:
+        widths = {name: arrays[name].shape[1] for name in ("actions", "taken", "labels")}
+        raise WireError("shape", f"vectors of actions have unlike components: {widths}")
 
 
 def _check_digest(digest: str, arrays: Mapping[str, np.ndarray]) -> None:

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from icrl_dist import cli
-from icrl_dist.algos.sac import SACConfig
 from icrl_dist.bench import experts
 from icrl_dist.bench.experts import Sizes
+from icrl_dist.games import SACConfig
 
 TINY = Sizes(2, SACConfig(hidden=(8, 8), batch=4, replay=50), 3, 2)
 

@@ -38,7 +38,8 @@ def test_dumps_is_read_back(small_run: Run) -> None:
 
 def test_every_number_says_what_it_is() -> None:
     """A docstring stands under each field, so ``--help`` and the docs can say it."""
-    source = (resources.files("icrl_dist") / "config.py").read_text().splitlines()
+    files = resources.files("icrl_dist")
+    source = [line for name in ("config.py", "games.py") for line in (files / name).read_text().splitlines()]
     sections = [f.default_factory for f in dataclasses.fields(Run) if f.default_factory is not dataclasses.MISSING]
     for section in sections:
         assert isinstance(section, type)
@@ -117,6 +118,20 @@ def test_values_land_where_they_belong() -> None:
         ("[stream]\ncredits = 0", ["stream.credits = 0", "above 0"]),
         ("[learner]\nthreads = -1", ["learner.threads = -1"]),
         ("[learner]\nrestarts = -1", ["learner.restarts = -1"]),
+        # The continuous games.
+        ('problem = "dmc-cheeta-run"', ["problem = 'dmc-cheeta-run'", "did you mean 'dmc-cheetah-run'"]),
+        ('problem = "dmc-hopper-hop"\n[control]\ntrain_tasks = 9', ["control.train_tasks = 9", "4, 16 or 36"]),
+        ('problem = "dmc-hopper-hop"\n[control]\ntest_tasks = 49', ["control.test_tasks = 49", "48 others"]),
+        ('problem = "dmc-hopper-hop"\n[practice]\nrounds = 1', ["practice.rounds = 1", "Dark Room"]),
+        ('problem = "dmc-hopper-hop"\n[context]\nmax = 150', ["context.max = 150", "at least one episode"]),
+        ('problem = "metaworld-pick-place"\n[control]\ntrain_tasks = 46', ["control.train_tasks = 46", "1 to 45"]),
+        ('problem = "metaworld-pick-place"\n[control]\nhorizon = 501', ["control.horizon = 501", "500"]),
+        ('problem = "metaworld-pick-place"\n[control]\ndisturbance = 1', ["control.disturbance = 1.0", "0.1 metres"]),
+        ('[control]\nforces = "strong"', ["control.forces = 'strong'", "'paper', 'qarl'"]),
+        ("[sac]\nsteps = 0", ["sac.steps = 0", "above 0"]),
+        ("[sac]\nhidden = []", ["sac.hidden = ()", "at least one layer"]),
+        ("[sac]\nhiden = [64]", ["sac.hiden", "did you mean 'hidden'"]),
+        ("[sac]\ngamma = 1.0", ["sac.gamma = 1.0"]),
         # Broken TOML.
         ("[darkroom\nsize = 3", ["not valid TOML", "line 1"]),
         ("seed = 1\nseed = 2\n", ["not valid TOML", "Cannot overwrite a value"]),

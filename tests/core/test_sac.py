@@ -6,7 +6,8 @@ import pytest
 import stable_baselines3
 import torch
 
-from icrl_dist.algos.sac import Expert, SACConfig, expert
+from icrl_dist.algos.sac import Expert, expert
+from icrl_dist.games import SACConfig
 
 CONFIG = SACConfig(hidden=(8, 4), batch=6, random_steps=10, warmup=20, replay=100, update_every=3)
 

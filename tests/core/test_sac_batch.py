@@ -13,10 +13,11 @@ from stable_baselines3.common.logger import configure
 from icrl_dist import envs
 from icrl_dist.algos.lockstep import draw
 from icrl_dist.algos.replay import Replay, Transitions
-from icrl_dist.algos.sac import Expert, SACConfig
+from icrl_dist.algos.sac import Expert
 from icrl_dist.algos.sac_batch import SACBatch, pick, train
 from icrl_dist.algos.stacked import outputs
 from icrl_dist.envs import problems
+from icrl_dist.games import SACConfig
 from icrl_dist.types import Spec, Step, Variation
 
 S, A, N = 17, 6, 3

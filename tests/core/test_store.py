@@ -58,6 +58,20 @@ def test_what_was_appended_is_there_after_reopening_in_canonical_order(Store, tm
     assert trajectories[0].identity in again and Identity("adapt", 0, 0, 0, 0) not in again
 
 
+def test_actions_may_be_vectors_in_one_segment_with_numbers(Store, tmp_path, trajectories):
+    t, rng = trajectories[0], np.random.default_rng(0)
+    steps, queries, taken = len(t.actions), len(t.queries), len(t.taken)
+    shapes = {"actions": (steps, 3), "labels": (queries, 3), "taken": (taken, 3), "adversary": (steps, 2)}
+    arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
+    vectors = [dataclasses.replace(t, identity=t.identity._replace(trial=100 + n), **arrays) for n in range(3)]
+    Store(tmp_path).append([vectors[0], *trajectories, *vectors[1:]])
+    again = Store(tmp_path)
+    for one in (*trajectories, *vectors):
+        back = again.read(one.identity)
+        assert wire.trajectory_digest(back) == wire.trajectory_digest(one)
+        assert {n: a.shape for n, a in back.arrays().items()} == {n: a.shape for n, a in one.arrays().items()}
+
+
 def test_the_ledger_says_where_each_lies_and_where_it_comes_from(Store, tmp_path, trajectories):
     store = Store(tmp_path, seal_bytes=2000)
     for t in trajectories:

@@ -8,7 +8,8 @@ import pytest
 
 from icrl_dist import envs
 from icrl_dist.config import Run
-from icrl_dist.envs import tasks
+from icrl_dist.envs import problems, tasks
+from icrl_dist.envs.metaworld import ml1_tasks
 from icrl_dist.types import NULL
 
 
@@ -81,3 +82,37 @@ def test_test_adversaries_repeat_and_keep_their_law_as_p_grows(small_run: Run) -
     assert len({tasks.test_adversary(small_run, i, 0.1, "unseen") for i in range(20)}) == 20
     assert tasks.test_adversary(small_run, 3, 0.1, "uniform").kind == "uniform"
     assert tasks.test_adversary(small_run, 3, 0.0, "unseen") == NULL
+
+
+def test_a_continuous_run_trains_on_the_centre_and_tests_elsewhere(small_run: Run) -> None:
+    control = dataclasses.replace(small_run.control, train_tasks=4, test_tasks=6, horizon=50, forces="qarl", strength=2.0)
+    run = dataclasses.replace(small_run, problem="dmc-hopper-hop", control=control)
+    parts = tasks.split(run)
+    assert (len(parts.train), len(parts.test)) == (4, 6) and not set(parts.train) & set(parts.test)
+    masses = {task.number("torso_mass") for task in problems.grid(run.problem, 2)}
+    assert {task.number("torso_mass") for task in parts.train} == masses
+    assert {(t["horizon"], t["forces"]) for t in parts.train + parts.test} == {(50, "qarl")}
+    assert parts == tasks.split(dataclasses.replace(run, seed=7)), "the run's seed must not move the split"
+    assert tasks.spec(run) == envs.spec(parts.test[0]) and tasks.disturbance(run) == 2
+    kinds = tasks.variations(run, 1, parts.train[1])
+    assert kinds[0].adversary == NULL and len({v.adversary for v in kinds}) == run.adversary.count
+    assert {v.adversary["strength"] for v in kinds[1:]} == {2.0}
+    assert kinds != tasks.variations(run, 1, parts.train[1], 1) and kinds == tasks.variations(run, 1, parts.train[1])
+    tests = [tasks.test_adversary(run, i, 0.5, "unseen") for i in range(6)]
+    assert (
+        len(set(tests)) == 6 and {a["strength"] for a in tests} == {1.0} and tasks.test_adversary(run, 0, 0, "unseen") == NULL
+    )
+    assert not set(tests) & {v.adversary for i in range(4) for v in tasks.variations(run, i, parts.train[i])}
+    envs.batch([kinds[1]])
+
+
+def test_meta_world_trains_on_ml1s_first_tasks_and_tests_on_the_next(small_run: Run) -> None:
+    control = dataclasses.replace(small_run.control, train_tasks=3, test_tasks=2, disturbance=0.02, horizon=40)
+    run = dataclasses.replace(small_run, problem="metaworld-pick-place", control=control)
+    parts = tasks.split(run)
+    assert (len(parts.train), len(parts.test)) == (3, 2)
+    places = [task.vector("goal") for task in (*parts.train, *parts.test)]
+    assert places == [task.vector("goal") for task in ml1_tasks(5, 0)]
+    assert {(t["horizon"], t["disturbance"]) for t in parts.train + parts.test} == {(40, 0.02)}
+    assert tasks.spec(run) == envs.spec(parts.train[0]) and tasks.disturbance(run) == 9
+    envs.batch([tasks.variations(run, 0, parts.train[0])[1]])

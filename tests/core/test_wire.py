@@ -45,6 +45,14 @@ def trajectory(steps: int = 5, queries: int = 3, variation: Variation = VARIATIO
     )
 
 
+def vectors(steps: int = 5, queries: int = 3) -> Trajectory:
+    """A trajectory of a game with four-dimensional actions, pushed in three components."""
+    rng = np.random.default_rng(steps)
+    shapes = {"actions": (steps, 4), "adversary": (steps, 3), "taken": (queries // 2, 4), "labels": (queries, 4)}
+    arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
+    return dataclasses.replace(trajectory(steps, queries), origin="expert", **arrays)
+
+
 def weights() -> Weights:
     rng = np.random.default_rng(0)
     arrays = {
@@ -70,8 +78,8 @@ def decode(data: bytes) -> Trajectory:
 
 
 def test_a_trajectory_comes_back_as_it_was() -> None:
-    for steps, queries, variation in [(5, 3, VARIATIONS[0]), (1, 0, VARIATIONS[1]), (100, 1, VARIATIONS[2])]:
-        sent = trajectory(steps, queries, variation)
+    discrete = [(5, 3, VARIATIONS[0]), (1, 0, VARIATIONS[1]), (100, 1, VARIATIONS[2])]
+    for sent in [*(trajectory(*sizes) for sizes in discrete), vectors(), vectors(1, 0)]:
         got = decode(wire.encode_trajectory(sent))
         for field in dataclasses.fields(Trajectory):
             if field.name not in ARRAYS:
@@ -219,6 +227,15 @@ MALFORMED: list[tuple[str, str, bytes]] = [
     ("nothing taken but something gained", "shape", repack(array("taken", [0]))),
     ("more taken than asked", "shape", repack(lambda m: m["arrays"].update(taken=FOUR_TAKEN, gained=FOUR_GAINED))),
     ("queries of three", "shape", repack(array("queries", [3, 3], bytes(36)))),
+    ("vectors for numbers", "dtype", repack(array("actions", [5, 4], bytes(80), "<f4"))),
+    ("numbers for vectors", "dtype", repack(array("actions", [5], bytes(10)), wire.encode_trajectory(vectors()))),
+    ("a flat list of vectors", "shape", repack(array("actions", [20], bytes(80), "<f4"), wire.encode_trajectory(vectors()))),
+    (
+        "vectors of unlike components",
+        "shape",
+        repack(array("actions", [5, 3], bytes(60), "<f4"), wire.encode_trajectory(vectors())),
+    ),
+    ("an adversary of numbers", "dtype", repack(array("adversary", [5], bytes(10)), wire.encode_trajectory(vectors()))),
 ]
 
 
@@ -281,13 +298,23 @@ def test_a_producers_mistakes_are_refused_at_home() -> None:
     wide = trajectory()
     object.__setattr__(wide, "rewards", wide.rewards.astype(np.float64))
     cases.append(("dtype", lambda: wire.encode_trajectory(wide)))
+    uneven = vectors()
+    object.__setattr__(uneven, "labels", np.zeros((3, 2), np.float32))
+    cases.append(("shape", lambda: wire.encode_trajectory(uneven)))
+    mixed = vectors()
+    object.__setattr__(mixed, "adversary", np.full(5, -1, np.int16))
+    cases.append(("dtype", lambda: wire.encode_trajectory(mixed)))
     for reason, encode in cases:
         with pytest.raises(WireError) as caught:
             encode()
         assert caught.value.reason == reason
 
 
-ALL = {"trajectory": (wire.encode_trajectory(trajectory()), decode), **ENCODED}
+ALL = {
+    "trajectory": (wire.encode_trajectory(trajectory()), decode),
+    "vectors": (wire.encode_trajectory(vectors()), decode),
+    **ENCODED,
+}
 
 
 @settings(max_examples=400, deadline=None)

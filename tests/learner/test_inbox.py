@@ -12,8 +12,8 @@ from icrl_dist.files import StoreError
 from icrl_dist.recipes import METHODS
 from icrl_dist.store import Store
 from icrl_dist.stream import batch, wire
-from icrl_dist.types import Identity
-from learner.inbox import REASONS, Inbox
+from icrl_dist.types import Identity, Spec
+from learner.inbox import REASONS, Inbox, Rejected, check
 
 
 class Asked:
@@ -141,6 +141,29 @@ def test_bad_messages_are_counted_by_reason_refused_and_harm_nothing(inbox, traj
         assert inbox.drops[reason] == before + 1
     assert len(inbox.store) == 0 and set(inbox.drops) <= set(REASONS)
     assert put(inbox, wire.encode_trajectory(trajectories[0])) == ""
+
+
+def test_vectors_of_actions_are_held_to_the_spec(trajectories, job):
+    spec = Spec((0.0, 0.0), (2.0, 2.0), 3, len(trajectories[0].actions), discrete=False)
+    one, rng = trajectories[0], np.random.default_rng(0)
+    shapes = {"actions": (len(one.actions), 3), "labels": (len(one.queries), 3), "taken": (len(one.taken), 3)}
+    arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
+    good = dataclasses.replace(one, adversary=np.zeros((len(one.actions), 2), np.float32), **arrays)
+    check(good, job, spec, "")
+    for name, array in arrays.items():
+        if len(array):
+            far = array.copy()
+            far[-1, -1] = 1.01
+            with pytest.raises(Rejected, match=r"outside -1\.\.1"):
+                check(dataclasses.replace(good, **{name: far}), job, spec, "")
+            far[-1, -1] = np.nan
+            with pytest.raises(Rejected, match="not-finite"):
+                check(dataclasses.replace(good, **{name: far}), job, spec, "")
+    with pytest.raises(Rejected, match=r"spec.*labels"):
+        check(good, job, dataclasses.replace(spec, actions=4), "")
+    for odd, other in ((one, dataclasses.replace(spec, actions=5)), (good, dataclasses.replace(spec, discrete=True))):
+        with pytest.raises(Rejected, match="of the other kind"):
+            check(odd, job, other, "")
 
 
 def test_each_trajectory_of_a_request_is_answered_for_itself(inbox, trajectories):
