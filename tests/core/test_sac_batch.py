@@ -320,7 +320,7 @@ class Broken(Line):
         return made._replace(reward=np.where(lost, np.nan, made.reward).astype(np.float32), diverged=lost)
 
 
-LINE = SACConfig(hidden=(8,), batch=4, random_steps=5, warmup=10, update_every=3, replay=1000)
+LINE = SACConfig(hidden=(8,), batch=4, random_steps=5, warmup=9, update_every=3, replay=1000)
 
 
 def test_the_target_bootstraps_through_the_time_limit():
@@ -357,6 +357,16 @@ def test_the_target_bootstraps_through_the_time_limit():
         torch.testing.assert_close(got, error, rtol=1e-3, atol=1e-5)
 
 
+def test_actions_are_uniform_for_the_random_steps_and_the_experts_then(monkeypatch):
+    asked, act = [], SACBatch.act
+    monkeypatch.setattr(SACBatch, "act", lambda self, *given: asked.append(self.steps) or act(self, *given))
+    line = Line(400)
+    train(line, LINE, 14, 0, device="cpu")
+    assert asked == list(range(5, 14))
+    uniform = np.stack(line.acted)[:5].ravel()
+    assert np.abs(np.quantile(uniform, [0.1, 0.5, 0.9]) - [-0.8, 0.0, 0.8]).max() < 0.08
+
+
 def test_a_training_draws_by_its_seed_alone_and_goes_on_from_a_state():
     kept = {}
 
@@ -365,7 +375,7 @@ def test_a_training_draws_by_its_seed_alone_and_goes_on_from_a_state():
 
     line = Line(2)
     whole = train(line, LINE, 35, 5, keep, "cpu").state()
-    assert whole["updates"] == 8  # steps 12, 15, ..., 33
+    assert whole["updates"] == 8  # after the steps 12, 15, ..., 33, not yet after 9
     assert len({tuple(start) for start in line.starts}) == 5 and len({x for start in line.starts for x in start}) == 10
     np.random.seed(1)
     torch.manual_seed(1)
@@ -428,7 +438,7 @@ def test_an_expert_learns_to_balance_the_pole_within_12000_steps():
     pole, heard = [Variation(problems.task("dmc-cartpole-balance"))], []
     env = envs.batch(pole)
     rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
-    config = SACConfig(hidden=(64, 64), batch=128, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
+    config = SACConfig(hidden=(64, 64), batch=64, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
 
     def look(experts, _):
         if experts.steps % 1000:
@@ -444,5 +454,5 @@ def test_an_expert_learns_to_balance_the_pole_within_12000_steps():
             raise LearnedError
 
     with pytest.raises(LearnedError):
-        train(envs.batch(pole), config, 12_000, 0, look, "cpu")
+        train(envs.batch(pole), config, 12_000, 1, look, "cpu")
     assert heard[0] < 170, "there was nothing to learn"
