@@ -41,7 +41,7 @@ class Worker:
         self._folder = folder
         self._stop = threading.Event()
         self._episodes = self._steps = 0
-        self._job = ""
+        self._job = self._doing = ""
 
     def stop(self) -> None:
         """End after the job at hand."""
@@ -77,7 +77,7 @@ class Worker:
         self._job = job.label
         made: set[Identity] = set()
         try:
-            work = jobs.do(job, _Waiting(policy, watchdog), self.name)
+            work = jobs.do(job, _Waiting(policy, watchdog), self.name, self._tell)
             while (trajectory := _next(work, watchdog, deadline_s)) is not None:
                 made.add(trajectory.identity)
                 self._episodes += 1
@@ -95,7 +95,14 @@ class Worker:
             _settle(sender, drain_s)
             self._ask("failed", job=list(job.name), record=record, file=self._keep(record))
         finally:
-            self._job = ""
+            self._job = self._doing = ""
+
+    def _tell(self, text: str, note: bool = False) -> None:
+        """A note goes to whoever looks at the run; anything else with the next heartbeat."""
+        if note:
+            self._ask("note", text=text)
+        else:
+            self._doing = text
 
     def _keep(self, record: dict[str, Any]) -> str:
         """Write the record into the run folder, if that is on this machine; the file's name."""
@@ -131,7 +138,8 @@ class Worker:
             key = self._keys.monitor(f"worker/{self.name}")
             while True:
                 fields = {**self._count(sender), **crashes.memory()}
-                message = wire.encode_message("worker", worker=self.name, job=self._job, time=time.time(), **fields)
+                now = {"job": self._job, "doing": self._doing, "pid": os.getpid(), "time": time.time()}
+                message = wire.encode_message("worker", worker=self.name, **now, **fields)
                 try:
                     self._link.publish(key, message, droppable=True)
                 except LinkError as error:

@@ -54,14 +54,18 @@ def train(arguments: Train, console: Console) -> int:
                 result = launch.train_ray(
                     run, folder, arguments.actors, arguments.address, display.report, arguments.oversubscribe
                 )
-            save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
-            results = heldout.online(run, folder, display)
+            if run.method != "experts":
+                save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
+                results = heldout.online(run, folder, display)
     except launch.TrainInterrupted:
         given = arguments.run or f"--from {arguments.source}"
         console.print(f"interrupted; `icrl-dist train {given} --resume` goes on from the checkpoint", markup=False)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
-    result |= heldout.show_online(run, folder / "report", *results, console)
+    if run.method == "experts":
+        result |= heldout.show_experts(folder, console)
+    else:
+        result |= heldout.show_online(run, folder / "report", *results, console)
     atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "

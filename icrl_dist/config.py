@@ -11,7 +11,7 @@ from __future__ import annotations
 import tomllib
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +26,7 @@ Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online: by Algorithm 1, its context frozen within an episode; or with every
 transition in its context at once and its guesses kept (zeta of eq. 6)."""
 
-METHOD_NAMES = ("dpt", "icag", "icaa")
+METHOD_NAMES = ("dpt", "icag", "icaa", "experts")
 
 
 @dataclass(frozen=True)
@@ -256,8 +256,9 @@ class LearnerConfig:
 class Run:
     """One run: a method, a problem and every number."""
 
-    method: Literal["dpt", "icag", "icaa"] = "icag"
-    """Which method of section 4 pretrains the transformer."""
+    method: Literal["dpt", "icag", "icaa", "experts"] = "icag"
+    """Which method of section 4 pretrains the transformer; ``experts``: none does, only the SAC experts of
+    a continuous game are made and kept, for later runs."""
     seed: int = 0
     """Every random draw of the run is keyed by this and by the identity of the work."""
     problem: str = "darkroom"
@@ -279,10 +280,12 @@ class Run:
 
 
 def load(name_or_path: str) -> Run:
-    """The run file of this name among the packaged ones, or at this path.
+    """The run file of this name among the packaged ones, or at this path; ``experts-NAME``: its experts alone.
 
     Raises ConfigError if there is none, or if any key or value in it is impossible.
     """
+    if name_or_path.startswith("experts-"):
+        return replace(load(name_or_path.removeprefix("experts-")), method="experts")
     path = Path(name_or_path)
     packaged = resources.files("icrl_dist") / "runs"
     if path.suffix == ".toml" or "/" in name_or_path:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgpack
 import numpy as np
@@ -36,6 +36,16 @@ CHECKPOINT_S = 60.0
 """A training that is under way is written down so often; after a kill it goes on from there."""
 
 _PHYSICS = ("dm-control", "metaworld", "mujoco", "torch")
+
+
+class Tell(Protocol):
+    """Hears how long work goes on; what is a ``note`` is worth a line of its own."""
+
+    def __call__(self, text: str, note: bool = False) -> None: ...
+
+
+def unheard(text: str, note: bool = False) -> None:
+    """Nobody listens."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,14 +77,14 @@ def sac_of(job: Job) -> SACConfig:
     return SACConfig(**given)
 
 
-def train_expert(job: Job, worker: str) -> Iterator[Trajectory]:
+def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajectory]:
     """Histories D^{i,k} of SAC experts of each variation, query states and labels (Algorithm 2, lines 8 to 12).
 
     All of a job's experts train together, in lockstep; they, and so the histories, are known when
     the last step is made.  Settings: those of ``settings``, ``queries`` a trajectory.  Raises
     RuntimeError for a variation whose simulation keeps breaking down.
     """
-    found = _histories(job, sac_of(job))
+    found = _histories(job, sac_of(job), tell)
     queries = int(str(job.setting("queries")))
     for row, (task, variation) in enumerate(job.rows()):
         history = found[row]
@@ -125,7 +135,7 @@ def _file(config: SACConfig, name: str) -> Path:
     return Path(config.cache).expanduser() / f"{name}.npz"
 
 
-def _histories(job: Job, config: SACConfig) -> list[History]:
+def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     """Of each of the job's variations: from the cache if all are there, else of a training of all of them.
 
     The batch belongs to the job, as everywhere: experts that trained in other company differ in
@@ -134,9 +144,10 @@ def _histories(job: Job, config: SACConfig) -> list[History]:
     found = [kept(variation, config, job.seed) for variation in job.variations]
     whole = [history for history in found if history is not None]
     if len(whole) == len(found):
-        _log.info("job %s: %d experts from the cache, %d steps of each saved", job.label, len(whole), config.steps)
+        saved = f"{len(whole) * config.steps:,} steps of SAC saved"
+        tell(f"{job.label}: {len(whole)} experts from the cache, {saved}", note=True)
         return whole
-    made = _train(job, config)
+    made = _train(job, config, tell)
     if config.cache:
         for variation, history in zip(job.variations, made, strict=True):
             save_checkpoint(
@@ -145,7 +156,7 @@ def _histories(job: Job, config: SACConfig) -> list[History]:
     return made
 
 
-def _train(job: Job, config: SACConfig) -> list[History]:
+def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     from icrl_dist.algos.sac_batch import SACBatch, train
 
     names = [key(variation, config, job.seed) for variation in job.variations]
@@ -156,6 +167,8 @@ def _train(job: Job, config: SACConfig) -> list[History]:
 
     def progress(experts: SACBatch, returns: np.ndarray) -> None:
         nonlocal written
+        mean = f"mean return {returns.mean():.0f}"
+        tell(f"{len(names)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}")
         if part is not None and time.monotonic() - written >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}

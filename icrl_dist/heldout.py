@@ -18,8 +18,9 @@ from icrl_dist.envs import tasks
 from icrl_dist.exact import RULES
 from icrl_dist.files import Checkpoint, atomic_write, load_checkpoint
 from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.store import Store
 from icrl_dist.surprise import Surprise
-from icrl_dist.terminal import Display, gap_table, kl_table, returns_table
+from icrl_dist.terminal import Display, experts_table, gap_table, kl_table, returns_table
 from icrl_dist.types import Variation
 
 
@@ -121,6 +122,20 @@ def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | i
         "first10_over_oracle": {f"{one.p:g}": one.first_over(oracle[one.p], 10) for one in newest},
         "episode_of_90": {f"{one.p:g}": one.episode_of(oracle[one.p], 0.9) for one in newest},
     }
+
+
+def show_experts(folder: Path, console: Console) -> dict[str, Any]:
+    """Print what each expert's first and last recorded episode returned; returns the rows."""
+    data = Store(folder / "dataset", readonly=True)
+    rows = []
+    for key in data.variations("pretrain", 0):
+        trials = data.trials(key)
+        told = {name: round(value, 4) for name, value in trials[0].variation.task.params if isinstance(value, float)}
+        kind, ends = trials[0].variation.adversary.kind, (trials[0], trials[-1])
+        rows.append({"task": told, "adversary": kind, "returns": [round(trial.episode_return, 2) for trial in ends]})
+    data.close()
+    console.print(experts_table(rows))
+    return {"experts": rows}
 
 
 def _tasks(run: Run, count: int) -> str:

@@ -13,7 +13,7 @@ from icrl_dist.behaviour import Walks
 from icrl_dist.config import ContextConfig, Deployment
 from icrl_dist.envs.darkroom import cells
 from icrl_dist.exact import OptimalAgent
-from icrl_dist.experts import train_expert
+from icrl_dist.experts import Tell, train_expert, unheard
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.heads import sample
 from icrl_dist.oracle import Hypotheses, cell_numbers, heuristic_labels, soft_labels
@@ -29,15 +29,15 @@ class Policies(Protocol):
         ...
 
 
-def do(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
-    """Do the job, yielding each trajectory when its episode ends.
+def do(job: Job, policies: Policies, worker: str, tell: Tell = unheard) -> Iterator[Trajectory]:
+    """Do the job, yielding each trajectory when its episode ends; ``tell`` hears of what takes long before that.
 
     Raises ValueError for a job of an unknown kind.
     """
     if job.kind == "random_context":
         return random_context(job, worker)
     if job.kind == "train_expert":
-        return train_expert(job, worker)
+        return train_expert(job, worker, tell)
     if job.kind == "adapt":
         return adapt(job, policies, worker)
     raise ValueError(f"job kind {job.kind!r}: this worker knows random_context, train_expert and adapt")

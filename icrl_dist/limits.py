@@ -37,6 +37,8 @@ def validate(run: Run, source: str) -> None:
     for p in run.evaluate.p:
         need(0 <= p <= 1, "evaluate.p", p, "a probability lies in [0, 1]")
     need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
+    room_or_game = "Dark Room has exact labels and no experts: use dpt, icag or icaa"
+    need(run.method != "experts" or run.problem != "darkroom", "method", run.method, room_or_game)
     if run.problem != "darkroom":
         train = run.control.train_tasks
         _validate_control(run, need)

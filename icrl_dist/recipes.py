@@ -258,7 +258,14 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
     return Examples.of(contexts, queries, labels, run.icaa.context == "history", stretches)
 
 
+def _nothing_learned(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
+    return ()
+
+
 METHODS: dict[str, Method] = {
+    "experts": Method(
+        lambda run: (Phase("pretrain", 0, 0, run.optim.learning_rate),), _icag_ask, _nothing_learned, tasks.variations
+    ),
     "dpt": Method(_then_practice, _dpt_ask, _pretrain_learn, _undisturbed),
     "icag": Method(_then_practice, _icag_ask, _pretrain_learn, tasks.variations),
     "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn, tasks.variations),

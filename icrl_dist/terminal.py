@@ -71,7 +71,7 @@ class Display:
         when, ended = self._printed.get(name, (time.monotonic(), False))
         if not ended and (done == total or time.monotonic() - when >= _PERIOD_S or name not in self._printed):
             self._printed[name] = (time.monotonic(), done == total)
-            if done:
+            if done or event.get("doing"):
                 self.console.print(f"{name:<26} {done:>7}/{total:<7} {info}", highlight=False)
 
 
@@ -91,6 +91,8 @@ def _info(event: dict[str, Any]) -> str:
     drops = sum(event["drops"].values())
     dropped = f", {drops} dropped" if drops else ""
     acting = f", weights v{event['version']}, lag {event['lag']}" if event["phase"] == "adapt" else ""
+    if event.get("doing"):
+        return f"{event['workers']} workers{acting}{dropped}; {'; '.join(event['doing'])}"
     return f"{event['per_s']:.0f} trajectories/s, {event['workers']} workers{acting}{dropped}"
 
 
@@ -123,6 +125,17 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
             f"{result.last(last):.1f}",
             *([f"{result.last(last) / ceilings[result.p]:.0%}"] if best else []),
         )
+    return table
+
+
+def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Returns of each expert's first and last recorded episode, a row a variation."""
+    table = Table(title="SAC experts: return of the first and of the last episode that was recorded", title_justify="left")
+    for name in ("task", "adversary", "first", "last"):
+        table.add_column(name, justify="left" if name in ("task", "adversary") else "right")
+    for row in rows:
+        told = ", ".join(f"{name} {value:g}" for name, value in row["task"].items()) or "-"
+        table.add_row(told, row["adversary"], *(f"{value:.1f}" for value in row["returns"]))
     return table
 
 

@@ -68,6 +68,13 @@ class Desk:
         """Times that a trajectory had to be sent again, by all workers so far."""
         return sum(said["resent"] for said in list(self.counters.values()))
 
+    @property
+    def doing(self) -> list[str]:
+        """What the workers that are here say of work that takes long."""
+        here = [worker for worker, alive in sorted(self.workers.items()) if alive]
+        said = (str(self.counters.get(worker, {}).get("doing", "")) for worker in here)
+        return [f"{worker}: {text[:100]}" for worker, text in zip(here, said, strict=True) if text]
+
     def finish(self) -> None:
         """From now on, tell whoever asks to stop."""
         self._finished.set()
@@ -200,7 +207,10 @@ class Desk:
             stage, round_, task, first = fields["job"]
             self._failed(worker, (stage, round_, task, first), fields["record"], fields["file"])
             return wire.encode_message("noted")
-        raise ValueError(f"message kind {kind!r}: expected hello, ask or failed")
+        if kind == "note":
+            self._report({"event": "note", "text": f"worker {worker}: {str(fields['text'])[:200]}"})
+            return wire.encode_message("noted")
+        raise ValueError(f"message kind {kind!r}: expected hello, ask, failed or note")
 
     def _lease(self, worker: str) -> bytes:
         if self._finished.is_set():

@@ -310,6 +310,7 @@ class Service:
             "workers": sum(self.desk.workers.values()),
             "lag": self._lag,
             "drops": dict(self.inbox.drops),
+            "doing": self.desk.doing,
             **values,
         }
         self._report({"event": "progress", **fields})

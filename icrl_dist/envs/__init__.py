@@ -59,10 +59,10 @@ def spec(task: Task) -> Spec:
     return of(task)
 
 
-def make(variation: Variation) -> VariationEnv:
-    """One variation environment (tau, phi) as a ``gymnasium.Env``.
+def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
+    """One variation environment (tau, phi) as a ``gymnasium.Env``; ``render_mode`` ``rgb_array`` for images.
 
     The adversary is part of the environment: the agent sees neither it nor its action,
     except in ``info["adversary"]`` (see ``Step.adversary``).
     """
-    return VariationEnv(variation, batch([variation]))
+    return VariationEnv(variation, batch([variation]), render_mode)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64, Int, UInt8
 
 from icrl_dist.envs.adversary import override_law
 from icrl_dist.types import Spec, Step, Task, Variation
@@ -120,3 +120,12 @@ class DarkRoom:
             done=self._h == self.spec.horizon,
             adversary=np.where(overridden, drawn, -1).astype(np.int16),
         )
+
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """The room from above, x to the right and y upwards: goal green, agent blue; 24 pixels a cell."""
+        size = round(len(self._cells) ** 0.5)
+        room = np.full((size, size, 3), 235, np.uint8)
+        for cell, colour in ((self._goal[row], (45, 164, 78)), (self._cell[row], (31, 111, 235))):
+            x, y = divmod(int(cell), size)
+            room[size - 1 - y, x] = colour
+        return room.repeat(24, axis=0).repeat(24, axis=1)

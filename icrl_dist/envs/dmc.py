@@ -13,11 +13,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from icrl_dist.envs.network import Networks
 from icrl_dist.envs.problems import AXES, HORIZON, Preset, problem, spec
-from icrl_dist.envs.suite import BROKEN, DOMAINS, Rows, observed
+from icrl_dist.envs.suite import BROKEN, DOMAINS, Rows, drawn, observed
 from icrl_dist.types import Step, Task, Variation
 
 
@@ -99,6 +99,10 @@ class DMC:
         self._shown = np.where(self._diverged[:, None], self._shown, self._observe())
         return Step(self._shown, reward, self._h == self.spec.horizon, pushes, self._diverged.copy())
 
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
+        return drawn(lambda: self._envs[row].physics.render(240, 320, camera_id=0))
+
     def _advance(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """As dm_control steps: what depends on position and velocity is up to date before and after."""
         if self._whole:
@@ -156,3 +160,7 @@ class Variations:
         step = self.game.step(actions, self._adversaries.act(self._seen))
         self._seen = step.observation
         return step
+
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
+        return self.game.image(row)

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt8
 
 from icrl_dist.envs import pick_place
 from icrl_dist.envs.network import Networks
-from icrl_dist.envs.suite import BROKEN
+from icrl_dist.envs.suite import BROKEN, drawn
 from icrl_dist.types import Step, Task, Variation
 
 _HAND, _OBJECT, _GOAL = slice(0, 3), slice(4, 7), slice(36, 39)
@@ -112,6 +112,12 @@ class PickPlace:
                 self.truth[row, :36], reward[row], self.success[row] = state[:36], paid, bool(info["success"])
         self._shown, moved = self._show(self._shown)
         return Step(self._shown, reward, self._h == self.spec.horizon, moved, self._diverged.copy())
+
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """One row through a camera of Meta-World's.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
+        env = self._envs[row]
+        env.render_mode = "rgb_array"
+        return drawn(env.render)
 
     def _show(self, before: Float32[np.ndarray, "B S"] | None) -> tuple[Float32[np.ndarray, "B S"], Float32[np.ndarray, "B F"]]:
         """What the agent sees of the true states, and the adversaries' actions."""

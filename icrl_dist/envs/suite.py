@@ -7,13 +7,14 @@ other, step by step, under forces.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from dm_control.utils.rewards import tolerance
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int64, UInt8
 
 Array = Float64[np.ndarray, "B ..."]
 BROKEN = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{of}").value for of in ("POS", "VEL", "ACC")]
@@ -201,3 +202,15 @@ DOMAINS: dict[str, Domain] = {
 def observed(rows: Rows, domain: str) -> Array:
     """The observation of every row: dm_control's dict, flattened in its order."""
     return np.concatenate(DOMAINS[domain].observe(rows), axis=1)
+
+
+def drawn(draw: Callable[[], np.ndarray]) -> UInt8[np.ndarray, "height width 3"]:
+    """An image by MuJoCo.  Raises RuntimeError with the remedy if there is no way to draw on this machine."""
+    gl = os.environ.get("MUJOCO_GL", "")
+    remedy = "set MUJOCO_GL=egl, or osmesa without a GPU, before Python starts, and install libegl1 or libosmesa6"
+    if gl in ("", "disabled", "disable", "off", "false", "0"):
+        raise RuntimeError(f"MuJoCo cannot draw here (MUJOCO_GL={gl!r}): {remedy}")
+    try:
+        return np.asarray(draw(), np.uint8)
+    except Exception as error:  # each back end has its own
+        raise RuntimeError(f"MuJoCo cannot draw here (MUJOCO_GL={gl!r}: {' '.join(str(error).split())}): {remedy}") from None

@@ -18,6 +18,9 @@ Action = np.int64 | np.ndarray[Any, np.dtype[np.float32]]
 """A number, or a vector in [-1, 1]."""
 
 
+Image = np.ndarray[Any, np.dtype[np.uint8]]
+
+
 class VariationEnv(gymnasium.Env[Observation, Action]):
     """The MDP (S, A, P_{tau,phi}, R_{tau,phi}, gamma, rho_tau) of section 4.1.
 
@@ -25,11 +28,13 @@ class VariationEnv(gymnasium.Env[Observation, Action]):
     and never terminates.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - gymnasium declares it so
-    render_mode: str | None = None
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - gymnasium declares it so
 
-    def __init__(self, variation: Variation, batch: Batch) -> None:
-        self.variation = variation
+    def __init__(self, variation: Variation, batch: Batch, render_mode: str | None = None) -> None:
+        """Raises ValueError for a ``render_mode`` other than ``rgb_array`` or None."""
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode {render_mode!r}: choose 'rgb_array', or None to draw nothing")
+        self.variation, self.render_mode = variation, render_mode
         self._batch = batch
         low, high = (np.array(bound, dtype=np.float32) for bound in (batch.spec.low, batch.spec.high))
         self.observation_space = spaces.Box(low, high)
@@ -53,3 +58,11 @@ class VariationEnv(gymnasium.Env[Observation, Action]):
             info["diverged"] = bool(step.diverged[0])
             over = over or info["diverged"]
         return step.observation[0], float(step.reward[0]), False, over, info
+
+    def render(self) -> Image | None:
+        """The present state as an image ``(height, width, 3)``; None without a ``render_mode``.
+
+        Raises RuntimeError, with the remedy, if MuJoCo has no way to draw on this machine.
+        """
+        drawing: Any = self._batch  # every game's batch can draw; what only steps need not
+        return None if self.render_mode is None else drawing.image(0)

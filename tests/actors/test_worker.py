@@ -104,7 +104,7 @@ def test_the_record_names_the_trajectory_that_was_under_way(hub, small_run, monk
     job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
     real = jobs.do
 
-    def breaks_at_the_third(job, policies, worker):
+    def breaks_at_the_third(job, policies, worker, tell):
         work = real(job, policies, worker)
         yield next(work)
         yield next(work)
@@ -148,7 +148,7 @@ def test_every_ask_says_what_was_done_and_heartbeats_go_on_meanwhile(hub, small_
     watching.subscribe(KEYS.heartbeats, hear)
     real = jobs.do
 
-    def stuck_for_three_beats(job, policies, worker):
+    def stuck_for_three_beats(job, policies, worker, tell):
         assert beaten.wait(30)
         return real(job, policies, worker)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,3 +74,39 @@ def test_a_batch_of_two_problems_is_refused() -> None:
         envs.batch([quiet_room(), Variation(Task.of("lightroom", size=3))])
     with pytest.raises(ValueError, match="one problem"):
         envs.batch([])
+
+
+def test_a_room_is_drawn_from_above() -> None:
+    env = envs.make(Variation(darkroom.task((2, 0), 3, 5, start=(0, 1))), "rgb_array")
+    env.reset(seed=0)
+    image = env.render()
+    assert image is not None and image.shape == (72, 72, 3) and image.dtype == np.uint8
+    cells = image[12::24, 12::24]
+    green = np.argwhere((cells == (45, 164, 78)).all(axis=2)).tolist()
+    blue = np.argwhere((cells == (31, 111, 235)).all(axis=2)).tolist()
+    assert (green, blue) == ([[2, 2]], [[1, 0]]), "rows from above, columns from the left"
+    assert envs.make(quiet_room()).render() is None
+    with pytest.raises(ValueError, match=r"render_mode 'human'.*'rgb_array'"):
+        envs.make(quiet_room(), "human")
+
+
+@pytest.mark.parametrize("make_variation", [blurred_reach, pushed("dmc-hopper-hop")], ids=["metaworld", "dmc"])
+@pytest.mark.parametrize("back_end", ["disabled", "osmesa"])
+def test_what_cannot_be_drawn_is_one_line_with_the_remedy(
+    make_variation: MakeVariation, back_end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env: Any = envs.make(make_variation(), "rgb_array")
+    env.reset(seed=0)
+    monkeypatch.setenv("MUJOCO_GL", back_end)
+    inner = env._batch._envs[0] if make_variation is blurred_reach else env._batch.game._envs[0].physics
+
+    def broken(*arguments: Any, **options: Any) -> None:
+        raise OSError("no such\nlibrary")
+
+    monkeypatch.setattr(inner, "render", broken)
+    with pytest.raises(RuntimeError, match=f"MUJOCO_GL='{back_end}'.*set MUJOCO_GL=egl") as caught:
+        env.render()
+    assert len(str(caught.value).splitlines()) == 1
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr(inner, "render", lambda *arguments, **options: np.ones((2, 3, 3), np.uint8))
+    np.testing.assert_array_equal(env.render(), np.ones((2, 3, 3)))

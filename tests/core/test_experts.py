@@ -246,3 +246,14 @@ def envs_variation():
     from icrl_dist.types import Variation
 
     return Variation(pick_place.task((0.02, 0.65, 0.02), (0.05, 0.85, 0.2)))
+
+
+def test_a_training_says_how_far_it_is_and_a_cache_what_it_saved(run):
+    job, heard = asked(run)[0], []
+    tell = lambda text, note=False: heard.append((text, note))  # noqa: E731
+    list(jobs.do(job, None, "w", tell))
+    assert len(heard) == EPISODES and heard[4][0].startswith("4 experts at 100 of 200 steps, mean return ")
+    assert not any(note for _, note in heard)
+    heard.clear()
+    list(jobs.do(job, None, "w", tell))
+    assert heard == [(f"{job.label}: 4 experts from the cache, 800 steps of SAC saved", True)]

@@ -255,3 +255,20 @@ def test_a_record_that_cannot_be_written_is_said_too(office):
     office.ask("w0")
     office.fail("w0", office.jobs[0])
     assert "its record cannot be written" in office.wait("crash")[0]["text"]
+
+
+def test_what_takes_long_is_shown_while_its_worker_is_here_and_a_note_at_once(office, worker):
+    assert office.desk.doing == []
+    links = {name: worker(name) for name in ("w1", "w0")}
+    for name, text in (("w0", "4 experts at 1,000 of 12,000 steps"), ("w1", "")):
+        office.ask(name, doing=text)
+    assert office.desk.doing == ["w0: 4 experts at 1,000 of 12,000 steps"]
+    office.ask("w1", doing="x" * 1000)
+    assert [len(text) for text in office.desk.doing] == [len("w0: 4 experts at 1,000 of 12,000 steps"), len("w1: ") + 100]
+    links["w0"].close()
+    office.wait("worker", 3)
+    assert [text[:3] for text in office.desk.doing] == ["w1:"]
+    assert office.say("note", "w1", text="2 experts from the cache")[0] == "noted"
+    assert office.wait("note")[0]["text"] == "worker w1: 2 experts from the cache"
+    with pytest.raises(Refused, match="expected hello, ask, failed or note"):
+        office.say("gossip", "w1")

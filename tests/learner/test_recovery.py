@@ -184,7 +184,7 @@ def test_explain_checks_everything_that_is_left(parent):
 def test_a_rerun_that_comes_out_otherwise_is_said(parent, monkeypatch):
     real = jobs.adapt
 
-    def other(job, policies, worker):
+    def other(job, policies, worker, tell=None):
         for trajectory in real(job, policies, worker):
             yield dataclasses.replace(trajectory, rewards=trajectory.rewards + 1)
 
