@@ -12,7 +12,7 @@ import dataclasses
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist import envs
-from icrl_dist.envs import Batch
+from icrl_dist.envs.recorder import Recorder
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
 from icrl_dist.games import SACConfig
 from icrl_dist.stream import wire
-from icrl_dist.types import Identity, Job, Params, Spec, Step, Trajectory, Variation
+from icrl_dist.types import Identity, Job, Params, Spec, Trajectory, Variation
 
 _log = logging.getLogger(__name__)
 
@@ -161,7 +161,7 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
 
     names = [key(variation, config, job.seed) for variation in job.variations]
     part = _file(config, "part-" + hashlib.sha256("".join(names).encode()).hexdigest()) if config.cache else None
-    recorder = _Recorder(envs.batch(job.variations), max(1, config.steps // envs.spec(job.variations[0].task).horizon))
+    recorder = Recorder(envs.batch(job.variations), max(1, config.steps // envs.spec(job.variations[0].task).horizon), KEPT)
     state = _resumed(part, recorder) if part is not None and part.exists() else None
     written = time.monotonic()
 
@@ -198,7 +198,7 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     return made
 
 
-def _resumed(part: Path, recorder: _Recorder) -> dict[str, np.ndarray] | None:
+def _resumed(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
     """The state of a training that was under way; None if it cannot be read."""
     try:
         stored = load_checkpoint(part)
@@ -213,63 +213,6 @@ def _scripted(truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
     from icrl_dist.envs.metaworld import expert
 
     return expert(truths.reshape(-1, truths.shape[-1]).astype(np.float64))
-
-
-class _Recorder:
-    """A batch of environments that remembers some of its episodes: ``KEPT``, evenly spaced."""
-
-    def __init__(self, env: Batch, episodes: int) -> None:
-        self.spec, self.batch, self.episodes = env.spec, env.batch, episodes
-        self._env, self._number = env, 0
-        self._wanted = set(np.linspace(0, episodes - 1, min(KEPT, episodes)).round().astype(int).tolist())
-        self._columns: dict[str, list[np.ndarray]] = {}
-        self._now: dict[str, list[np.ndarray]] = {}
-
-    def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
-        self._now = {name: [] for name in ("observations", "actions", "rewards", "adversary", "truths")}
-        seen: np.ndarray = self._env.reset(rngs)
-        self._see(seen)
-        return seen
-
-    def step(self, actions: Float32[np.ndarray, "B A"]) -> Step:
-        step = self._env.step(actions)
-        for name, value in (("actions", actions), ("rewards", step.reward), ("adversary", step.adversary)):
-            self._now[name].append(value)
-        if step.done:
-            self._now["observations"].append(step.observation)
-            self._end(step.diverged)
-        else:
-            self._see(step.observation)
-        return step
-
-    def _see(self, seen: np.ndarray) -> None:
-        self._now["observations"].append(seen)
-        truth = getattr(self._env, "truth", None)
-        if truth is not None:
-            self._now["truths"].append(truth.astype(np.float32))
-
-    def _end(self, diverged: np.ndarray | None) -> None:
-        if self._number in self._wanted:
-            for name, values in self._now.items():
-                if values:
-                    self._columns.setdefault(name, []).append(np.stack(values, axis=1))
-            lost = np.zeros(self.batch, bool) if diverged is None else diverged
-            self._columns.setdefault("whole", []).append(~lost)
-        self._number += 1
-
-    def state(self) -> dict[str, np.ndarray]:
-        """What ``load`` needs."""
-        return {"number": np.array(self._number), **{name: np.stack(values) for name, values in self._columns.items()}}
-
-    def load(self, state: Mapping[str, np.ndarray]) -> None:
-        self._number = int(state["number"])
-        self._columns = {name: list(values) for name, values in state.items() if name != "number"}
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """The episodes, ``(N, E, ...)`` each: ``observations``, ``actions``, ``rewards``, ``adversary``;
-        ``whole``, which did not break down; where a game hides something, ``truths``.
-        """
-        return {name: np.stack(values, axis=1) for name, values in self._columns.items()}
 
 
 class ExpertPolicy:

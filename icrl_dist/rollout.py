@@ -22,28 +22,8 @@ Watch = Callable[..., object]
 """Told of every decision of T_theta and of what came of it (``models.outcomes.Decisions``)."""
 
 
-class Policy(Protocol):
-    """Acts in B environments at once, by its law over discrete actions; whatever it learns, it learns from ``observe``."""
-
-    def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]: ...
-
-    def observe(
-        self,
-        observation: Float32[np.ndarray, "B S"],
-        action: Int64[np.ndarray, " B"],
-        reward: Float32[np.ndarray, " B"],
-        next_observation: Float32[np.ndarray, "B S"],
-        done: bool,
-    ) -> None: ...
-
-
-@runtime_checkable
-class Actor(Protocol):
-    """Acts in B environments at once, by actions of any kind."""
-
-    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
-        """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
-        ...
+class Observer(Protocol):
+    """Whatever it learns of B environments, it learns from ``observe``."""
 
     def observe(
         self,
@@ -53,6 +33,21 @@ class Actor(Protocol):
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None: ...
+
+
+class Policy(Observer, Protocol):
+    """Acts in B environments at once, by its law over discrete actions."""
+
+    def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]: ...
+
+
+@runtime_checkable
+class Actor(Observer, Protocol):
+    """Acts in B environments at once, by actions of any kind."""
+
+    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
+        """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
+        ...
 
 
 class RandomActor:
