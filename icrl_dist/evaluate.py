@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from icrl_dist import envs, experts, rollout
+from icrl_dist import envs, experts, histories, rollout
 from icrl_dist.config import DarkRoomConfig, Deployment, Run
 from icrl_dist.envs import darkroom, tasks
 from icrl_dist.envs.darkroom import ACTIONS
@@ -97,9 +97,9 @@ def scripted(rows: Sequence[Variation]) -> Actor:
 
 def expert(run: Run, chosen: Sequence[Task]) -> MakePolicy | None:
     """The SAC experts of these tasks, undisturbed, if they were trained on this machine."""
-    histories = {task: experts.kept(Variation(task), run.sac, run.seed) for task in chosen}
-    found = {task: history for task, history in histories.items() if history is not None}
-    if len(found) < len(histories):
+    asked = {task: histories.kept(Variation(task), run.sac, run.seed) for task in chosen}
+    found = {task: history for task, history in asked.items() if history is not None}
+    if len(found) < len(asked):
         return None
     return lambda rows: experts.ExpertPolicy([found[row.task] for row in rows], tasks.spec(run), run.sac)
 

@@ -8,34 +8,31 @@ nobody trains them twice.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import msgpack
 import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist import envs
+from icrl_dist.envs import Batch
 from icrl_dist.envs.recorder import Recorder
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
 from icrl_dist.games import SACConfig
-from icrl_dist.stream import wire
-from icrl_dist.types import Identity, Job, Params, Spec, Trajectory, Variation
+from icrl_dist.histories import KEPT, LED, History, file, keep, kept, key, sac_of
+from icrl_dist.types import Identity, Job, Spec, Trajectory
+
+if TYPE_CHECKING:
+    from icrl_dist.algos.sac_batch import SACBatch
 
 _log = logging.getLogger(__name__)
 
-KEPT = 200
-"""Episodes of a history, evenly spaced over the training; all, if there are fewer."""
 CHECKPOINT_S = 60.0
 """A training that is under way is written down so often; after a kill it goes on from there."""
-
-_PHYSICS = ("dm-control", "metaworld", "mujoco", "torch")
 
 
 class Tell(Protocol):
@@ -48,51 +45,20 @@ def unheard(text: str, note: bool = False) -> None:
     """Nobody listens."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class History:
-    """E episodes of one expert's training, what the expert would have done in them, and the expert."""
-
-    actions: Float32[np.ndarray, "E H A"]
-    observations: Float32[np.ndarray, "E H+1 S"]
-    rewards: Float32[np.ndarray, "E H"]
-    adversary: Float32[np.ndarray, "E H F"]
-    labels: Float32[np.ndarray, "E H A"]
-    """The right action at each of the first H states: the expert's mean; in Meta-World the scripted policy's."""
-    actor: Float32[np.ndarray, " P"]
-    """The expert's parameters, as ``algos.stacked.Shape`` lays them out."""
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """By name, as they are kept."""
-        return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
-
-
-def settings(config: SACConfig) -> Params:
-    """The section as settings of a job."""
-    return tuple((f"sac.{item.name}", getattr(config, item.name)) for item in dataclasses.fields(config))
-
-
-def sac_of(job: Job) -> SACConfig:
-    """The inverse of ``settings``."""
-    given: dict[str, Any] = {item.name: job.setting(f"sac.{item.name}") for item in dataclasses.fields(SACConfig)}
-    return SACConfig(**given)
-
-
 def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajectory]:
     """Histories D^{i,k} of SAC experts of each variation, query states and labels (Algorithm 2, lines 8 to 12).
 
     All of a job's experts train together, in lockstep; they, and so the histories, are known when
-    the last step is made.  Settings: those of ``settings``, ``queries`` a trajectory.  Raises
+    the last step is made.  Settings: those of ``settings``; ``queries`` a trajectory; ``stretches``
+    a trajectory, of ``stretch`` states, a share ``misled`` of them led by another's expert.  Raises
     RuntimeError for a variation whose simulation keeps breaking down.
     """
     found = _histories(job, sac_of(job), tell)
-    queries = int(str(job.setting("queries")))
     for row, (task, variation) in enumerate(job.rows()):
         history = found[row]
         chosen = np.linspace(0, len(history.rewards) - 1, job.trials).round().astype(int)
         for trial, episode in enumerate(chosen.tolist()):
             identity = Identity(job.stage, job.round, task, variation, trial)
-            asked = identity.rng(job.seed).integers(history.rewards.size, size=queries)
-            place = np.unravel_index(asked, history.rewards.shape)
             yield Trajectory(
                 identity=identity,
                 variation=job.variation(identity),
@@ -103,36 +69,30 @@ def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajec
                 actions=history.actions[episode],
                 rewards=history.rewards[episode],
                 adversary=history.adversary[episode],
-                queries=history.observations[:, :-1][place],
-                labels=history.labels[place],
-                taken=np.zeros((0, history.labels.shape[-1]), np.float32),
-                gained=np.zeros(0, np.float32),
                 origin="expert",
+                **_known(job, history, identity.rng(job.seed)),
             )
 
 
-def key(variation: Variation, config: SACConfig, seed: int) -> str:
-    """What a variation's history is kept under: all that decides it, versions of the physics included."""
-    versions = [[name, metadata.version(name)] for name in _PHYSICS]
-    numbers = [[name, value] for name, value in settings(dataclasses.replace(config, cache=""))]
-    whole = [wire.from_variation(variation), numbers, seed, versions, KEPT]
-    return hashlib.sha256(msgpack.packb(whole)).hexdigest()
-
-
-def kept(variation: Variation, config: SACConfig, seed: int) -> History | None:
-    """The history in the cache; None if it is not there, or damaged."""
-    if not config.cache:
-        return None
-    path = _file(config, key(variation, config, seed))
-    try:
-        return History(**load_checkpoint(path).arrays) if path.exists() else None
-    except (StoreError, TypeError) as error:
-        _log.warning("made anew: %s", error)
-        return None
-
-
-def _file(config: SACConfig, name: str) -> Path:
-    return Path(config.cache).expanduser() / f"{name}.npz"
+def _known(job: Job, history: History, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Query states of the history and stretches of what experts led, with their labels: a trajectory's last arrays."""
+    queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
+    place = np.unravel_index(rng.integers(history.rewards.size, size=queries), history.rewards.shape)
+    wrong = rng.random(stretches) < float(str(job.setting("misled")))
+    right_ones, wrong_ones = np.flatnonzero(~history.led_wrong), np.flatnonzero(history.led_wrong)
+    led, at = [], []
+    for misled in wrong.tolist():
+        episodes = wrong_ones if misled and len(wrong_ones) else right_ones
+        led += [int(rng.choice(episodes))] * length
+        first = int(rng.integers(history.led_rewards.shape[1] - length + 1))
+        at += list(range(first, first + length))
+    rest = np.array(led, int), np.array(at, int)
+    return {
+        "queries": np.concatenate([history.observations[:, :-1][place], history.led_observations[:, :-1][rest]]),
+        "labels": np.concatenate([history.labels[place], history.led_labels[rest]]),
+        "taken": history.led_actions[rest],
+        "gained": history.led_rewards[rest],
+    }
 
 
 def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
@@ -148,20 +108,18 @@ def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
         tell(f"{job.label}: {len(whole)} experts from the cache, {saved}", note=True)
         return whole
     made = _train(job, config, tell)
-    if config.cache:
-        for variation, history in zip(job.variations, made, strict=True):
-            save_checkpoint(
-                _file(config, key(variation, config, job.seed)), Checkpoint(history.arrays(), {"of": str(variation)})
-            )
+    for variation, history in zip(job.variations, made, strict=True):
+        keep(history, variation, config, job.seed)
     return made
 
 
 def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
-    from icrl_dist.algos.sac_batch import SACBatch, train
+    from icrl_dist.algos.sac_batch import train
 
     names = [key(variation, config, job.seed) for variation in job.variations]
-    part = _file(config, "part-" + hashlib.sha256("".join(names).encode()).hexdigest()) if config.cache else None
-    recorder = Recorder(envs.batch(job.variations), max(1, config.steps // envs.spec(job.variations[0].task).horizon), KEPT)
+    part = file(config, "part-" + hashlib.sha256("".join(names).encode()).hexdigest()) if config.cache else None
+    env = envs.batch(job.variations)
+    recorder = Recorder(env, max(1, config.steps // env.spec.horizon), KEPT)
     state = _resumed(part, recorder) if part is not None and part.exists() else None
     written = time.monotonic()
 
@@ -175,27 +133,68 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
             save_checkpoint(part, Checkpoint(arrays, {}))
             written = time.monotonic()
 
-    seed = int(Identity(job.stage, job.round, job.task, job.first, 0).rng(job.seed).integers(2**31))
+    rng = Identity(job.stage, job.round, job.task, job.first, 0).rng(job.seed)
+    seed, chance = int(rng.integers(2**31)), int(rng.integers(2**31))
     experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seed, progress, state=state)
-    columns = recorder.columns()
-    truths, whole = columns.pop("truths", None), columns.pop("whole")
-    if truths is None:
-        seen = columns["observations"][:, :, :-1]
-        columns["labels"] = experts.act(seen.reshape(len(names), -1, seen.shape[-1]), None, deterministic=True)
-    else:
-        columns["labels"] = _scripted(truths)
-    columns["labels"] = columns["labels"].reshape(columns["actions"].shape)
+    columns = _labelled(recorder.columns(), experts)
+    led = _lead(env, experts, chance)
     actors = experts.arrays["actor"].cpu().numpy()
+    made = []
     for row, variation in enumerate(job.variations):
-        if not whole[row].any():
-            raise RuntimeError(f"{variation}: its simulation broke down in every episode; leave it out, or push it less")
-    made = [
-        History(**{name: column[row][whole[row]] for name, column in columns.items()}, actor=actors[row])
-        for row in range(len(names))
-    ]
+        parts = {"": columns, "led_": led}
+        whole = {prefix: of["whole"][row] for prefix, of in parts.items()}
+        lost = sum(int((~one).sum()) for one in whole.values())
+        if lost:
+            tell(f"{job.label}: {lost} episodes of {variation} broke down, and are left out", note=True)
+        if not all(one.any() for one in whole.values()) or led["wrong"][row][whole["led_"]].all():
+            raise RuntimeError(f"{variation}: its simulation breaks down in every episode; leave it out, or push it less")
+        taken = {
+            prefix + name: column[row][whole[prefix]]
+            for prefix, of in parts.items()
+            for name, column in of.items()
+            if name != "whole" and prefix + name != "led_adversary"
+        }
+        made.append(History(**taken, actor=actors[row]))
     if part is not None:
         part.unlink(missing_ok=True)
     return made
+
+
+def _labelled(columns: dict[str, np.ndarray], experts: SACBatch) -> dict[str, np.ndarray]:
+    """Episodes with the right action at each of their states in place of the true states."""
+    truths = columns.pop("truths", None)
+    if truths is None:
+        seen = columns["observations"][:, :, :-1]
+        labels = experts.act(seen.reshape(len(seen), -1, seen.shape[-1]), None, deterministic=True)
+    else:
+        labels = scripted(truths)
+    return {**columns, "labels": labels.reshape(columns["actions"].shape)}
+
+
+def _lead(env: Batch, experts: SACBatch, seed: int) -> dict[str, np.ndarray]:
+    """``LED`` episodes in which each row's own expert acts, and, if there are several, as many in which the next row's does."""
+    count = env.batch
+    recorder = Recorder(env, episodes := 2 * LED if count > 1 else LED, episodes)
+    for episode in range(episodes):
+        by = np.roll(np.arange(count), -int(episode >= LED))  # row r follows expert by[r]
+        seen = recorder.reset(
+            [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(episode, r))) for r in range(count)]
+        )
+        for _ in range(env.spec.horizon):
+            seen = recorder.step(_led_by(by, seen, getattr(env, "truth", None), experts)).observation
+    wrong = np.broadcast_to(np.arange(episodes) >= LED, (count, episodes))
+    return {**_labelled(recorder.columns(), experts), "wrong": wrong}
+
+
+def _led_by(
+    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, experts: SACBatch
+) -> Float32[np.ndarray, "B A"]:
+    """What the expert ``by[r]`` does in row r; Meta-World's is the scripted policy that is told that row's goal."""
+    if truth is not None:
+        return scripted(np.concatenate([truth[:, :-3], truth[by, -3:]], axis=1))
+    asked = np.empty_like(seen)
+    asked[by] = seen
+    return experts.act(asked, None, deterministic=True)[by]
 
 
 def _resumed(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
@@ -209,7 +208,8 @@ def _resumed(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
         return None
 
 
-def _scripted(truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
+def scripted(truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
+    """Meta-World's scripted policy at these true states."""
     from icrl_dist.envs.metaworld import expert
 
     return expert(truths.reshape(-1, truths.shape[-1]).astype(np.float64))

@@ -129,4 +129,3 @@ def _validate_control(run: Run, need: Need) -> None:
     need(
         run.practice.rounds == 0, "practice.rounds", run.practice.rounds, "only Dark Room's labels can be had of new histories"
     )
-    need(run.pretrain.stretches == 0, "pretrain.stretches", run.pretrain.stretches, "only in Dark Room so far: use 0")

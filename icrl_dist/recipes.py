@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from icrl_dist import experts
+from icrl_dist import histories
 from icrl_dist.config import Deployment, Run, default_deployment
 from icrl_dist.context import Examples, Pool, Shelf, Shelved, Stretches
 from icrl_dist.envs import tasks
@@ -96,6 +96,17 @@ def _labelling(run: Run) -> Params:
     )
 
 
+def _of_experts(run: Run) -> Params:
+    """The same of a job that trains experts."""
+    return (
+        ("misled", run.pretrain.misled),
+        ("queries", run.pretrain.queries),
+        ("stretch", run.model.stretch),
+        ("stretches", run.pretrain.stretches),
+        *histories.settings(run.sac),
+    )
+
+
 def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
     """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
 
@@ -105,7 +116,7 @@ def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], t
     if run.problem == "darkroom":
         kind, settings = "random_context", (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
     else:
-        kind, settings = "train_expert", (("queries", run.pretrain.queries), *experts.settings(run.sac))
+        kind, settings = "train_expert", _of_experts(run)
     chosen = [variations(i, task) for i, task in enumerate(tasks.split(run).train)]
     trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
     return _jobs(run, phase, kind, chosen, trials, settings)

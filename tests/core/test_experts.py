@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist import envs, experts, jobs
+from icrl_dist import context, envs, experts, histories, jobs, pretrain, rollout
 from icrl_dist.algos import sac_batch
 from icrl_dist.config import AdversaryConfig
 from icrl_dist.envs import metaworld, tasks
 from icrl_dist.envs.network import Networks
-from icrl_dist.experts import ExpertPolicy, History, ScriptedPolicy
+from icrl_dist.experts import ExpertPolicy, ScriptedPolicy
 from icrl_dist.games import ControlConfig, SACConfig
+from icrl_dist.histories import LED, History
+from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.recipes import METHODS, self_labelled
 from icrl_dist.stream import wire
 from icrl_dist.types import NULL
-from tests.core.test_recipes import Fixed
+from tests.core.test_recipes import Fixed, Kept
 
 HORIZON, EPISODES = 20, 10
 
@@ -47,7 +49,7 @@ def test_a_job_is_all_variations_of_a_few_tasks_with_the_numbers_of_sac(run):
     first, second = asked(run)
     assert first.kind == "train_expert" and (first.trials, first.tasks, second.task) == (3, 2, 2)
     assert [v.adversary == NULL for v in first.variations] == [True, False] * 2
-    assert experts.sac_of(wire.decode_job(wire.encode_job(first))) == run.sac
+    assert histories.sac_of(wire.decode_job(wire.encode_job(first))) == run.sac
     assert {v.adversary for job in asked(run, "dpt") for v in job.variations} == {NULL}
 
 
@@ -55,10 +57,10 @@ def test_contexts_are_episodes_of_the_training_and_labels_what_its_expert_would_
     job = asked(run)[0]
     sent = list(jobs.do(job, None, "w"))
     assert [t.identity for t in sent] == list(job.identities())
-    histories = [experts.kept(v, run.sac, run.seed) for v in job.variations]
+    found = [histories.kept(v, run.sac, run.seed) for v in job.variations]
     for t in sent:
         row = job.variations.index(t.variation)
-        history = histories[row]
+        history = found[row]
         assert history.rewards.shape == (EPISODES, HORIZON) and t.origin == "expert" and t.weights == -1
         number = [0, 4, 9][t.identity.trial]  # evenly spaced, from the first random one to the last
         for name in ("observations", "actions", "rewards", "adversary"):
@@ -91,7 +93,7 @@ def test_nothing_is_trained_that_is_in_the_cache_and_all_of_it_if_something_is_n
     first = digests(jobs.do(job, None, "w"))
     assert trained == [4]
     assert digests(jobs.do(dataclasses.replace(job, trials=2), None, "w")) != first and trained == [4]
-    file = experts._file(run.sac, experts.key(job.variations[2], run.sac, run.seed))
+    file = histories.file(run.sac, histories.key(job.variations[2], run.sac, run.seed))
     whole = file.read_bytes()
     for damage in (whole[: len(whole) // 2], b"nothing"):
         file.write_bytes(damage)
@@ -101,20 +103,20 @@ def test_nothing_is_trained_that_is_in_the_cache_and_all_of_it_if_something_is_n
 
 def test_what_decides_a_history_decides_where_it_is_kept(run, monkeypatch):
     job = asked(run)[0]
-    one = experts.key(job.variations[0], run.sac, 0)
+    one = histories.key(job.variations[0], run.sac, 0)
     changed = [
-        experts.key(job.variations[1], run.sac, 0),
-        experts.key(job.variations[2], run.sac, 0),
-        experts.key(job.variations[0], run.sac, 1),
+        histories.key(job.variations[1], run.sac, 0),
+        histories.key(job.variations[2], run.sac, 0),
+        histories.key(job.variations[0], run.sac, 1),
         *(
-            experts.key(job.variations[0], dataclasses.replace(run.sac, **{name: value}), 0)
+            histories.key(job.variations[0], dataclasses.replace(run.sac, **{name: value}), 0)
             for name, value in {"hidden": (8, 9), "gamma": 0.5, "steps": 400, "update_every": 3}.items()
         ),
     ]
     assert len({one, *changed}) == 1 + len(changed)
-    assert experts.key(job.variations[0], dataclasses.replace(run.sac, cache="/elsewhere"), 0) == one
-    monkeypatch.setattr(experts.metadata, "version", lambda name: "0")
-    assert experts.key(job.variations[0], run.sac, 0) != one, "other physics is other data"
+    assert histories.key(job.variations[0], dataclasses.replace(run.sac, cache="/elsewhere"), 0) == one
+    monkeypatch.setattr(histories.metadata, "version", lambda name: "0")
+    assert histories.key(job.variations[0], run.sac, 0) != one, "other physics is other data"
 
 
 class KilledError(Exception):
@@ -140,7 +142,7 @@ def test_a_killed_training_goes_on_from_its_checkpoint_to_the_same_bytes(run, mo
     assert all(name.startswith("part-") for name in begun) and len(begun) == 7
     assert digests(jobs.do(job, None, "w")) == undisturbed
     assert len([name for name in begun if name.startswith("part-")]) == EPISODES, "no episode was trained twice"
-    assert not list(experts._file(run.sac, "").parent.glob("part-*"))
+    assert not list(histories.file(run.sac, "").parent.glob("part-*"))
 
 
 class Breaking:
@@ -166,11 +168,11 @@ def test_episodes_that_broke_down_are_no_data(run, monkeypatch, always):
     monkeypatch.setattr(experts.envs, "batch", lambda variations: Breaking(real(variations), always))
     job = asked(run)[0]
     if always:
-        with pytest.raises(RuntimeError, match="broke down in every episode"):
+        with pytest.raises(RuntimeError, match="breaks down in every episode"):
             list(jobs.do(job, None, "w"))
         return
     list(jobs.do(job, None, "w"))
-    lengths = [len(experts.kept(v, run.sac, run.seed).rewards) for v in job.variations]
+    lengths = [len(histories.kept(v, run.sac, run.seed).rewards) for v in job.variations]
     assert lengths == [EPISODES, EPISODES - 2, EPISODES, EPISODES - 2]
 
 
@@ -225,10 +227,12 @@ def test_experts_act_each_in_its_row(run):
     torch.manual_seed(0)
     spec = envs.spec(tasks.split(run).train[0])
     batch = sac_batch.SACBatch(3, spec, run.sac, 0, "cpu")
-    empty = {"rewards": np.zeros((0, 1), np.float32), "observations": np.zeros((0, 2, 2), np.float32)}
-    shape = {name: np.zeros((0, 1, 2), np.float32) for name in ("actions", "adversary", "labels")}
+    shapes = dict.fromkeys(("actions", "adversary", "labels", "led_actions", "led_labels"), (0, 1, 2))
+    shapes |= {"rewards": (0, 1), "led_rewards": (0, 1), "observations": (0, 2, 2), "led_observations": (0, 2, 2)}
+    empty = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     actors = batch.arrays["actor"].numpy()
-    policy = ExpertPolicy([History(**shape, **empty, actor=actor) for actor in actors], spec, run.sac)
+    made = [History(**empty, led_wrong=np.zeros(0, bool), actor=actor) for actor in actors]
+    policy = ExpertPolicy(made, spec, run.sac)
     seen = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
     np.testing.assert_allclose(policy.act(seen, np.zeros((3, 2))), batch.act(seen, None, deterministic=True), atol=1e-6)
 
@@ -257,3 +261,67 @@ def test_a_training_says_how_far_it_is_and_a_cache_what_it_saved(run):
     heard.clear()
     list(jobs.do(job, None, "w", tell))
     assert heard == [(f"{job.label}: 4 experts from the cache, 800 steps of SAC saved", True)]
+
+
+@pytest.fixture
+def stretched(run):
+    model = dataclasses.replace(run.model, stretch=4)
+    pretrain = dataclasses.replace(run.pretrain, stretches=5, misled=0.5)
+    return dataclasses.replace(run, model=model, pretrain=pretrain, optim=dataclasses.replace(run.optim, stretches=2))
+
+
+def test_stretches_are_cut_from_episodes_that_experts_led_some_of_them_another_variations(stretched):
+    job = asked(stretched)[0]
+    sent = list(jobs.do(job, None, "w"))
+    found = [histories.kept(v, stretched.sac, stretched.seed) for v in job.variations]
+    spec, led = envs.spec(job.variations[0].task), {False: 0, True: 0}
+    for row, history in enumerate(found):
+        assert history.led_wrong.tolist() == [False] * LED + [True] * LED
+        other = found[(row + 1) % len(found)]
+        for wrong, actor in ((False, history), (True, other)):
+            seen = history.led_observations[history.led_wrong == wrong][:, :-1].reshape(-1, 6)
+            acted = history.led_actions[history.led_wrong == wrong].reshape(-1, 2)
+            labels = history.led_labels[history.led_wrong == wrong].reshape(-1, 2)
+            for array, expert in ((acted, actor), (labels, history)):
+                right = ExpertPolicy([expert] * len(seen), spec, stretched.sac).act(seen, np.zeros((len(seen), 2)))
+                np.testing.assert_allclose(array, right, atol=1e-5)
+    for t in sent:
+        history = found[job.variations.index(t.variation)]
+        assert len(t.queries) == 6 + 5 * 4 and len(t.taken) == 20
+        columns = (
+            t.queries[6:].reshape(5, 4, 6),
+            t.taken.reshape(5, 4, 2),
+            t.gained.reshape(5, 4),
+            t.labels[6:].reshape(5, 4, 2),
+        )
+        whole = history.led_observations[:, :-1]
+        for states, taken, gained, labels in zip(*columns, strict=True):
+            places = [(g, h) for g in range(len(whole)) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states).all()]
+            assert places, "no four states in a row of a led episode"
+            g, h = places[0]
+            np.testing.assert_array_equal(taken, history.led_actions[g, h : h + 4])
+            np.testing.assert_array_equal(gained, history.led_rewards[g, h : h + 4])
+            np.testing.assert_array_equal(labels, history.led_labels[g, h : h + 4])
+            led[bool(history.led_wrong[g])] += 1
+    assert min(led.values()) > 0.25 * sum(led.values())
+
+
+def test_a_model_of_vectors_trains_on_stretches_and_is_deployed_committed(stretched):
+    phase = METHODS["icag"].phases(stretched)[0]
+    data = Kept([t for job in asked(stretched) for t in jobs.do(job, None, "w")])
+    pools = METHODS["icag"].learn(stretched, phase, data)
+    torch.manual_seed(0)
+    model = PretrainedTransformer(tasks.spec(stretched), stretched.model)
+    draws = lambda step: context.draw(np.random.default_rng(step), pools, 8, 8, 0, 2)  # noqa: E731
+    taken = draws(0).stretches.taken
+    assert taken.shape == (8, 2, 4, 2) and taken.dtype == np.float32
+    opt = pretrain.Optimiser(model, stretched.optim)
+    before = np.mean([pretrain.batch_loss(model, draws(1000 + n)).item() for n in range(8)])
+    pretrain.fit(model, opt, stretched.optim, 3e-3, 60, draws)
+    after = np.mean([pretrain.batch_loss(model, draws(1000 + n)).item() for n in range(8)])
+    assert after < before - 0.3
+    policy = rollout.in_context(model, 4, stretched.context)
+    assert isinstance(policy, rollout.CommittedPolicy)
+    env = envs.batch(asked(stretched)[0].variations)
+    ran = rollout.episode(env, policy, [np.random.default_rng(row) for row in range(4)])
+    assert ran.actions.shape == (4, HORIZON, 2) and policy.length == HORIZON
