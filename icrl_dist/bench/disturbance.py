@@ -30,7 +30,6 @@ WEAK = 0.02
 """Share of the return that the default adversaries take on average, below which they are called weak."""
 EARNS = 0.01
 """Mean reward a step that an expert must earn undisturbed, or there is nothing to lose."""
-_SHORT = ("dmc-cartpole-balance", "dmc-cartpole-swingup", "dmc-reacher-easy", "dmc-reacher-hard")
 _CHANCE, _ADVERSARIES = 1, 2
 
 Report = Callable[[str], None]
@@ -45,12 +44,14 @@ class Sizes:
     adversaries: int = 9
     """K, beside the null adversary."""
     episodes: int = 10
-    """In DeepMind Control, of each adversary; in Meta-World, where a task begins always alike, tasks of one episode."""
-    steps: int = 24_000
-    """Of an expert's training; half of it where that is enough, in cartpole and reacher."""
+    """Under each adversary, in DeepMind Control."""
+    tasks: int = 5
+    """Of Meta-World, where a task begins always alike: each for one episode under each adversary."""
+    steps: int = 0
+    """Of an expert's training; 0: its run file's."""
 
 
-QUICK = Sizes(episodes=3, steps=4_000)
+QUICK = Sizes(episodes=3, tasks=2, steps=4_000)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,12 +71,11 @@ def run(
     quick: bool = False,
     report: Report = lambda said: None,
     sizes: Sizes | None = None,
-    sac: SACConfig | None = None,
 ) -> dict[str, Any]:
     """Shares of the return that are lost under K default adversaries, of every problem or of the one named.
 
     Experts are those of the problem's laptop run file, in its cache: what was trained before is not
-    trained again.  ``sac`` stands in the place of those numbers.  Raises ConfigError for an unknown problem.
+    trained again.  Raises ConfigError for an unknown problem.
     """
     if problem is not None and problem not in PROBLEMS:
         known = ", ".join(PROBLEMS)
@@ -86,10 +86,10 @@ def run(
     torch.set_num_threads(1)
     try:
         for kind in PROBLEMS if problem is None else (problem,):
-            config = sac or numbers(kind, sizes.steps)
+            config = numbers(kind, sizes.steps)
             make = policy(kind, config, report)
             for one in settings(kind):
-                report(f"{kind} {one.forces}: {sizes.adversaries} adversaries")
+                report(f"{kind}: {sizes.adversaries} adversaries{one.forces and f', forces of {one.forces}'}")
                 rows.append(_row(kind, one, make, sizes, config))
                 report(describe_row(rows[-1]))
     finally:
@@ -97,10 +97,10 @@ def run(
     return {"quick": quick, **dataclasses.asdict(sizes), "problems": rows, "weak": sum(bool(row["weak"]) for row in rows)}
 
 
-def numbers(kind: str, steps: int) -> SACConfig:
-    """SAC's numbers for an expert of this problem: its laptop run file's, but for the steps."""
+def numbers(kind: str, steps: int = 0) -> SACConfig:
+    """SAC's numbers for an expert of this problem: its laptop run file's, ``steps`` in the place of those there unless 0."""
     config = load(f"{kind}-laptop" if kind in problems.PROBLEMS else "metaworld-laptop").sac
-    return dataclasses.replace(config, steps=steps // 2 if kind in _SHORT else steps)
+    return dataclasses.replace(config, steps=steps or config.steps)
 
 
 def settings(kind: str) -> list[Setting]:
@@ -158,39 +158,46 @@ class ToldTheGoal:
         self.succeeded = self.succeeded | self._env.success
 
 
-def measure(
-    rows: Sequence[Variation], make: Make, episodes: int, tasks: int
-) -> tuple[Float[np.ndarray, "C R"], Float[np.ndarray, " R"] | None]:
-    """Returns of C = episodes x tasks episodes under each of R adversaries, all of one episode begun alike.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Measured:
+    """C episodes under each of R adversaries."""
 
-    ``rows`` are the R variations of each task, task by task.  With them, where the game knows
-    success, the share of tasks that succeeded.
+    returns: Float[np.ndarray, "C R"]
+    broken: int
+    """Episodes in which a simulation broke down, and earned nothing from then on."""
+    succeeded: Float[np.ndarray, " R"] | None
+    """Share of the tasks that succeeded, where the game knows success."""
+
+
+def measure(rows: Sequence[Variation], make: Make, episodes: int, tasks: int) -> Measured:
+    """So many episodes in every row, each begun alike under every adversary of a task.
+
+    ``rows`` are the R variations of each task, task by task: C = episodes x tasks.
     """
     env = envs.batch(rows)
     acting, adversaries = make(env), len(rows) // tasks
     chance = ([_chance(number, row // adversaries) for row in range(len(rows))] for number in range(episodes))
-    found = np.stack([ran.returns for ran in deploy_online(env, acting, chance)])
+    ran = list(deploy_online(env, acting, chance))
+    returns = np.stack([one.returns for one in ran]).reshape(episodes * tasks, adversaries)
+    broken = sum(int(one.diverged.sum()) for one in ran if one.diverged is not None)
     succeeded = getattr(acting, "succeeded", None)
-    successes = None if succeeded is None else succeeded.reshape(tasks, adversaries).mean(axis=0)
-    return found.reshape(episodes * tasks, adversaries), successes
+    shares = None if succeeded is None else succeeded.reshape(tasks, adversaries).mean(axis=0)
+    return Measured(returns, broken, shares)
 
 
 def _chance(episode: int, task: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_CHANCE, episode, task)))
 
 
-def variations(one: Setting, sizes: Sizes, strength: float = 1.0) -> tuple[list[Variation], int]:
-    """The null adversary and K of this strength in each task, task by task; and how many tasks.
-
-    The adversaries are the same at every strength.
-    """
+def variations(one: Setting, sizes: Sizes) -> tuple[list[Variation], int]:
+    """The null adversary and K of strength 1 in each task, task by task; and how many tasks."""
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_ADVERSARIES,)))
-    pushes = networks(rng, sizes.adversaries + 1, envs.spec(one.task), one.outputs, strength)
+    pushes = networks(rng, sizes.adversaries + 1, envs.spec(one.task), one.outputs, 1.0)
     tasks: tuple[Task, ...] = (one.task,)
     if one.task.kind == pick_place.KIND:
         from icrl_dist.envs.metaworld import ml1_tasks
 
-        tasks = ml1_tasks(sizes.episodes)
+        tasks = ml1_tasks(sizes.tasks)
     return [Variation(task, push) for task in tasks for push in pushes], len(tasks)
 
 
@@ -223,15 +230,16 @@ def _error(values: Float[np.ndarray, " C"]) -> float | None:
 def _row(kind: str, one: Setting, make: Make, sizes: Sizes, config: SACConfig) -> dict[str, Any]:
     """One problem under one disturbance, and what is to be said of it."""
     rows, tasks = variations(one, sizes)
-    returns, succeeded = measure(rows, make, sizes.episodes // tasks, tasks)
-    found: dict[str, Any] = {name: None if value is None else round(value, 4) for name, value in lost(returns).items()}
+    measured = measure(rows, make, 1 if kind == pick_place.KIND else sizes.episodes, tasks)
+    found: dict[str, Any] = {name: None if value is None else round(value, 4) for name, value in lost(measured.returns).items()}
     if kind == pick_place.KIND:
         about: dict[str, Any] = {"metres": pick_place.disturbance(one.task)}
     else:
         about = {"forces": one.forces, "newtons": problems.problem(kind).forces[one.forces].largest, "steps": config.steps}  # type: ignore[index]
-    if succeeded is not None:
-        about |= {"success": round(float(succeeded[0]), 3), "success_disturbed": round(float(succeeded[1:].mean()), 3)}
-    return {"problem": kind, **about, **found, **verdict(found, envs.spec(one.task).horizon)}
+    if measured.succeeded is not None:
+        alone, *under = measured.succeeded.tolist()
+        about |= {"success": round(alone, 3), "success_disturbed": round(float(np.mean(under)), 3)}
+    return {"problem": kind, **about, "broken": measured.broken, **found, **verdict(found, envs.spec(one.task).horizon)}
 
 
 def verdict(found: dict[str, float | None], horizon: int) -> dict[str, Any]:
