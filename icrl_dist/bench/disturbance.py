@@ -30,6 +30,8 @@ WEAK = 0.02
 """Share of the return that the default adversaries take on average, below which they are called weak."""
 EARNS = 0.01
 """Mean reward a step that an expert must earn undisturbed, or there is nothing to lose."""
+LONGER = dict.fromkeys(("dmc-cheetah-run", "dmc-reacher-easy", "dmc-reacher-hard"), 36_000)
+"""Steps of an expert's training where it has hardly begun to earn after its run file's 12,000."""
 _CHANCE, _ADVERSARIES = 1, 2
 
 Report = Callable[[str], None]
@@ -48,7 +50,7 @@ class Sizes:
     tasks: int = 5
     """Of Meta-World, where a task begins always alike: each for one episode under each adversary."""
     steps: int = 0
-    """Of an expert's training; 0: its run file's."""
+    """Of an expert's training; 0: its run file's, or those of ``LONGER``."""
 
 
 QUICK = Sizes(episodes=3, tasks=2, steps=4_000)
@@ -98,9 +100,9 @@ def run(
 
 
 def numbers(kind: str, steps: int = 0) -> SACConfig:
-    """SAC's numbers for an expert of this problem: its laptop run file's, ``steps`` in the place of those there unless 0."""
+    """SAC's numbers for an expert of this problem: its laptop run file's, but for so many ``steps``, or those of ``LONGER``."""
     config = load(f"{kind}-laptop" if kind in problems.PROBLEMS else "metaworld-laptop").sac
-    return dataclasses.replace(config, steps=steps or config.steps)
+    return dataclasses.replace(config, steps=steps or LONGER.get(kind, config.steps))
 
 
 def settings(kind: str) -> list[Setting]:
