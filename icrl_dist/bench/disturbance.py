@@ -252,6 +252,9 @@ def verdict(found: dict[str, float | None], horizon: int) -> dict[str, Any]:
         return {"weak": False, "untaught": True, "said": said}
     if share < WEAK:
         said = f"weak: on average the default adversaries take {share:.1%} of the return, under {WEAK:.0%}"
+        error = found["lost_error"]
+        if error is None or share + 2 * error >= WEAK:
+            said += "; these episodes are too few to tell it from more"
         return {"weak": True, "untaught": False, "said": said}
     return {"weak": False, "untaught": False, "said": ""}
 

@@ -107,8 +107,16 @@ def test_a_default_disturbance_that_takes_next_to_nothing_is_called_weak_and_a_s
     ],
 )
 def test_of_an_expert_that_earns_nothing_nothing_is_said_to_be_lost(undisturbed, lost_mean, weak, untaught):
-    found = disturbance.verdict({"undisturbed": undisturbed, "lost_mean": lost_mean}, 200)
+    found = disturbance.verdict({"undisturbed": undisturbed, "lost_mean": lost_mean, "lost_error": 0.001}, 200)
     assert (found["weak"], found["untaught"], bool(found["said"])) == (weak, untaught, weak or untaught)
+
+
+def test_weak_within_an_error_that_leaves_it_open_says_that_too():
+    said = [
+        disturbance.verdict({"undisturbed": 100.0, "lost_mean": 0.01, "lost_error": error}, 200)["said"]
+        for error in (0.004, 0.005, None)
+    ]
+    assert all(one.startswith("weak") for one in said) and ["too few" in one for one in said] == [False, True, True]
 
 
 def test_without_any_return_shares_are_none_and_the_table_has_them():
