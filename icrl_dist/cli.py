@@ -112,7 +112,7 @@ class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
     name: tyro.conf.Positional[
-        Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts"]
+        Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts", "disturbance"]
     ]
     """``env``: environment steps a second, of simulated problems beside their library's own loop;
     ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
@@ -121,13 +121,16 @@ class Bench:
     after a worker or the learner was killed; ``soak``: does any process of a long run grow;
     ``fuzz``: 100,000 hostile inputs to every reader of bytes; ``incontext``: deployment and
     training of the model, beside DPT's official layout; ``experts``: updates of experts in
-    lockstep, beside stable-baselines3."""
-    problem: str = "darkroom"
-    """Which environment (env only): ``darkroom``, or one such as ``dmc-cheetah-run``."""
+    lockstep, beside stable-baselines3; ``disturbance``: the return that an undisturbed expert loses
+    under each default adversary."""
+    problem: str | None = None
+    """Which environment: one such as ``dmc-cheetah-run`` (env: ``darkroom`` if not given;
+    disturbance: every simulated one)."""
     seconds: float | None = None
     """How long to measure (env, stream, ingest and soak)."""
     quick: bool = False
-    """One seed instead of three (incontext), 3 turns instead of 15 (experts)."""
+    """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
+    little and 3 episodes instead of 10 (disturbance)."""
     folder: Path = Path("runs")
     """Whose disk to write to (ingest, recovery), where to put the figure (soak, incontext) or an
     input that breaks something (fuzz), where to keep finished trainings (incontext)."""

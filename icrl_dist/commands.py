@@ -192,14 +192,21 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import broadcast, env, experts, fuzz, incontext, ingest, recovery, soak, stream
+    from icrl_dist.bench import broadcast, disturbance, env, experts, fuzz, incontext, ingest, recovery, soak, stream
 
-    if arguments.seconds is not None and arguments.name in ("broadcast", "experts", "fuzz", "incontext", "recovery"):
+    if arguments.seconds is not None and arguments.name in (
+        "broadcast",
+        "disturbance",
+        "experts",
+        "fuzz",
+        "incontext",
+        "recovery",
+    ):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
         case "env":
-            result, text = (r := env.run(arguments.problem, **timed)), env.describe(r)
+            result, text = (r := env.run(arguments.problem or "darkroom", **timed)), env.describe(r)
         case "stream":
             result, text = (r := stream.run(**timed)), stream.describe(r)
         case "ingest":
@@ -223,6 +230,10 @@ def bench(arguments: Bench, console: Console) -> int:
             with console.status("experts"):
                 result = experts.run(arguments.quick)
             text = experts.describe(result)
+        case "disturbance":
+            say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
+            result = disturbance.run(arguments.problem, arguments.quick, say)
+            text = disturbance.describe(result)
     console.print(text, highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))
