@@ -26,8 +26,6 @@ Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online: by Algorithm 1, its context frozen within an episode; or with every
 transition in its context at once and its guesses kept (zeta of eq. 6)."""
 
-METHOD_NAMES = ("dpt", "icag", "icaa", "experts")
-
 
 @dataclass(frozen=True)
 class DarkRoomConfig:

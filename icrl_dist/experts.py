@@ -139,9 +139,8 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     columns = _labelled(recorder.columns(), experts)
     led = _lead(env, experts, chance)
     actors = experts.arrays["actor"].cpu().numpy()
-    made = []
+    parts, made = {"": columns, "led_": led}, []
     for row, variation in enumerate(job.variations):
-        parts = {"": columns, "led_": led}
         whole = {prefix: of["whole"][row] for prefix, of in parts.items()}
         lost = sum(int((~one).sum()) for one in whole.values())
         if lost:
@@ -152,7 +151,7 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
             prefix + name: column[row][whole[prefix]]
             for prefix, of in parts.items()
             for name, column in of.items()
-            if name != "whole" and prefix + name != "led_adversary"
+            if name != "whole"
         }
         made.append(History(**taken, actor=actors[row]))
     if part is not None:
@@ -183,7 +182,9 @@ def _lead(env: Batch, experts: SACBatch, seed: int) -> dict[str, np.ndarray]:
         for _ in range(env.spec.horizon):
             seen = recorder.step(_led_by(by, seen, getattr(env, "truth", None), experts)).observation
     wrong = np.broadcast_to(np.arange(episodes) >= LED, (count, episodes))
-    return {**_labelled(recorder.columns(), experts), "wrong": wrong}
+    columns = _labelled(recorder.columns(), experts)
+    del columns["adversary"]  # zeta holds nothing of it
+    return {**columns, "wrong": wrong}
 
 
 def _led_by(
@@ -246,9 +247,7 @@ class ScriptedPolicy:
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
         """What it does in the true state, whatever is shown."""
-        from icrl_dist.envs.metaworld import expert
-
-        return expert(self._env.truth)
+        return scripted(self._env.truth)
 
     def observe(self, *transition: object) -> None:
         """Nothing to learn."""

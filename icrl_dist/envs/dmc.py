@@ -17,7 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from icrl_dist.envs.network import Networks
 from icrl_dist.envs.problems import AXES, HORIZON, Preset, problem, spec
-from icrl_dist.envs.suite import BROKEN, DOMAINS, Rows, drawn, observed
+from icrl_dist.envs.suite import BROKEN, DOMAINS, Rows, check_step, drawn, observed
 from icrl_dist.types import Step, Task, Variation
 
 
@@ -82,10 +82,7 @@ class DMC:
         ``diverged`` from then on.  Raises ValueError for actions outside [-1, 1], RuntimeError
         past the horizon or before a reset.
         """
-        if self._h >= self.spec.horizon:
-            raise RuntimeError(f"dmc: stepped past the horizon of {self.spec.horizon}; call reset first")
-        if actions.shape != (self.batch, self.spec.actions) or not np.abs(actions).max() <= 1:
-            raise ValueError(f"dmc: actions {actions}: expected {self.batch} x {self.spec.actions} numbers in [-1, 1]")
+        check_step("dmc", self.spec, self.batch, self._h, actions)
         self._wrenches[:, self._bodies, self._axes] = pushes * self._forces.largest
         each = zip(self._each, actions, self._wrenches, self._diverged.tolist(), strict=True)
         for (model, data, control, push), action, wrench, diverged in each:

@@ -17,7 +17,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from icrl_dist.envs import pick_place
 from icrl_dist.envs.network import Networks
-from icrl_dist.envs.suite import BROKEN, drawn
+from icrl_dist.envs.suite import BROKEN, check_step, drawn
 from icrl_dist.types import Step, Task, Variation
 
 _HAND, _OBJECT, _GOAL = slice(0, 3), slice(4, 7), slice(36, 39)
@@ -98,10 +98,7 @@ class PickPlace:
 
         Raises ValueError for actions outside [-1, 1], RuntimeError past the horizon or before a reset.
         """
-        if self._h >= self.spec.horizon:
-            raise RuntimeError(f"metaworld: stepped past the horizon of {self.spec.horizon}; call reset first")
-        if actions.shape != (self.batch, self.spec.actions) or not np.abs(actions).max() <= 1:
-            raise ValueError(f"metaworld: actions {actions}: expected {self.batch} x {self.spec.actions} numbers in [-1, 1]")
+        check_step("metaworld", self.spec, self.batch, self._h, actions)
         self._h += 1
         reward = np.zeros(self.batch, np.float32)
         self.truth, self.success = self.truth.copy(), np.zeros(self.batch, bool)

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 from dm_control.utils.rewards import tolerance
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from icrl_dist.types import Spec
 
 Array = Float64[np.ndarray, "B ..."]
 BROKEN = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{of}").value for of in ("POS", "VEL", "ACC")]
@@ -214,3 +216,11 @@ def drawn(draw: Callable[[], np.ndarray]) -> UInt8[np.ndarray, "height width 3"]
         return np.asarray(draw(), np.uint8)
     except Exception as error:  # each back end has its own
         raise RuntimeError(f"MuJoCo cannot draw here (MUJOCO_GL={gl!r}: {' '.join(str(error).split())}): {remedy}") from None
+
+
+def check_step(game: str, spec: Spec, batch: int, done: int, actions: Float32[np.ndarray, "B A"]) -> None:
+    """After ``done`` steps: raises RuntimeError past the horizon, ValueError for actions outside [-1, 1]."""
+    if done >= spec.horizon:
+        raise RuntimeError(f"{game}: stepped past the horizon of {spec.horizon}; call reset first")
+    if actions.shape != (batch, spec.actions) or not np.abs(actions).max() <= 1:
+        raise ValueError(f"{game}: actions {actions}: expected {batch} x {spec.actions} numbers in [-1, 1]")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icrl_dist import envs
 from icrl_dist.config import Run
 from icrl_dist.envs import darkroom, pick_place, problems
 from icrl_dist.envs.adversary import adversary_set, sample_dirichlet
@@ -63,9 +64,8 @@ def spec(run: Run) -> Spec:
     if run.problem == pick_place.KIND:  # ML1 takes seconds to make its tasks
         place = {"object": (0.0, 0.6, 0.02), "goal": (0.0, 0.8, 0.1)}
         horizon = {"horizon": run.control.horizon} if run.control.horizon else {}
-        return pick_place.spec(Task.of(pick_place.KIND, **place, **horizon))
-    task = split(run).train[0]
-    return darkroom.spec(task) if run.problem == "darkroom" else problems.spec(task)
+        return envs.spec(Task.of(pick_place.KIND, **place, **horizon))
+    return envs.spec(split(run).train[0])
 
 
 def deployed(task: Task) -> Task:
