@@ -1,0 +1,1 @@
+"""The live view: terminal and browser, reading the monitor plane only."""
