@@ -42,6 +42,7 @@ class Worker:
         self._stop = threading.Event()
         self._episodes = self._steps = 0
         self._job = self._doing = ""
+        self._samples = Samples()
 
     def stop(self) -> None:
         """End after the job at hand."""
@@ -120,6 +121,9 @@ class Worker:
     def _show(self, trajectory: Trajectory) -> None:
         message = wire.monitor_trajectory(trajectory, time.time())
         self._link.publish(self._keys.monitor(f"trajectory/{self.name}"), message, droppable=True)
+        if self._samples.take(trajectory.identity, time.monotonic()):
+            message = wire.monitor_episode(trajectory, time.time())
+            self._link.publish(self._keys.monitor(f"episode/{self.name}"), message, droppable=True)
 
     def _count(self, sender: CreditSender) -> dict[str, int]:
         return {
@@ -154,6 +158,28 @@ class Worker:
         finally:
             ended.set()
             thread.join(5.0)
+
+
+class Samples:
+    """Which episodes are shown whole: some a second, of every variation in turn."""
+
+    def __init__(self, per_s: float = 4.0, burst: int = 8, again_s: float = 3.0) -> None:
+        """At most ``burst`` at once; of one variation not twice within ``again_s`` seconds."""
+        self._per_s, self._burst, self._again_s = per_s, burst, again_s
+        self._left, self._since = float(burst), float("-inf")
+        self._shown: dict[tuple[int, int], float] = {}
+
+    def take(self, identity: Identity, now: float) -> bool:
+        """Whether this one is shown."""
+        self._left = min(self._burst, self._left + (now - self._since) * self._per_s)
+        self._since = now
+        place = identity.task, identity.variation
+        if self._left < 1 or now - self._shown.get(place, float("-inf")) < self._again_s:
+            return False
+        self._left -= 1
+        self._shown = {other: then for other, then in self._shown.items() if now - then < self._again_s}
+        self._shown[place] = now
+        return True
 
 
 class _Waiting:

@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from icrl_dist.alerts import AlertsConfig
 from icrl_dist.games import PROBLEMS, ControlConfig, SACConfig
 from icrl_dist.limits import validate
 from icrl_dist.tables import ConfigError, build, dumps, nearest
@@ -248,6 +249,8 @@ class LearnerConfig:
     """Megabytes of the dataset that a fit keeps in memory; the rest is read when it is drawn."""
     device: str = "auto"
     """``auto`` takes a GPU where there is one; ``cpu`` or ``cuda`` decide."""
+    prometheus: str = ""
+    """HOST:PORT to serve the newest metrics at, for Prometheus, such as 127.0.0.1:9464; empty: nowhere."""
 
 
 @dataclass(frozen=True)
@@ -275,6 +278,7 @@ class Run:
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
     learner: LearnerConfig = field(default_factory=LearnerConfig)
+    alerts: AlertsConfig = field(default_factory=AlertsConfig)
 
 
 def load(name_or_path: str) -> Run:

@@ -62,6 +62,14 @@ def validate(run: Run, source: str) -> None:
     need(run.context.max >= horizon, "context.max", run.context.max, "must hold at least one episode")
     need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
     need(run.learner.device in ("auto", "cpu", "cuda"), "learner.device", run.learner.device, "use auto, cpu or cuda")
+    served = run.learner.prometheus
+    host, _, port = served.rpartition(":")
+    need(
+        not served or bool(host and port.isascii() and port.isdigit() and 0 < int(port) < 65536),
+        "learner.prometheus",
+        served,
+        "use HOST:PORT, such as 127.0.0.1:9464, or nothing",
+    )
     for name, endpoint, remedy in endpoints.objections(run.stream.endpoint, run.stream.connect, run.stream.certificates):
         need(False, f"stream.{name}", endpoint, remedy)
     positive = {

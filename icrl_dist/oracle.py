@@ -66,12 +66,17 @@ def q_values(h: Hypotheses, gamma: float) -> Float64[np.ndarray, "M C A"]:
     return _backup(h, value, gamma)
 
 
-def optimal_returns(h: Hypotheses, start: Sequence[int] = (0, 0)) -> Float64[np.ndarray, " M"]:
-    """Undiscounted return of the optimal policy from ``start``: the ceiling of every agent."""
+def optimal_values(h: Hypotheses) -> Float64[np.ndarray, "M C"]:
+    """Undiscounted return of the optimal policy from every cell."""
     value = np.zeros((len(h.goal), h.size**2))
     for _ in range(h.horizon):
         value = _backup(h, value, 1.0).max(axis=2)
-    best: np.ndarray = value[:, int(start[0]) * h.size + int(start[1])]
+    return value
+
+
+def optimal_returns(h: Hypotheses, start: Sequence[int] = (0, 0)) -> Float64[np.ndarray, " M"]:
+    """The same from ``start``: the ceiling of every agent."""
+    best: np.ndarray = optimal_values(h)[:, int(start[0]) * h.size + int(start[1])]
     return best
 
 

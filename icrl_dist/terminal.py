@@ -56,7 +56,7 @@ class Display:
             )
         elif kind == "listening":
             self.console.print(f"learner listens at {event['endpoint']}, weights version {event['version']}", highlight=False)
-        elif kind in ("note", "worker", "crash", "quarantine", "repaired", "interrupted"):
+        elif kind in ("note", "worker", "alert", "crash", "quarantine", "repaired", "interrupted"):
             self.console.print(event["text"], highlight=False, markup=False)
 
     def _stage(self, event: dict[str, Any]) -> None:

@@ -55,6 +55,7 @@ class Desk:
         """Every worker seen, and whether it is alive."""
         self.counters: dict[str, dict[str, Any]] = {}
         """The newest that each worker said of itself: episodes, steps, resent, memory_mb and so on."""
+        self._heard: dict[str, float] = {}
         self._jobs: dict[str, Job] = {}
         self._told: set[tuple[str, int, int, int]] = set()
         self._finished = threading.Event()
@@ -67,6 +68,17 @@ class Desk:
     def resent(self) -> int:
         """Times that a trajectory had to be sent again, by all workers so far."""
         return sum(said["resent"] for said in list(self.counters.values()))
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What all workers said of themselves together, and for how many seconds each has been silent."""
+        now, said = time.monotonic(), list(self.counters.values())
+        return {
+            "episodes": sum(one["episodes"] for one in said),
+            "acknowledged": sum(one["trajectories"] for one in said),
+            "resent": self.resent,
+            "silent": {worker: now - heard for worker, heard in list(self._heard.items())},
+        }
 
     @property
     def doing(self) -> list[str]:
@@ -186,6 +198,7 @@ class Desk:
             before = self.counters.get(worker, {})
             counts = {name: max(int(fields[name]), before.get(name, 0)) for name in _COUNTS}
             self.counters[worker] = {**before, **fields, **counts}
+            self._heard[worker] = time.monotonic()
 
     def _work(self, query: Query) -> None:
         try:

@@ -28,14 +28,12 @@ from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
 from learner.broadcast import Broadcast
 from learner.desk import Desk
+from learner.herald import Herald
 from learner.inbox import Inbox
 from learner.plan import Plan
 from learner.work import Board
 
 Report = Callable[[dict[str, Any]], None]
-
-PERIOD_S = 0.25
-"""Progress is told this often."""
 
 _FIT_DRAWS = 104
 """Spawn key of a fit's draws, apart from every trajectory's (those begin with a stage)."""
@@ -74,14 +72,15 @@ class Service:
         self._opt = pretrain.Optimiser(self.model, run.optim)
         self.version = files.newest_version(folder)
         self._partial = 0
-        self._metrics = Metrics(folder)
+        self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
+        self._herald = Herald(run, folder, link, self._keys, self._metrics, report, lambda: self.version)
+        closing.callback(self._herald.write)
         self._lock = threading.Lock()
         self._board = Board(run.stream.lease_s)
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._error: BaseException | None = None
-        self._shown = -np.inf
         self._lag = 0
         self._mended = 0
         self.store = Store(folder / "dataset")
@@ -102,9 +101,8 @@ class Service:
         )
         closing.callback(self.inbox.close)
         acting = lambda job: self._plan.acting(job, self.version)  # noqa: E731
-        self.desk = Desk(
-            run, folder, link, self._keys, self._board, self._lock, report, lambda line: self.fail(RunFailed(line)), acting
-        )
+        fail = lambda line: self.fail(RunFailed(line))  # noqa: E731
+        self.desk = Desk(run, folder, link, self._keys, self._board, self._lock, self._herald.event, fail, acting)
         closing.callback(self.desk.close)
         self._taking = False
         self._take_up()
@@ -135,6 +133,7 @@ class Service:
             done = self._board.done(identity.stage, identity.round)
         if identity.stage == "adapt":
             self._lag = identity.round - trajectory.weights
+        self._herald.stored(trajectory)
         if done:
             self._changed.set()
 
@@ -149,16 +148,29 @@ class Service:
         Raises Interrupted after ``stop`` (a checkpoint has been written), RunFailed or
         StoreError if the run cannot go on.
         """
+        try:
+            result = self._run_phases()
+        except Interrupted:
+            self._herald.say("interrupted", f"interrupted with T^{self.version} and {len(self.store)} trajectories")
+            raise
+        except Exception as error:
+            self._herald.say("failed", f"failed: {error}")
+            raise
+        self._herald.say("finished", f"finished with T^{self.version} and {len(self.store)} trajectories")
+        return result
+
+    def _run_phases(self) -> dict[str, Any]:
+        self._herald.about(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
         while (phase := self._plan.next(self.version)) is not None:
             if phase.produces <= self.version:
                 lost = ", ".join(job.label for job in self._plan.incomplete(phase))
-                self._report({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
+                self._herald.event({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
             try:
                 self._collect(phase)
                 if phase.produces > self.version:
                     self._fit(phase)
             except Damaged as error:
-                self._report({"event": "note", "text": str(error)})
+                self._herald.event({"event": "note", "text": str(error)})
                 self.store.repair()
                 self._tell_repairs()
                 self._plan.give_up({})
@@ -194,6 +206,7 @@ class Service:
 
     def _collect(self, phase: Phase) -> None:
         self._open(phase)
+        self._herald.began()
         with self._lock:
             already, _ = self._board.progress(phase.stage, phase.round)
         if not self._taking:  # earlier, nothing was expected yet: what comes meanwhile is sent again
@@ -224,8 +237,7 @@ class Service:
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         quality = label_quality(self._run, phase, self.store) if phase.produces > self.version else {}
         if quality:
-            self._metrics.write(phase.round, "labels", **quality)
-            self._report({"event": "labels", "round": phase.round, **quality})
+            self._herald.labelled(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
         pools = self._plan.method.learn(self._run, phase, self.store)
@@ -265,7 +277,7 @@ class Service:
         self._save(files.version_file(self._folder, self.version), loss=loss, **where)
         partial.unlink(missing_ok=True)
         self._publish()
-        self._metrics.write(self.version, "version", loss=loss, seconds=time.monotonic() - began)
+        self._herald.fitted(loss, time.monotonic() - began)
 
     def _save(self, path: Path, **where: object) -> None:
         about = checkpoints.manifest(self._run, self._spec, self.version, self._threads)
@@ -287,7 +299,7 @@ class Service:
     def _tell_repairs(self) -> None:
         self._mended += len(self.store.repaired)
         for note in self.store.repaired:
-            self._report({"event": "repaired", "text": note})
+            self._herald.event({"event": "repaired", "text": note})
 
     def _check(self) -> None:
         if self._error is not None:
@@ -296,9 +308,6 @@ class Service:
             raise Interrupted
 
     def _progress(self, what: str, phase: Phase, done: int, total: int, force: bool, **values: float) -> None:
-        if not force and time.monotonic() - self._shown < PERIOD_S:
-            return
-        self._shown = time.monotonic()
         fields: dict[str, Any] = {
             "stage": what,
             "round": phase.round,
@@ -313,10 +322,7 @@ class Service:
             "doing": self.desk.doing,
             **values,
         }
-        self._report({"event": "progress", **fields})
-        self._link.publish(
-            self._keys.monitor("learner"), wire.encode_message("learner", time=time.time(), **fields), droppable=True
-        )
+        self._herald.progress(fields, force, self.desk.told)
 
 
 def _device(name: str) -> torch.device:

@@ -49,6 +49,9 @@ from icrl_dist.types import (
 
 __all__ = ["REASONS", "VERSION", "WireError"]
 
+FRAMES = 100
+"""States of an episode that the monitor plane shows, at most, besides the last."""
+
 SMALL = 1 << 20
 """Default limit of jobs and messages, bytes."""
 
@@ -207,6 +210,26 @@ def monitor_trajectory(trajectory: Trajectory, time: float) -> bytes:
         steps=len(trajectory.actions),
         weights=trajectory.weights,
         digest=trajectory.digest,
+        worker=trajectory.worker,
+        time=float(time),
+    )
+
+
+def monitor_episode(trajectory: Trajectory, time: float) -> bytes:
+    """An episode to be drawn, of at most ``FRAMES`` states of it: docs/tap.md.  ``time`` in Unix seconds."""
+    every = -(-len(trajectory.actions) // FRAMES)
+    adversary = trajectory.adversary
+    if adversary.ndim == 2:  # how hard it pushed
+        adversary = np.linalg.norm(adversary, axis=1) / max(1, adversary.shape[1]) ** 0.5
+    return encode_message(
+        "episode",
+        identity=str(trajectory.identity),
+        problem=trajectory.variation.task.kind,
+        task=_plain(trajectory.variation.task.params),
+        episode_return=trajectory.episode_return,
+        every=every,
+        observations=from_array(np.ascontiguousarray(trajectory.observations[::every])),
+        adversary=from_array(adversary[::every].astype("<f4")),
         worker=trajectory.worker,
         time=float(time),
     )

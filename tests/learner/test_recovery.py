@@ -11,13 +11,13 @@ from icrl_dist.files import StoreError, hold
 from icrl_dist.lineage import parse_source
 from icrl_dist.store import Store
 from icrl_dist.types import Identity
-from learner import service
+from learner import herald, service
 from tests.learner.test_service import METRICS, run_inline, same
 
 
 @pytest.fixture(autouse=True)
 def no_tensorboard(monkeypatch):
-    monkeypatch.setattr(service, "Metrics", lambda folder: METRICS(folder, tensorboard=False))
+    monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def parent(tmp_path_factory, request):
     """An undisturbed run that nobody changes: its folder and its result."""
     run = request.getfixturevalue("module_run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service, "Metrics", lambda folder: METRICS(folder, tensorboard=False))
+        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
         folder = tmp_path_factory.mktemp("runs") / "parent"
         return folder, run_inline(run, folder), run
 
@@ -150,7 +150,7 @@ def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began
     run = override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set")
     made, real = [], service.Service.run
     monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
-    monkeypatch.setattr(service, "PERIOD_S", 0.0)
+    monkeypatch.setattr(herald, "PERIOD_S", 0.0)
 
     def stop(event):
         if event.get("stage") == "fit" and event["version"] == 0:

@@ -11,7 +11,7 @@ from icrl_dist.agent import load_agent
 from icrl_dist.config import ConfigError
 from icrl_dist.files import version_file
 from icrl_dist.store import Store
-from learner import checkpoints, service
+from learner import checkpoints, herald, service
 
 
 def run_inline(run, folder, report=lambda event: None, **options):
@@ -21,7 +21,7 @@ def run_inline(run, folder, report=lambda event: None, **options):
 
 @pytest.fixture(autouse=True)
 def no_tensorboard(monkeypatch):
-    monkeypatch.setattr(service, "Metrics", lambda folder: METRICS(folder, tensorboard=False))
+    monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
 
 
 METRICS = service.Metrics
@@ -74,7 +74,7 @@ def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, u
     made = []
     real = service.Service.run
     monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
-    monkeypatch.setattr(service, "PERIOD_S", 0.0)
+    monkeypatch.setattr(herald, "PERIOD_S", 0.0)
     folder = tmp_path / "stopped"
     with pytest.raises(launch.TrainInterrupted):
         run_inline(small_run, folder, stop_at)

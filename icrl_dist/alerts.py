@@ -1,0 +1,138 @@
+"""What a run's overseer should be woken for, by thresholds of the run file."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from icrl_dist.tables import ConfigError
+
+_PAIRS = 20
+"""Trials that two versions must have in common before their returns are compared."""
+_MOST = 200_000
+"""Returns remembered of a version; beyond them no more pairs are formed."""
+_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class AlertsConfig:
+    """When to wake somebody; in the live view, in ``metrics.jsonl`` and on the monitor plane.  0: never."""
+
+    collapse: float = 0.5
+    """The newest version returns less than this share of what the one before returned in the same
+    trials of the same variations."""
+    zero_episodes: int = 40
+    """A variation whose last so many episodes all returned 0."""
+    silent_s: float = 5.0
+    """A worker that has not been heard of for so long, seconds."""
+    ingest: float = 0.5
+    """Trajectories stored a second fall below this share of the episodes that workers finish, over ten seconds."""
+    labels: float = 0.05
+    """The share of a round's own labels that are optimal falls by this much from round to round (ICAA in Dark Room)."""
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError, naming the number, for one that cannot be."""
+        for name in ("zero_episodes", "silent_s"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"alerts.{name} = {getattr(self, name)!r}: must not be negative; 0 is never")
+        for name in ("collapse", "ingest", "labels"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"alerts.{name} = {getattr(self, name)!r}: a share lies in [0, 1]; 0 is never")
+
+
+@dataclass(frozen=True)
+class Alert:
+    """Something that began to be wrong, or that is over."""
+
+    name: str
+    active: bool
+    text: str
+
+
+class Alerts:
+    """Watches a run's numbers; ``check`` gives what has changed since it was last asked."""
+
+    def __init__(self, config: AlertsConfig) -> None:
+        self._config = config
+        self._active: dict[str, str] = {}
+        self._zeros: dict[tuple[int, int], int] = {}
+        self._returns: dict[int, dict[tuple[int, int, int], float]] = {}
+        self._agreement: dict[int, float] = {}
+        self._counts: deque[tuple[float, int, int]] = deque()
+
+    def returned(self, place: tuple[int, int, int], version: int, value: float) -> None:
+        """``version`` acted in trial ``place`` (task, variation, trial) and earned ``value``; -1 for no version."""
+        variation = place[:2]
+        self._zeros[variation] = self._zeros.get(variation, 0) + 1 if value == 0 else 0
+        if version < 0:
+            return
+        kept = self._returns.setdefault(version, {})
+        if len(kept) < _MOST:
+            kept[place] = value
+        for old in sorted(self._returns)[:-2]:
+            del self._returns[old]
+
+    def began(self) -> None:
+        """A phase begins: what was 0 before does not count."""
+        self._zeros.clear()
+        self._counts.clear()
+
+    def labels(self, round: int, agreement: float) -> None:
+        """So large a share of a round's labels are optimal."""
+        self._agreement[round] = agreement
+
+    def counted(self, now: float, produced: int, stored: int) -> None:
+        """So many episodes were finished by workers, and so many trajectories stored, in all."""
+        self._counts.append((now, produced, stored))
+        while len(self._counts) > 2 and now - self._counts[1][0] >= 10.0:
+            self._counts.popleft()
+
+    def check(self, silent: Mapping[str, float]) -> list[Alert]:
+        """What began or ended; ``silent``: seconds since each worker was heard of."""
+        found = dict(filter(None, (self._collapsed(), self._zero(), self._ingest(), self._labels())))
+        for worker, seconds in silent.items():
+            if 0 < self._config.silent_s < seconds:
+                found[f"silent {worker}"] = f"worker {worker} has not been heard of for {self._config.silent_s:g} s"
+        ended = [Alert(name, False, f"over: {text}") for name, text in self._active.items() if name not in found]
+        begun = [Alert(name, True, text) for name, text in found.items() if name not in self._active]
+        self._active = {name: self._active.get(name, text) for name, text in found.items()}
+        return ended + begun
+
+    def _collapsed(self) -> tuple[str, str] | None:
+        if len(self._returns) < 2 or not self._config.collapse:
+            return None
+        old, new = sorted(self._returns)
+        pairs = self._returns[old].keys() & self._returns[new].keys()
+        before, after = (sum(self._returns[v][place] for place in pairs) for v in (old, new))
+        if len(pairs) < _PAIRS or not after < self._config.collapse * before:
+            return None
+        means = f"{after / len(pairs):.1f}, T^{old} {before / len(pairs):.1f}"
+        return "collapse", f"returns collapsed after an update: T^{new} earns {means} in the same {len(pairs)} trials"
+
+    def _zero(self) -> tuple[str, str] | None:
+        limit = self._config.zero_episodes
+        stuck = [f"{task}/{variation}" for (task, variation), count in self._zeros.items() if 0 < limit <= count]
+        if not stuck:
+            return None
+        names = ", ".join(stuck[:_SHOWN]) + (f" and {len(stuck) - _SHOWN} more" if len(stuck) > _SHOWN else "")
+        return "zero", f"stuck at zero for {limit} episodes: variation {names}"
+
+    def _ingest(self) -> tuple[str, str] | None:
+        if len(self._counts) < 2 or self._counts[-1][0] - self._counts[0][0] < 10.0:
+            return None
+        (then, produced_before, stored_before), (now, produced, stored) = self._counts[0], self._counts[-1]
+        made, kept = (produced - produced_before) / (now - then), (stored - stored_before) / (now - then)
+        if not kept < self._config.ingest * made:
+            return None
+        return "ingest", f"ingest below demand: workers finish {made:.1f} episodes/s, {kept:.1f} trajectories/s are stored"
+
+    def _labels(self) -> tuple[str, str] | None:
+        newest = max(self._agreement, default=0)
+        before, after = self._agreement.get(newest - 1), self._agreement.get(newest)
+        if before is None or after is None or not 0 < self._config.labels <= before - after:
+            return None
+        return (
+            "labels",
+            f"label quality falls: {after:.0%} of round {newest}'s labels are optimal, {before:.0%} of round {newest - 1}'s",
+        )

@@ -1,0 +1,161 @@
+"""Adaptation, variation by variation: returns over episodes, and some episodes to be drawn."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from typing import Any
+
+from icrl_dist.monitor import plain, sketch
+from icrl_dist.monitor.plain import Odd
+from icrl_dist.types import Identity
+
+VARIATIONS = 4096
+"""Variations that are kept; further ones are only counted."""
+_EPISODES = 256
+"""Returns kept of a phase, a variation: of longer phases the newest."""
+_PHASES = 3
+"""Phases kept of a variation, the newest."""
+_LINEAGE = 32
+_DRAWN = 48
+"""Episodes kept to be drawn."""
+_OPTIMA = 4
+"""Optima computed a tick, at most: each takes some milliseconds."""
+
+
+class Curve:
+    """One variation: who and where it is, and what was earned in it."""
+
+    __slots__ = ("adversary", "changed", "lineage", "optimum", "phases", "problem", "quarantine", "task")
+
+    def __init__(self, message: dict[str, Any]) -> None:
+        self.describe(message)
+        self.phases: OrderedDict[str, dict[int, float]] = OrderedDict()
+        self.lineage: deque[dict[str, Any]] = deque(maxlen=_LINEAGE)
+        self.optimum: float | None = None
+        self.quarantine = ""
+        self.changed = 0
+
+    def describe(self, message: dict[str, Any]) -> None:
+        """What it is in the phase that begins."""
+        self.problem = plain.text(message.get("problem"), 64)
+        self.task = plain.named(message.get("task"))
+        self.adversary = plain.named(message.get("adversary"))
+
+
+class Curves:
+    """A bounded table of variations, named ``TASK/VARIATION``."""
+
+    def __init__(self) -> None:
+        self._curves: dict[tuple[int, int], Curve] = {}
+        self._left_out: set[tuple[int, int]] = set()
+        self._unsolved: deque[Curve] = deque()
+        self._episodes: OrderedDict[tuple[int, int], dict[str, Any]] = OrderedDict()
+        self._next = 1
+
+    def __len__(self) -> int:
+        """Variations that were heard of."""
+        return len(self._curves) + len(self._left_out)
+
+    def returned(self, identity: Identity, message: dict[str, Any]) -> None:
+        """An episode ended."""
+        place = identity.task, identity.variation
+        curve = self._curves.get(place)
+        if curve is None:
+            if len(self._curves) >= VARIATIONS:
+                if len(self._left_out) < 16 * VARIATIONS:
+                    self._left_out.add(place)
+                raise Odd("too many variations")
+            curve = self._curves[place] = Curve(message)
+        earned = plain.number(message.get("episode_return"))
+        lineage = {
+            "identity": "/".join(map(str, identity)),
+            "episode_return": earned,
+            "weights": plain.integer(message.get("weights"), -1),
+            "digest": plain.text(message.get("digest"), 64),
+            "worker": plain.text(message.get("worker")),
+            "time": plain.number(message.get("time")),
+        }
+        name = f"{identity.stage}/{identity.round}"
+        returns = curve.phases.get(name)
+        if returns is None:
+            curve.describe(message)
+            self._unsolved.append(curve)
+            returns = curve.phases[name] = {}
+            if len(curve.phases) > _PHASES:
+                curve.phases.popitem(last=False)
+        returns[identity.trial] = earned
+        if len(returns) > _EPISODES:
+            del returns[min(returns)]
+        curve.lineage.append(lineage)
+        curve.changed = self._next
+
+    def quarantined(self, name: str, cause: str) -> None:
+        """The run goes on without ``STAGE/ROUND/TASK/VARIATION``."""
+        parts = name.split("/")
+        if len(parts) == 4 and all(part.isdigit() and len(part) < 10 for part in parts[2:]):
+            curve = self._curves.get((int(parts[2]), int(parts[3])))
+            if curve is not None:
+                curve.quarantine, curve.changed = cause, self._next
+
+    def drawn(self, identity: Identity, message: dict[str, Any]) -> None:
+        """An episode to be drawn; of a variation the newest is kept."""
+        place = identity.task, identity.variation
+        drawing = sketch.of(message)
+        self._episodes.pop(place, None)
+        told = {
+            "name": f"{place[0]}/{place[1]}",
+            "identity": "/".join(map(str, identity)),
+            "worker": plain.text(message.get("worker")),
+            "episode_return": plain.number(message.get("episode_return")),
+            "time": plain.number(message.get("time")),
+        }
+        self._episodes[place] = {**told, "drawing": drawing, "seq": self._next}
+        if len(self._episodes) > _DRAWN:
+            self._episodes.popitem(last=False)
+
+    def tick(self, seq: int) -> None:
+        """Look up some optima; what changes from now on is newer than ``seq``."""
+        self._next = seq + 1
+        for _ in range(min(_OPTIMA, len(self._unsolved))):
+            curve = self._unsolved.popleft()
+            curve.optimum = sketch.optimum(curve.problem, curve.task, curve.adversary)
+            if curve.optimum is not None:
+                curve.changed = self._next
+
+    def changed(self, since: int) -> tuple[list[dict[str, Any]], int]:
+        """The variations that changed after ``since``, and how many were left out for want of room."""
+        return [_told(place, c) for place, c in sorted(self._curves.items()) if c.changed > since], len(self._left_out)
+
+    def episodes(self, since: int) -> list[dict[str, Any]]:
+        """Episodes to be drawn that came after ``since``, the oldest first."""
+        return [episode for episode in self._episodes.values() if episode["seq"] > since]
+
+    def detail(self, name: str) -> dict[str, Any] | None:
+        """All that is kept of a variation."""
+        task, _, variation = name.partition("/")
+        if not (task.isascii() and task.isdigit() and variation.isascii() and variation.isdigit() and len(name) < 24):
+            return None
+        place = int(task), int(variation)
+        curve = self._curves.get(place)
+        if curve is None:
+            return None
+        return {**_told(place, curve), "lineage": list(curve.lineage), "episode": self._episodes.get(place)}
+
+
+def _told(place: tuple[int, int], curve: Curve) -> dict[str, Any]:
+    return {
+        "name": f"{place[0]}/{place[1]}",
+        "task": place[0],
+        "variation": place[1],
+        "problem": curve.problem,
+        "parameters": curve.task,
+        "adversary": curve.adversary,
+        "optimum": curve.optimum,
+        "quarantine": curve.quarantine,
+        "phases": [{"name": name, **_columns(returns)} for name, returns in curve.phases.items()],
+    }
+
+
+def _columns(returns: dict[int, float]) -> dict[str, list[Any]]:
+    trials = sorted(returns)
+    return {"trials": trials, "returns": [round(returns[trial], 4) for trial in trials]}

@@ -1,0 +1,144 @@
+"""Where a picture comes from: a run that is on, or one on disk, played again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+from icrl_dist.monitor.picture import Picture
+from icrl_dist.monitor.recording import Recording
+from icrl_dist.stream.link import Link
+
+PERIOD_S = 0.25
+"""A picture's time goes on this often."""
+
+
+class Feed(Protocol):
+    """Keeps a picture up to date on a thread of its own."""
+
+    picture: Picture
+
+    def now(self) -> float:
+        """The picture's time, Unix seconds."""
+        ...
+
+    def replay(self) -> dict[str, Any] | None:
+        """Where a recording is: ``begin``, ``end``, ``at`` (Unix seconds), ``speed``, ``paused``; None for a run that is on."""
+        ...
+
+    def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
+        """Play a recording faster or slower, stop and go on, or from another moment on; nothing for a run that is on."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class LiveFeed:
+    """A run that is on, over a link to its learner."""
+
+    def __init__(self, link: Link, run: str = "*") -> None:
+        """Subscribes to the monitor plane of ``run``, by default of whichever run is at that endpoint."""
+        self.picture = Picture()
+        self._ended = threading.Event()
+        link.subscribe(f"icrl/{run}/mon/**", lambda key, payload: self.picture.hear(key, payload, time.time()))
+        self._thread = threading.Thread(target=self._tick, name="picture", daemon=True)
+        self._thread.start()
+
+    def _tick(self) -> None:
+        while not self._ended.wait(PERIOD_S):
+            self.picture.tick(time.time())
+
+    def now(self) -> float:
+        return time.time()
+
+    def replay(self) -> dict[str, Any] | None:
+        return None
+
+    def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
+        """A run that is on cannot be hurried."""
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(5.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class ReplayFeed:
+    """A run on disk, finished or crashed, played again from its dataset and metrics."""
+
+    def __init__(self, folder: Path, speed: float = 10.0) -> None:
+        """``speed``: seconds of then a second of now.  Raises ConfigError if there is nothing to play."""
+        self.picture = Picture()
+        self._recording = Recording(folder)
+        self._lock = threading.Lock()
+        self._speed, self._paused, self._seek = speed, False, False
+        self._at = self._recording.begin
+        self._messages = self._recording.messages()
+        self._next = next(self._messages, None)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._play, name="replay", daemon=True)
+        self._thread.start()
+
+    def _play(self) -> None:
+        last = time.monotonic()
+        while not self._ended.wait(PERIOD_S):
+            with self._lock:
+                elapsed, last = time.monotonic() - last, time.monotonic()
+                if not self._paused:
+                    self._at = min(self._recording.end, self._at + elapsed * self._speed)
+                at, seek, self._seek = self._at, self._seek, False
+            if seek:
+                self.picture.clear()
+                self._messages = self._recording.messages()
+                self._next = next(self._messages, None)
+            self._until(at)
+
+    def _until(self, at: float) -> None:
+        """Hear everything up to then, a second of then at a time, as it was heard."""
+        ticked = None
+        while self._next is not None and self._next[0] <= at and not self._ended.is_set():
+            then, key, payload = self._next
+            if ticked is None:
+                ticked = then
+            if then - ticked >= 1.0:
+                ticked = then
+                self.picture.tick(then)
+            self.picture.hear(key, payload, then)
+            self._next = next(self._messages, None)
+        self.picture.tick(at)
+
+    def now(self) -> float:
+        return self._at
+
+    def replay(self) -> dict[str, Any] | None:
+        with self._lock:
+            where = {"begin": self._recording.begin, "end": self._recording.end, "at": self._at}
+            return {**where, "speed": self._speed, "paused": self._paused}
+
+    def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
+        with self._lock:
+            if speed is not None:
+                self._speed = min(1e4, max(0.1, speed))
+            if paused is not None:
+                self._paused = paused
+            if at is not None:
+                self._seek = at < self._at or self._seek
+                self._at = min(self._recording.end, max(self._recording.begin, at))
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(5.0)
+        self._recording.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

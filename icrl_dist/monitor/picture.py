@@ -1,0 +1,211 @@
+"""What the live view knows of a run: a bounded picture, made of what the monitor plane says.
+
+Nothing here trusts a message: one that is not what docs/tap.md says is counted and left out.
+``snapshot`` gives plain values for a page or a terminal, whole or only what has changed.
+"""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections import Counter, deque
+from typing import Any
+
+from icrl_dist.monitor import plain
+from icrl_dist.monitor.curves import Curves
+from icrl_dist.monitor.pace import Pace
+from icrl_dist.monitor.plain import Odd
+from icrl_dist.monitor.staff import Staff
+from icrl_dist.stream import strict
+from icrl_dist.types import Identity
+
+LARGEST = 1 << 20
+"""A message of more bytes than this is left out."""
+_EVENTS = 200
+_SILENT_S = 3.0
+"""A learner that says nothing for so long is called silent."""
+_BELIEFS = 16
+_OVER = ("finished", "interrupted", "failed")
+
+
+class Picture:
+    """A run as its monitor plane shows it; safe to use from several threads.
+
+    Times are Unix seconds: of this machine while a run is watched, of then while one is replayed.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything; a viewer that asks for changes is given the whole picture once more."""
+        with self._lock:
+            self.epoch = uuid.uuid4().hex[:8]
+            self.ignored: Counter[str] = Counter()
+            """Messages left out, by reason."""
+            self._seq = 0
+            self._run: dict[str, Any] = {"name": "", "state": "waiting", "version": -1, "trajectories": 0}
+            self._heard = float("-inf")
+            self._staff = Staff()
+            self._curves = Curves()
+            self._pace = Pace()
+            self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+            self._event_count = 0
+            self._alerts: dict[str, dict[str, Any]] = {}
+            self._beliefs: dict[str, dict[str, Any]] = {}
+
+    # What the feed calls.
+
+    def hear(self, key: str, payload: bytes, now: float) -> None:
+        """Take in one message of the monitor plane, whatever it is."""
+        try:
+            message = strict.unpack(payload, LARGEST)
+            kind = plain.text(message.get("kind"), 32)
+            parts = key.split("/")
+            with self._lock:
+                if not self._run["name"]:
+                    self._run["name"] = plain.text(parts[1], 200)
+                elif parts[1] != self._run["name"]:
+                    raise Odd("another run")
+                self._take(kind, message, now)
+        except strict.WireError as error:
+            self.ignored[error.reason] += 1
+        except Odd as error:
+            self.ignored[str(error)] += 1
+
+    def _take(self, kind: str, message: dict[str, Any], now: float) -> None:
+        if kind == "trajectory":
+            self._curves.returned(_identity(message), message)
+            self._pace.produced(1)
+        elif kind == "episode":
+            self._curves.drawn(_identity(message), message)
+        elif kind == "worker":
+            self._staff.beat(message, now)
+        elif kind == "learner":
+            self._progress(message, now)
+        elif kind == "run":
+            self._begin(message)
+        elif kind == "event":
+            self._event(message, now)
+        elif kind == "belief":
+            self._belief(message)
+        else:
+            raise Odd("unknown kind")
+
+    def _progress(self, message: dict[str, Any], now: float) -> None:
+        run = self._run
+        stage = plain.text(message.get("stage"), 32)
+        for name in ("round", "step", "steps", "version", "trajectories", "workers", "lag"):
+            run[name] = plain.integer(message.get(name), -1, 2**53)
+        run["phase"] = plain.text(message.get("phase"), 32)
+        run["drops"] = plain.counts(message.get("drops"))
+        run["doing"] = [plain.text(line, 200) for line in plain.listed(message.get("doing"), 64)]
+        loss = message.get("loss")
+        run["loss"] = plain.number(loss) if loss is not None else run.get("loss")
+        run["stage"] = stage
+        if run["state"] != "finished":  # an interrupted or failed run may go on
+            run["state"] = {"collect": "collecting", "fit": "fitting"}.get(stage, stage)
+        self._heard = now
+        self._pace.progress(run, now)
+
+    def _begin(self, message: dict[str, Any]) -> None:
+        for name, longest in (("method", 32), ("problem", 64)):
+            self._run[name] = plain.text(message.get(name), longest)
+        for name in ("tasks", "variations", "rounds"):
+            self._run[name] = plain.integer(message.get(name), 0, 10**7)
+        self._run["began"] = plain.number(message.get("began"))
+        phases = [plain.listed(phase, 3) for phase in plain.listed(message.get("phases"), 4096)]
+        self._pace.phases = [
+            (plain.text(p[0], 32), plain.integer(p[1], 0), plain.integer(p[2], 0)) for p in phases if len(p) == 3
+        ]
+
+    def _event(self, message: dict[str, Any], now: float) -> None:
+        what, text = plain.text(message.get("what"), 32), plain.text(message.get("text"), 500)
+        time = plain.number(message.get("time"))
+        self._event_count += 1
+        self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
+        if what == "worker":
+            self._staff.came(plain.text(message.get("worker")), bool(message.get("alive")), now)
+        elif what == "alert":
+            name = plain.text(message.get("alert"))
+            if not message.get("active"):
+                self._alerts.pop(name, None)
+            elif len(self._alerts) < _EVENTS:
+                self._alerts[name] = {"name": name, "text": text, "since": time}
+        elif what == "quarantine":
+            self._curves.quarantined(plain.text(message.get("identity")), text)
+        elif what == "version":
+            self._run["version"] = plain.integer(message.get("version"), 0)
+        elif what in _OVER:
+            self._run["state"] = what
+
+    def _belief(self, message: dict[str, Any]) -> None:
+        identity, worker = _identity(message), plain.text(message.get("worker"))
+        size = plain.integer(message.get("size"), 2, 64)
+        goal = [plain.integer(c, 0, size - 1) for c in plain.listed(message.get("goal"), 2)]
+        laws = {name: plain.numbers(message.get(name), size * size) for name in ("implied", "exact")}
+        if any(len(law) != size * size for law in laws.values()) or len(goal) != 2:
+            raise Odd("schema")
+        if worker in self._beliefs or len(self._beliefs) < _BELIEFS:
+            self._beliefs[worker] = {"identity": str(identity), "size": size, "goal": goal, **laws, "seq": self._seq + 1}
+
+    # What the views call.
+
+    def tick(self, now: float) -> None:
+        """Time goes on: rates, who is silent, what is not yet known of a variation's optimum."""
+        with self._lock:
+            self._seq += 1
+            self._staff.tick(now)
+            rows = self._staff.rows(now)
+            steps_per_s, unstored = sum(row["steps_per_s"] for row in rows), sum(row["unstored"] for row in rows)
+            self._pace.tick(now, self._seq, self._run, steps_per_s, unstored)
+            self._curves.tick(self._seq)
+
+    def snapshot(self, now: float, since: int = -1) -> dict[str, Any]:
+        """All that is known, as plain values that JSON can hold; of what is large only that changed after ``since``.
+
+        ``seq`` is what to give as ``since`` next time, ``epoch`` changes when everything was
+        forgotten.  docs/monitor.md has the fields.
+        """
+        with self._lock:
+            run = dict(self._run)
+            if run["state"] in ("collecting", "fitting") and now - self._heard > _SILENT_S:
+                run["state"] = "silent"
+            began = run.get("began")
+            run["elapsed_s"] = max(0.0, now - began) if began is not None else None
+            working = run["state"] in ("collecting", "fitting")
+            run["eta_s"] = self._pace.eta_s(run) if working else None
+            run["stage_eta_s"] = self._pace.stage_eta_s(run) if working else None
+            run["silent_s"] = max(0.0, now - self._heard) if self._heard > float("-inf") else None
+            run["rates"] = dict(self._pace.rates)
+            changed, left_out = self._curves.changed(since)
+            return {
+                "epoch": self.epoch,
+                "seq": self._seq,
+                "since": since,
+                "time": now,
+                "run": run,
+                "workers": self._staff.rows(now, run["state"] in _OVER),
+                "variations": changed,
+                "variation_count": len(self._curves),
+                "variations_left_out": left_out,
+                "episodes": self._curves.episodes(since),
+                "series": self._pace.series(since),
+                "events": [event for event in self._events if event["seq"] > since],
+                "alerts": list(self._alerts.values()),
+                "beliefs": {w: b for w, b in self._beliefs.items() if b["seq"] > since},
+                "ignored": dict(self.ignored),
+            }
+
+    def variation(self, name: str) -> dict[str, Any] | None:
+        """All that is kept of one variation, named ``TASK/VARIATION``, its lineage among it; None if it is not known."""
+        with self._lock:
+            return self._curves.detail(name)
+
+
+def _identity(message: dict[str, Any]) -> Identity:
+    try:
+        return Identity.parse(plain.text(message.get("identity"), 120))
+    except ValueError:
+        raise Odd("schema") from None

@@ -1,0 +1,107 @@
+"""The workers as the live view knows them: from their heartbeats and the learner's word."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from icrl_dist.monitor import plain
+from icrl_dist.monitor.plain import Odd
+
+SILENT_S = 2.0
+"""A worker whose last heartbeat is older is called silent; they come twice a second."""
+_MOST = 1024
+_SPAN_S = 3.0
+"""Rates are means over about so long."""
+_COUNTS = ("episodes", "steps", "resent", "trajectories", "pid")
+
+
+@dataclass(slots=True)
+class _Row:
+    beaten: float
+    alive: bool = True
+    restarts: int = 0
+    said: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(_COUNTS, 0) | _NOTHING)
+    marks: deque[tuple[float, int, int]] = field(default_factory=deque)
+    """When it had done how many steps and episodes."""
+
+
+_NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0}
+
+
+class Staff:
+    """A bounded table of workers."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, _Row] = {}
+
+    def beat(self, message: dict[str, Any], now: float) -> None:
+        """A heartbeat."""
+        said: dict[str, Any] = {name: plain.integer(message.get(name), 0) for name in _COUNTS}
+        said |= {name: plain.text(message.get(name)) for name in ("job", "doing")}
+        said |= {name: plain.number(message.get(name)) for name in ("memory_mb", "peak_mb")}
+        row = self._row(plain.text(message.get("worker")), now)
+        if row.said["pid"] not in (0, said["pid"]):
+            row.restarts += 1
+            row.marks.clear()
+        row.said, row.beaten, row.alive = said, now, True
+
+    def came(self, worker: str, alive: bool, now: float) -> None:
+        """The learner says that it joined, or is gone."""
+        row = self._row(worker, now)
+        row.alive = alive
+        if alive:
+            row.beaten = now
+        else:
+            row.said |= {"job": "", "doing": ""}
+
+    def _row(self, worker: str, now: float) -> _Row:
+        row = self._rows.get(worker)
+        if row is None:
+            if len(self._rows) >= _MOST:
+                raise Odd("too many workers")
+            row = self._rows[worker] = _Row(now)
+        return row
+
+    def tick(self, now: float) -> None:
+        """Rates are taken from where the counts stood some seconds ago."""
+        for row in self._rows.values():
+            row.marks.append((now, row.said["steps"], row.said["episodes"]))
+            while len(row.marks) > 2 and now - row.marks[1][0] >= _SPAN_S:
+                row.marks.popleft()
+
+    def rows(self, now: float, over: bool = False) -> list[dict[str, Any]]:
+        """A row a worker, by name; ``state`` is gone, silent, waiting or working, and done once the run is ``over``."""
+        return [_told(name, row, now, over) for name, row in sorted(self._rows.items())]
+
+
+def _told(name: str, row: _Row, now: float, over: bool) -> dict[str, Any]:
+    silent = max(0.0, now - row.beaten)
+    state = (
+        "done"
+        if over
+        else "gone"
+        if not row.alive
+        else "silent"
+        if silent > SILENT_S
+        else "working"
+        if row.said["job"]
+        else "waiting"
+    )
+    steps_per_s = episodes_per_s = 0.0
+    if len(row.marks) > 1 and state in ("working", "waiting"):
+        then, steps, episodes = row.marks[0]
+        span = max(1e-3, row.marks[-1][0] - then)
+        steps_per_s = max(0, row.marks[-1][1] - steps) / span
+        episodes_per_s = max(0, row.marks[-1][2] - episodes) / span
+    return {
+        "name": name,
+        "state": state,
+        **row.said,
+        "steps_per_s": steps_per_s,
+        "episodes_per_s": episodes_per_s,
+        "unstored": max(0, row.said["episodes"] - row.said["trajectories"]),
+        "restarts": row.restarts,
+        "silent_s": round(silent, 1),
+    }
