@@ -108,6 +108,32 @@ class Tap:
 
 
 @dataclass(frozen=True)
+class Monitor:
+    """Watch a run live, in the terminal or in a browser; or play one again that has ended.
+
+    Without WHAT: the newest run under runs/ that is on.  A view reads the monitor plane only, so
+    it can slow nobody down.  ``icrl-dist monitor runs/demo`` plays the run in that folder again
+    once it has ended, at any speed.
+    """
+
+    what: tyro.conf.Positional[Path | None] = None
+    """Run folder: watched if the run is on, played again if it has ended."""
+    connect: str | None = None
+    """Instead, the endpoint of a learner, such as tcp/127.0.0.1:7447."""
+    certificates: str | None = None
+    """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/; the run's own if
+    not given."""
+    web: int | None = None
+    """Serve a page at this port instead; 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """Where the page is served: only to this machine unless you change it."""
+    speed: float = 10.0
+    """Seconds of then a second, of a run that is played again; the views can change it."""
+    timeout: float = 30.0
+    """Seconds to wait for the learner."""
+
+
+@dataclass(frozen=True)
 class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
@@ -212,6 +238,7 @@ class Doctor:
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "train": (Train, commands.train),
     "evaluate": (Evaluate, commands.evaluate),
+    "monitor": (Monitor, commands.monitor),
     "tap": (Tap, commands.tap),
     "bench": (Bench, commands.bench),
     "explain": (Explain, commands.explain),

@@ -18,7 +18,7 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.types import Identity
 
 if TYPE_CHECKING:
-    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Tap, Train
+    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -144,6 +144,33 @@ def export(arguments: Export, console: Console) -> int:
     with Display(console) as display:
         save_checkpoint(out, slim(heldout.calibrate(source, display)))
     console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)
+    return OK
+
+
+def monitor(arguments: Monitor, console: Console) -> int:
+    """``icrl-dist monitor``: the live view."""
+    from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
+    from icrl_dist.stream import security
+    from icrl_dist.stream.zenoh_link import ZenohLink
+
+    if arguments.speed <= 0:
+        raise ConfigError(f"--speed {arguments.speed:g}: must be above 0")
+    what = arguments.what
+    with contextlib.ExitStack() as stack:
+        if what is not None and arguments.connect is None and not (what / "endpoint").is_file():
+            feed: LiveFeed | ReplayFeed = stack.enter_context(ReplayFeed(what, arguments.speed))
+        else:
+            endpoint, certificates = _learner(what, arguments.connect, arguments.certificates)
+            settings = security.client(certificates, "monitor")
+            link = stack.enter_context(ZenohLink.connect(endpoint, arguments.timeout, settings))
+            feed = stack.enter_context(LiveFeed(link))
+        if arguments.web is not None:
+            from icrl_dist.monitor.page import serve
+
+            return serve(feed, arguments.host, arguments.web, console)
+        from icrl_dist.monitor.screen import Screen
+
+        Screen(feed).run()
     return OK
 
 
