@@ -27,6 +27,11 @@ def sticks(kind: str, states: Float32[np.ndarray, "F S"]) -> list[list[list[floa
     return [figure.frame(state) for state in states.astype(np.float64)]
 
 
+def step_s(kind: str) -> float:
+    """Simulated seconds between two steps of a problem."""
+    return _figure(kind).step_s
+
+
 @functools.lru_cache(maxsize=16)
 def _figure(kind: str) -> Figure:
     return Figure(kind)
@@ -39,6 +44,7 @@ class Figure:
         self._env: Any = suite_environment(kind)  # it owns the model
         self._model, self._domain = self._env.physics.model.ptr, problem(kind).domain
         self._data = mujoco.MjData(self._model)
+        self.step_s: float = self._env.control_timestep()
         moving = self._model.geom_bodyid > 0
         limbs = np.isin(self._model.geom_type, (_CAPSULE, _BOX, _ELLIPSOID)) & moving
         self._geoms = np.flatnonzero(limbs)

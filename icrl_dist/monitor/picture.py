@@ -152,6 +152,11 @@ class Picture:
 
     # What the views call.
 
+    @property
+    def seq(self) -> int:
+        """How often time has gone on."""
+        return self._seq
+
     def tick(self, now: float) -> None:
         """Time goes on: rates, who is silent, what is not yet known of a variation's optimum."""
         with self._lock:

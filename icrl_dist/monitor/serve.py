@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -32,13 +32,15 @@ VIEWERS = 64
 """Viewers of one page at once; further ones are told to come back."""
 QUEUED = 256
 """Events that wait for one viewer; the oldest are dropped for a viewer that is slower."""
+BEHIND = 16
+"""Events that wait for one viewer where each builds on the one before; a slower viewer is greeted anew."""
 BODY = 4096
 """Bytes of a command."""
 _QUIET_S = 10.0
 """After so long without an event a viewer is sent a comment, so that a lost one is noticed."""
 _HOME = {"127.0.0.1", "localhost", "::1"}
 _ASSETS = resources.files("icrl_dist.monitor") / "assets"
-_KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "LICENSE": "text/plain"}
+_KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "svg": "image/svg+xml", "LICENSE": "text/plain"}
 _HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -59,9 +61,14 @@ class EventStream:
 
     A *state* event replaces one of its name that a viewer has not been sent yet, and is the
     first that a new viewer hears; any other is sent once, or dropped if the viewer is slow.
+
+    Where each event builds on the one before there is a ``greeting``: the event that a viewer
+    can begin with.  It gives event and JSON text, on a thread of the server, once the viewer
+    is among those who are told; a viewer that fell behind begins with it anew.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, greeting: Callable[[], tuple[str, str]] | None = None) -> None:
+        self._greeting = greeting
         self._lock = threading.Lock()
         self._viewers: set[_Viewer] = set()
         self._state: dict[str, str] = {}
@@ -89,7 +96,7 @@ class EventStream:
                 viewer.end()
 
     async def _events(self) -> AsyncIterator[str]:
-        viewer = _Viewer(asyncio.get_running_loop())
+        viewer = _Viewer(asyncio.get_running_loop(), self._greeting)
         with self._lock:
             for event, text in self._state.items():
                 viewer.put(event, text, True)
@@ -114,16 +121,20 @@ class EventStream:
 class _Viewer:
     """What one viewer has still to be sent."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, greeting: Callable[[], tuple[str, str]] | None = None) -> None:
         self._loop, self._lock, self._some = loop, threading.Lock(), asyncio.Event()
         self._queue: deque[tuple[str, str, bool]] = deque()
         self._over = False
+        self._greeting, self._greet = greeting, greeting is not None
 
     def put(self, event: str, text: str, state: bool) -> None:
         with self._lock:
             if state:
                 self._queue = deque(one for one in self._queue if not (one[2] and one[0] == event))
             self._queue.append((event, text, state))
+            if self._greeting is not None and len(self._queue) > BEHIND:
+                self._queue.clear()
+                self._greet = True
             while len(self._queue) > QUEUED:
                 oldest = next((i for i, one in enumerate(self._queue) if not one[2]), 0)
                 del self._queue[oldest]
@@ -139,6 +150,11 @@ class _Viewer:
 
     async def next(self) -> str | None:
         """All that waits, in the form of the protocol; None when it is over."""
+        if self._greet and not self._over:
+            assert self._greeting is not None
+            self._greet = False  # what is put from here on comes after it
+            event, text = await asyncio.to_thread(self._greeting)
+            return _form(event, text)
         if not self._over:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._some.wait(), _QUIET_S)
@@ -147,13 +163,19 @@ class _Viewer:
             waiting, self._queue = self._queue, deque()
         if self._over:
             return None
-        return "".join(f"event: {event}\ndata: {text}\n\n" for event, text, _ in waiting) or ": still here\n\n"
+        return "".join(_form(event, text) for event, text, _ in waiting) or ": still here\n\n"
 
 
-def application(page: str, stream: EventStream, command: Command | None = None) -> Starlette:
+def _form(event: str, text: str) -> str:
+    return f"event: {event}\ndata: {text}\n\n"
+
+
+def application(
+    page: str, stream: EventStream, command: Command | None = None, more: Sequence[Route] = ()
+) -> Starlette:
     """``/`` is the asset ``page``, ``/assets/NAME`` every other, ``/events`` the stream, ``/command`` for JSON objects.
 
-    A command is answered 204; 400 with one line if ``command`` raises ValueError.
+    ``more``: what else this page answers.  A command is answered 204; 400 with one line if ``command`` raises ValueError.
     """
 
     async def asset(request: Request) -> Response:
@@ -172,7 +194,7 @@ def application(page: str, stream: EventStream, command: Command | None = None) 
         return Response(status_code=204)
 
     routes = [Route("/", asset), Route("/assets/{name}", asset), Route("/events", stream.respond)]
-    return Starlette(routes=routes + ([Route("/command", commanded, methods=["POST"])] if command else []))
+    return Starlette(routes=[*routes, *more] + ([Route("/command", commanded, methods=["POST"])] if command else []))
 
 
 async def _body(request: Request) -> bytes:

@@ -3,7 +3,8 @@
 A drawing is one of
 
 - ``room``: ``size``, ``goal``, ``path`` (the cells, one more than steps), ``overridden`` (a step each);
-- ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in metres, and ``force`` (0 to 1 a frame);
+- ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in metres, ``frame_s`` seconds apart, and
+  ``force`` (0 to 1 a frame);
 - ``paths``: ``paths``, named lists of points seen from above in metres, and ``goal``.
 """
 
@@ -46,7 +47,9 @@ def of(message: dict[str, Any]) -> dict[str, Any]:
     if kind in problems.PROBLEMS and states.shape[1] == len(problems.PROBLEMS[kind].scale):
         from icrl_dist.monitor import figures
 
-        return {"kind": "sticks", "frames": figures.sticks(kind, states), "force": _rounded(np.minimum(adversary, 1.0))}
+        frames, force = figures.sticks(kind, states), _rounded(np.minimum(adversary, 1.0))
+        frame_s = plain.integer(message.get("every"), 1, 512) * figures.step_s(kind)
+        return {"kind": "sticks", "frames": frames, "frame_s": frame_s, "force": force}
     raise Odd("schema")
 
 
