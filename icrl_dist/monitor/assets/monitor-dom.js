@@ -1,0 +1,99 @@
+// Elements, words and numbers.  Whatever a message says becomes text, never markup.
+
+import { number } from "./common.js";
+
+export const byId = (id) => document.getElementById(id);
+
+/** An element with attributes and children; a child that is no node becomes text. */
+export function el(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== false) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children);
+  return element;
+}
+
+/** Set text only where it differs, so that nothing is announced or selected anew. */
+export function say(element, text) {
+  const words = String(text);
+  if (element.textContent !== words) element.textContent = words;
+}
+
+/** What a run's or worker's state looks like; the word always stands beside it. */
+const KINDS = {
+  collecting: "ok", fitting: "ok", finished: "ok", working: "ok", done: "ok",
+  waiting: "muted", silent: "warn", interrupted: "warn", failed: "bad", gone: "bad",
+};
+
+export function badge(element, state) {
+  const kind = `badge ${KINDS[state] ?? "muted"}`;
+  if (element.className !== kind) element.className = kind;
+  say(element, state);
+}
+
+/** A time span in seconds, as 1:02:03 or 2:03; a dash for none. */
+export function span(seconds) {
+  if (seconds === null || seconds === undefined) return "–";
+  const whole = Math.round(seconds);
+  const [hours, minutes, rest] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+  const two = (value) => String(value).padStart(2, "0");
+  if (hours >= 48) return `${number(hours / 24, 1)} days`;
+  return hours ? `${hours}:${two(minutes)}:${two(rest)}` : `${minutes}:${two(rest)}`;
+}
+
+/** A moment, Unix seconds, as the time of day. */
+export const clock = (time) => new Date(time * 1000).toLocaleTimeString("en-GB");
+
+/** A number to three digits or so. */
+export function brief(value) {
+  if (value === null || value === undefined) return "–";
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 1e-3 || size >= 1e9)) return value.toExponential(2);
+  return number(value, size >= 100 || Number.isInteger(value) ? 0 : size >= 10 ? 1 : 2);
+}
+
+const parameter = (value) =>
+  Array.isArray(value) ? `[${value.map(brief).join(", ")}]` : typeof value === "number" ? brief(value) : String(value);
+
+/** Parameters as words: "p 0.31, alpha [1.2, 0.4]". */
+export const parameters = (named, without = []) =>
+  Object.entries(named)
+    .filter(([name]) => !without.includes(name))
+    .map(([name, value]) => `${name} ${parameter(value)}`)
+    .join(", ");
+
+/** A count by reason, as words. */
+export const reasons = (counts) =>
+  Object.entries(counts ?? {}).map(([name, count]) => `${name} ${number(count)}`).join(", ") || "none";
+
+export const plural = (count, noun) => `${number(count)} ${noun}${count === 1 ? "" : "s"}`;
+
+export const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+
+/** A line over values as an SVG, between `low` and `high`. */
+export function sparkline(svg, values, low, high) {
+  const [width, height] = [110, 22];
+  const place = (value, index) => {
+    const x = values.length > 1 ? 2 + ((width - 4) * index) / (values.length - 1) : width / 2;
+    const y = height - 3 - ((height - 6) * (value - low)) / (high - low || 1);
+    return `${x.toFixed(1)},${y.toFixed(1)}`;
+  };
+  const places = values.map(place);
+  svg.firstChild.setAttribute("points", places.join(" "));
+  const [x, y] = (places.at(-1) ?? "-9,-9").split(",");
+  svg.lastChild.setAttribute("cx", x);
+  svg.lastChild.setAttribute("cy", y);
+}
+
+export function sparklineElement() {
+  const make = (tag, attributes) => {
+    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    return element;
+  };
+  const svg = make("svg", { class: "spark", viewBox: "0 0 110 22", "aria-hidden": "true" });
+  svg.append(make("polyline", {}), make("circle", { r: "2" }));
+  return svg;
+}

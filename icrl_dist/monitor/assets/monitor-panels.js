@@ -1,0 +1,172 @@
+// Header, alerts, recording, workers, events: what is small and always whole.
+
+import { command, number } from "./common.js";
+import { badge, brief, byId, clock, el, parameters, plural, reasons, say, span } from "./monitor-dom.js";
+import { Table } from "./monitor-table.js";
+
+const STAGES = { collect: "Collecting", fit: "Fitting" };
+
+export function drawHeader({ run, replay }) {
+  say(byId("name"), run.name || "Waiting for a run");
+  document.title = run.name ? `${run.name}: ${run.state}` : "icrl-dist: live view";
+  badge(byId("state"), run.state ?? "waiting");
+  say(byId("what"), [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(" · "));
+  const over = ["finished", "interrupted", "failed"].includes(run.state);
+  const fit = run.stage === "fit";
+  say(byId("stage"), run.stage ? `${STAGES[run.stage] ?? run.stage} ${run.phase}/${run.round}` : "no stage yet");
+  const steps = run.steps ?? 0;
+  say(byId("steps"), steps ? `${number(run.step)} of ${number(steps)} ${fit ? "steps" : "trajectories"} · ${Math.floor((100 * run.step) / steps)}%` : "");
+  byId("bar").value = steps ? Math.min(1, run.step / steps) : 0;
+  const last = run.rounds ? ` of ${number(run.rounds - 1)}` : "";
+  say(byId("round"), run.stage ? (run.phase === "adapt" ? `${run.round}${last}` : "before 0") : "–");
+  say(byId("elapsed"), span(run.elapsed_s));
+  say(byId("stage-eta"), over ? "–" : span(run.stage_eta_s));
+  say(byId("eta"), over ? "–" : span(run.eta_s));
+  say(byId("version"), run.version >= 0 ? `T^${run.version}` : "none yet");
+  say(byId("trajectories"), number(run.trajectories ?? 0));
+  say(byId("loss"), brief(run.loss));
+  byId("replay").hidden = !replay;
+}
+
+export function drawAlerts({ alerts }) {
+  const place = byId("alerts");
+  const words = alerts.map((alert) => `${alert.text} (since ${clock(alert.since)})`);
+  if (place.dataset.words === words.join("\n")) return;
+  place.dataset.words = words.join("\n");
+  place.replaceChildren(...words.map((text) => el("p", {}, el("strong", {}, "Alert: "), text)));
+}
+
+const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 500];
+
+/** The controls of a recording. */
+export class Replay {
+  constructor() {
+    this.dragging = false;
+    this.speeds = "";
+    this.told = null;
+    byId("pause").addEventListener("click", () => this.#send({ paused: !this.told?.paused }));
+    byId("speed").addEventListener("change", (event) => this.#send({ speed: Number(event.target.value) }));
+    const seek = byId("seek");
+    seek.addEventListener("input", () => {
+      this.dragging = true;
+      say(byId("at"), this.#words(this.#moment()));
+      seek.setAttribute("aria-valuetext", this.#words(this.#moment()));
+    });
+    seek.addEventListener("change", async () => {
+      await this.#send({ at: this.#moment() });
+      this.dragging = false;
+    });
+  }
+
+  async #send(fields) {
+    say(byId("replay-error"), await command(fields));
+  }
+
+  #moment() {
+    const { begin, end } = this.told;
+    return begin + ((end - begin) * Number(byId("seek").value)) / 1000;
+  }
+
+  #words(at) {
+    const { begin, end } = this.told;
+    return `${span(at - begin)} of ${span(end - begin)}`;
+  }
+
+  draw({ replay }) {
+    if (!replay) return;
+    this.told = replay;
+    const done = replay.at >= replay.end;
+    say(byId("pause"), replay.paused ? "Play" : done ? "At the end" : "Pause");
+    byId("pause").disabled = done && !replay.paused;
+    const speeds = [...new Set([...SPEEDS, replay.speed])].sort((a, b) => a - b);
+    if (speeds.join() !== this.speeds) {
+      this.speeds = speeds.join();
+      byId("speed").replaceChildren(...speeds.map((speed) => el("option", { value: speed }, `${brief(speed)}×`)));
+    }
+    if (document.activeElement !== byId("speed")) byId("speed").value = String(replay.speed);
+    if (this.dragging) return;
+    byId("seek").value = String(Math.round((1000 * (replay.at - replay.begin)) / Math.max(1e-9, replay.end - replay.begin)));
+    say(byId("at"), this.#words(replay.at));
+    byId("seek").setAttribute("aria-valuetext", this.#words(replay.at));
+  }
+}
+
+const TROUBLE = { gone: 0, silent: 1, working: 2, waiting: 3, done: 4 };
+const ROWS = 200;
+const count = (name, title, about, first = "desc") => ({ name, title, about, first, number: true, value: (row) => row[name], text: (row) => brief(row[name]) });
+
+const COLUMNS = [
+  { name: "name", title: "Worker", value: (row) => row.name, text: (row) => row.name },
+  {
+    name: "state", title: "State", about: "Trouble first", value: (row) => TROUBLE[row.state] ?? 9,
+    fill: (cell, row) => {
+      if (!cell.firstChild) cell.append(el("span"));
+      badge(cell.firstChild, row.state);
+      cell.title = row.state === "gone" || row.state === "silent" ? `nothing heard for ${span(row.silent_s)}` : row.doing;
+    },
+  },
+  { name: "job", title: "Job", value: (row) => row.job, fill: (cell, row) => (say(cell, row.job || "–"), (cell.title = row.doing)) },
+  count("episodes_per_s", "Ep./s", "Episodes a second"),
+  count("steps_per_s", "Steps/s", "Environment steps a second"),
+  count("unstored", "Unstored", "Episodes finished and not yet acknowledged by the learner"),
+  count("restarts", "Restarts", "Times it came back as another process"),
+  { ...count("memory_mb", "MB", "Resident memory, megabytes"), text: (row) => (row.memory_mb ? number(row.memory_mb) : "–") },
+];
+
+export class Workers {
+  constructor() {
+    this.table = new Table(byId("worker-table"), COLUMNS, {
+      caption: "Workers, trouble first",
+      limit: ROWS,
+      order: ["state", false],
+      tie: (a, b) => (a.name < b.name ? -1 : 1),
+      decorate: (element, row) => {
+        element.dataset.state = row.state;
+        element.classList.toggle("troubled", row.state === "gone" || row.state === "silent");
+      },
+    });
+  }
+
+  draw({ workers }) {
+    const shown = this.table.draw(workers);
+    const trouble = workers.filter((row) => row.state === "gone" || row.state === "silent").length;
+    say(byId("worker-count"), `${number(workers.length)}${trouble ? `, ${number(trouble)} in trouble` : ""}`);
+    byId("worker-more").hidden = shown >= workers.length;
+    say(byId("worker-more"), `${plural(workers.length - shown, "more worker")} not shown`);
+  }
+}
+
+/** Events, newest first: only what is new is added. */
+export class Events {
+  constructor() {
+    this.newest = -1;
+  }
+
+  clear() {
+    this.newest = -1;
+    byId("events").replaceChildren();
+  }
+
+  draw({ events, run, ignored }) {
+    const list = byId("events");
+    const at = list.scrollTop;
+    const before = list.scrollHeight;
+    for (const event of events) {
+      if (event.number <= this.newest) continue;
+      this.newest = event.number;
+      const time = el("time", { datetime: new Date(event.time * 1000).toISOString(), class: "muted small" }, clock(event.time));
+      list.prepend(el("li", { "data-what": event.what }, time, el("span", { class: "what small" }, event.what), el("span", {}, event.text)));
+    }
+    while (list.children.length > 200) list.lastChild.remove();
+    if (at > 4) list.scrollTop = at + list.scrollHeight - before;
+    say(byId("drops"), reasons(run.drops));
+    say(byId("ignored"), reasons(ignored));
+  }
+}
+
+export const factsOf = (row) => [
+  ["Task", parameters(row.parameters) || "–"],
+  ["Adversary", [String(row.adversary.kind ?? "?"), parameters(row.adversary, ["kind"])].filter(Boolean).join(": ")],
+  ["Optimal return", brief(row.optimum)],
+  ...(row.quarantine ? [["Quarantined", row.quarantine]] : []),
+];

@@ -1,0 +1,94 @@
+// What the page knows of a run: bounded, whatever the server says.  docs/monitor.md has the fields.
+
+const VARIATIONS = 4096;
+const EPISODES = 48;
+const EVENTS = 200;
+const POINTS = 900;
+const NAMES = ["number", "t", "stored_per_s", "episodes_per_s", "steps_per_s", "fit_per_s", "loss", "lag", "unstored"];
+
+export function emptyStore() {
+  return {
+    epoch: "",
+    seq: -1,
+    time: 0,
+    run: {},
+    workers: [],
+    alerts: [],
+    variations: new Map(),
+    variationCount: 0,
+    leftOut: 0,
+    episodes: new Map(),
+    series: Object.fromEntries(NAMES.map((name) => [name, []])),
+    events: [],
+    beliefs: {},
+    ignored: {},
+    replay: null,
+    changes: 0, // grows when variations change
+  };
+}
+
+/** Take in one picture or what has changed since; false if something between was missed. */
+export function apply(store, told) {
+  if (told.since === -1) Object.assign(store, emptyStore(), { changes: store.changes + 1 });
+  else if (told.epoch !== store.epoch || told.since > store.seq) return false;
+  else if (told.seq < store.seq) return true;
+  for (const name of ["epoch", "seq", "time", "run", "workers", "alerts", "ignored", "replay"]) store[name] = told[name];
+  store.variationCount = told.variation_count;
+  store.leftOut = told.variations_left_out;
+  for (const row of told.variations) {
+    if (store.variations.size < VARIATIONS || store.variations.has(row.name)) store.variations.set(row.name, row);
+  }
+  if (told.variations.length) store.changes += 1;
+  for (const episode of told.episodes) {
+    if (store.episodes.get(episode.name)?.identity === episode.identity) continue;
+    store.episodes.delete(episode.name);
+    store.episodes.set(episode.name, episode);
+  }
+  for (const name of store.episodes.keys()) {
+    if (store.episodes.size <= EPISODES) break;
+    store.episodes.delete(name);
+  }
+  append(store, told);
+  Object.assign(store.beliefs, told.beliefs);
+  return true;
+}
+
+function append(store, told) {
+  const known = store.series.number.at(-1) ?? -1;
+  const first = told.series.number.findIndex((each) => each > known);
+  for (const name of NAMES) {
+    const column = store.series[name];
+    if (first >= 0) column.push(...told.series[name].slice(first));
+    if (column.length > POINTS) column.splice(0, column.length - POINTS);
+  }
+  const heard = store.events.at(-1)?.number ?? -1;
+  store.events.push(...told.events.filter((event) => event.number > heard));
+  if (store.events.length > EVENTS) store.events.splice(0, store.events.length - EVENTS);
+}
+
+/** The phase that goes on now: of the newest returns. */
+export function newestPhase(store) {
+  const last = (row) => row.phases.at(-1)?.name ?? "";
+  let newest = "";
+  for (const row of store.variations.values()) newest = later(newest, last(row));
+  return newest;
+}
+
+const ORDER = ["pretrain", "practice", "adapt"];
+
+/** The later of two phases, by stage and round. */
+export function later(one, other) {
+  if (!one || !other) return one || other;
+  const place = (name) => {
+    const [stage, round] = name.split("/");
+    return [ORDER.indexOf(stage), Number(round)];
+  };
+  const [[stage, round], [stage2, round2]] = [place(one), place(other)];
+  return stage2 > stage || (stage2 === stage && round2 > round) ? other : one;
+}
+
+/** Mean of the last five returns of a variation's newest phase, or null. */
+export function recent(row) {
+  const returns = row.phases.at(-1)?.returns.slice(-5) ?? [];
+  return returns.length ? returns.reduce((sum, value) => sum + value, 0) / returns.length : null;
+}

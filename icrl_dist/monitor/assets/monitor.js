@@ -1,0 +1,110 @@
+// The live view: listen, remember, draw.  docs/monitor.md says what the server tells.
+
+import { listen, themeButton } from "./common.js";
+import { Timeline, watchTheme } from "./monitor-charts.js";
+import { Detail } from "./monitor-detail.js";
+import { byId, brief, say } from "./monitor-dom.js";
+import { Beliefs, Episodes } from "./monitor-episodes.js";
+import { Events, Replay, Workers, drawAlerts, drawHeader } from "./monitor-panels.js";
+import { apply, emptyStore } from "./monitor-store.js";
+import { Variations } from "./monitor-variations.js";
+
+const STALE_MS = 3000;
+const AGAIN_MS = 2000;
+
+const store = emptyStore();
+let detail = null;
+const open = (name) => detail.open(name);
+const episodes = new Episodes(store, open);
+detail = new Detail(store, episodes);
+const variations = new Variations(store, open);
+const workers = new Workers();
+const events = new Events();
+const replay = new Replay();
+const beliefs = new Beliefs();
+
+const timelines = [
+  ["throughput", [
+    { name: "stored_per_s", label: "stored", ink: "--series-1" },
+    { name: "episodes_per_s", label: "episodes", ink: "--series-2", dash: [5, 3] },
+    { name: "fit_per_s", label: "fit steps", ink: "--series-3" },
+  ]],
+  ["backlog", [
+    { name: "unstored", label: "not yet stored", ink: "--series-4" },
+    { name: "lag", label: "lag", ink: "--series-5", dash: [5, 3] },
+  ]],
+  ["losses", [{ name: "loss", label: "loss", ink: "--series-1" }]],
+].map(([id, names]) => ({ id, names, line: new Timeline(byId(id), names), title: byId(id).getAttribute("aria-label") }));
+
+watchTheme();
+themeButton(byId("theme"));
+
+// What the server says.
+
+let heard = performance.now();
+let epoch = "";
+let source = null;
+
+function told(picture) {
+  heard = performance.now();
+  say(byId("connection"), store.replay ? "playing" : "live");
+  byId("connection").className = "badge ok";
+  if (!apply(store, picture)) return connect(); // something was missed: begin with the whole
+  if (store.epoch !== epoch) {
+    epoch = store.epoch;
+    episodes.clear();
+    events.clear();
+  }
+}
+
+function connect() {
+  source?.close();
+  source = listen({ picture: told }, byId("connection"));
+}
+
+setInterval(() => {
+  const silent = performance.now() - heard;
+  if (source.readyState === EventSource.CLOSED) connect();
+  else if (source.readyState === EventSource.OPEN && silent > STALE_MS) {
+    byId("connection").className = "badge warn";
+    say(byId("connection"), `stale: no news for ${Math.round(silent / 1000)} s`);
+  }
+  document.body.classList.toggle("stale", silent > STALE_MS);
+}, AGAIN_MS);
+
+// What is drawn how often: numbers four times a second, tables and charts once or twice.
+
+const jobs = [
+  [240, () => {
+    drawHeader(store);
+    drawAlerts(store);
+    replay.draw(store);
+    workers.draw(store);
+    events.draw(store);
+  }],
+  [500, () => {
+    variations.draw();
+    detail.refresh();
+    beliefs.draw(store.beliefs);
+  }],
+  [1000, () => {
+    for (const { id, names, line, title } of timelines) {
+      line.draw(store.series);
+      const newest = names.map(({ name, label }) => `${label} ${brief(store.series[name].at(-1))}`).join(", ");
+      byId(id).setAttribute("aria-label", `${title}; now ${newest}`);
+    }
+  }],
+].map(([every, paint]) => ({ every, paint, last: -Infinity }));
+
+function frame(now) {
+  requestAnimationFrame(frame);
+  if (store.seq < 0) return;
+  for (const job of jobs) {
+    if (now - job.last < job.every) continue;
+    job.last = now;
+    job.paint();
+  }
+}
+
+connect();
+requestAnimationFrame(frame);
