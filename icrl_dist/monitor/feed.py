@@ -75,7 +75,7 @@ class ReplayFeed:
 
     def __init__(self, folder: Path, speed: float = 10.0) -> None:
         """``speed``: seconds of then a second of now.  Raises ConfigError if there is nothing to play."""
-        self.picture = Picture()
+        self.picture = Picture(recorded=True)
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False

@@ -34,8 +34,9 @@ class Picture:
     Times are Unix seconds: of this machine while a run is watched, of then while one is replayed.
     """
 
-    def __init__(self) -> None:
-        self._lock = threading.RLock()
+    def __init__(self, recorded: bool = False) -> None:
+        """``recorded``: heartbeats were not kept, so nobody is called silent."""
+        self._lock, self._recorded = threading.RLock(), recorded
         self.clear()
 
     def clear(self) -> None:
@@ -47,7 +48,7 @@ class Picture:
             self._seq = 0
             self._run: dict[str, Any] = {"name": "", "state": "waiting", "version": -1, "trajectories": 0}
             self._heard = float("-inf")
-            self._staff = Staff()
+            self._staff = Staff(not self._recorded)
             self._curves = Curves()
             self._pace = Pace()
             self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
@@ -175,7 +176,7 @@ class Picture:
         """
         with self._lock:
             run = dict(self._run)
-            if run["state"] in ("collecting", "fitting") and now - self._heard > _SILENT_S:
+            if run["state"] in ("collecting", "fitting") and now - self._heard > _SILENT_S and not self._recorded:
                 run["state"] = "silent"
             began = run.get("began")
             run["elapsed_s"] = max(0.0, now - began) if began is not None else None

@@ -33,8 +33,10 @@ _NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb":
 class Staff:
     """A bounded table of workers."""
 
-    def __init__(self) -> None:
+    def __init__(self, beats: bool = True) -> None:
+        """``beats``: there are heartbeats, so that a worker without them is silent; else it waits."""
         self._rows: dict[str, _Row] = {}
+        self._beats = beats
 
     def beat(self, message: dict[str, Any], now: float) -> None:
         """A heartbeat."""
@@ -73,17 +75,17 @@ class Staff:
 
     def rows(self, now: float, over: bool = False) -> list[dict[str, Any]]:
         """A row a worker, by name; ``state`` is gone, silent, waiting or working, and done once the run is ``over``."""
-        return [_told(name, row, now, over) for name, row in sorted(self._rows.items())]
+        return [_told(name, row, now, over, self._beats) for name, row in sorted(self._rows.items())]
 
 
-def _told(name: str, row: _Row, now: float, over: bool) -> dict[str, Any]:
+def _told(name: str, row: _Row, now: float, over: bool, beats: bool) -> dict[str, Any]:
     silent = max(0.0, now - row.beaten)
     state = (
         "done"
         if over
         else "gone"
         if not row.alive
-        else "silent"
+        else ("silent" if beats else "waiting")
         if silent > SILENT_S
         else "working"
         if row.said["job"]

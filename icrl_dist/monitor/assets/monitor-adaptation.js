@@ -22,7 +22,7 @@ export function drawAdaptation(rows) {
   const phases = [...new Set(known.flatMap((row) => row.phases.map((phase) => phase.name)))];
   phases.sort((one, other) => (one === other ? 0 : later(one, other) === one ? -1 : 1)).splice(PHASES);
   const newest = phases[0];
-  say(byId("adaptation-unit"), scaled ? "return over the optimal return" : "return");
+  say(byId("adaptation-unit"), `${scaled ? "return over the optimal return" : "return"}, by episode`);
   if (!newest) return;
   const columns = phases.map((name) => means(known, name, scale));
   const x = columns[0].map((_, index) => index + 1);
@@ -66,14 +66,14 @@ function spread(rows, name, scale, length) {
 
 function options() {
   const { phases } = shown;
-  const edge = (label) => ({ ...line(label, "--series-1", { width: 0 }), stroke: faint("--series-1", 0) });
+  const edge = (label) => ({ ...line(label, "--series-1", { width: 0, quiet: true }), stroke: faint("--series-1", 0) });
   const lines = phases.map((name, age) =>
     line(name, INKS[age], { width: age ? 1.5 : 3, dash: DASHES[age], points: { show: age === 0 && shown.x.length < 2, size: 7, fill: ink(INKS[0]) } }),
   );
   return {
     scales: { x: { time: false, range: (_, low, high) => [low, Math.max(high, low + 1)] }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(high ?? 1, 0.1) * 1.04] } },
-    axes: [axis({ size: 34, label: "episode", labelSize: 14, labelFont: "11px sans-serif", labelGap: -2, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis()],
-    series: [{ label: "episode" }, edge("90% of variations below"), edge("10% below"), ...lines.toReversed()],
+    axes: [axis({ size: 22, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis()],
+    series: [{ label: "episode" }, edge("90%"), edge("10%"), ...lines.toReversed()],
     bands: [{ series: [1, 2], fill: faint("--series-1", 0.14) }],
     hooks: { drawAxes: [singles] },
   };

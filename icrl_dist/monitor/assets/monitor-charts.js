@@ -1,7 +1,7 @@
 // uPlot charts in the page's colours, drawn anew when those change.
 
 import { colour, onTheme } from "./common.js";
-import { brief } from "./monitor-dom.js";
+import { brief, el, say } from "./monitor-dom.js";
 
 const charts = new Set();
 const cache = new Map();
@@ -26,16 +26,18 @@ export const faint = (name, share) => ink(name).replace("rgb(", "rgba(").replace
 
 const FONT = "11px system-ui, 'Liberation Sans', sans-serif";
 
-/** A chart in an element, as wide and high as that; `make` gives uPlot's options, `data` its columns. */
+/** A chart that fills an element, with its key above; `make` gives uPlot's options. */
 export class Chart {
   constructor(place, make) {
-    this.place = place;
+    this.keys = el("div", { class: "keys small", "aria-hidden": "true" });
+    this.place = el("div", { class: "plot" });
+    place.append(this.keys, this.place);
     this.make = make;
     this.data = null;
     this.plot = null;
     this.shape = "";
     charts.add(this);
-    new ResizeObserver(() => this.#fit()).observe(place);
+    new ResizeObserver(() => this.#fit()).observe(this.place);
   }
 
   /** Draw columns; `shape` names what the series are: another shape is another chart. */
@@ -46,25 +48,50 @@ export class Chart {
       this.shape = shape;
       this.remake();
     }
+    this.#tell();
   }
 
   remake() {
     this.plot?.destroy();
     this.plot = null;
     if (!this.data || !this.place.clientWidth) return;
-    this.plot = new uPlot({ ...common(), ...this.make(), ...this.#size(0) }, this.data, this.place);
-    this.#fit();
+    const made = this.make();
+    const hooks = { ...made.hooks, setCursor: [() => this.#tell()] };
+    this.plot = new uPlot({ ...common(), ...made, hooks, ...this.#size() }, this.data, this.place);
+    this.values = [];
+    this.keys.replaceChildren(
+      ...made.series.flatMap((series, index) => {
+        if (series.quiet) return [];
+        const value = el("b");
+        this.values.push([index, value]);
+        const swatch = el("span", { class: series.dash?.length ? "swatch dashed" : "swatch" });
+        swatch.style.color = series.stroke ?? "transparent";
+        return el("span", { class: "key" }, ...(index ? [swatch] : []), `${series.label} `, value);
+      }),
+    );
+    this.#tell();
   }
 
-  #size(legend) {
-    return { width: this.place.clientWidth, height: Math.max(60, this.place.clientHeight - legend) };
+  /** The key says the values under the cursor, else the newest. */
+  #tell() {
+    if (!this.plot?.data) return;
+    const { idx } = this.plot.cursor;
+    for (const [index, element] of this.values ?? []) {
+      const column = this.plot.data[index];
+      const value = idx === null || idx === undefined ? (index ? column.findLast((each) => each !== null) : column.at(-1)) : column[idx];
+      const { words } = this.plot.series[index];
+      say(element, (words ?? brief)(value));
+    }
+  }
+
+  #size() {
+    return { width: this.place.clientWidth, height: Math.max(50, this.place.clientHeight) };
   }
 
   #fit() {
     if (!this.place.clientWidth) return;
     if (!this.plot) return this.remake();
-    const legend = this.place.querySelector(".u-legend")?.offsetHeight ?? 0;
-    const { width, height } = this.#size(legend);
+    const { width, height } = this.#size();
     if (this.plot.width !== width || this.plot.height !== height) this.plot.setSize({ width, height });
   }
 
@@ -72,13 +99,14 @@ export class Chart {
     this.plot?.destroy();
     this.plot = null;
     this.data = null;
+    this.keys.replaceChildren();
   }
 }
 
 const common = () => ({
   cursor: { y: false, points: { size: 6 }, drag: { x: false, y: false } },
-  legend: { live: true },
-  padding: [8, 8, 0, 0],
+  legend: { show: false },
+  padding: [8, 14, 0, 0],
 });
 
 /** An axis in the page's colours. */
@@ -103,21 +131,20 @@ export function line(label, name, more = {}) {
     width: 2,
     points: { show: false },
     spanGaps: false,
-    value: (_, value) => brief(value),
     ...more,
   };
 }
 
 /** Series of the run over time, in minutes before now. */
 export class Timeline {
-  constructor(place, names) {
+  constructor(place, names, least = 1) {
     this.names = names;
     this.chart = new Chart(place, () => ({
-      scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(1e-9, (high ?? 1) * 1.08)] } },
+      scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(least, (high ?? 1) * 1.08)] } },
       axes: [axis({ size: 22, values: (_, ticks) => ticks.map(ago), space: 60 }), axis()],
       series: [
-        { label: "", value: (_, value) => (value === null ? "" : ago(value)) },
-        ...names.map(({ label, ink: name, dash }) => line(label, name, { dash: dash ?? [], value: (_, value) => brief(value) })),
+        { label: "", words: (value) => (value === undefined ? "" : ago(value)) },
+        ...names.map(({ label, ink: name, dash }) => line(label, name, { dash: dash ?? [] })),
       ],
     }));
   }

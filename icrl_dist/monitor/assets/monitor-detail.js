@@ -94,7 +94,7 @@ export class Detail {
     const lines = row.phases.map((phase, index) => line(phase.name, INKS[newest - index] ?? INKS[2], { width: index === newest ? 2.5 : 1.5, points: { show: phase.returns.length < 40, size: 5 } }));
     return {
       scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), (high ?? 1) * 1.06 || 1] } },
-      axes: [axis({ size: 34, label: "episode", labelSize: 14, labelFont: "11px sans-serif", labelGap: -2, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis()],
+      axes: [axis({ size: 22, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis()],
       series: [{ label: "episode" }, ...bound, ...lines],
     };
   }

@@ -97,7 +97,7 @@ export class Variations {
     const shown = this.table.draw(rows);
     const [all, planned] = [this.store.variationCount, this.store.run.variations];
     const heard = planned && planned > all ? `${number(all)} of ${number(planned)}` : number(all);
-    say(byId("variation-count"), rows.length === this.store.variations.size ? heard : `${number(rows.length)} of ${number(all)}`);
+    say(byId("variation-count"), rows.length === this.store.variations.size ? heard : `${number(rows.length)} chosen of ${number(all)}`);
     const more = rows.length - shown;
     const words = [
       more ? `${plural(more, "more row")} not shown` : "",
