@@ -100,7 +100,7 @@ def _told(name: str, row: _Row, now: float, over: bool, beats: bool) -> dict[str
     return {
         "name": name,
         "state": state,
-        **row.said,
+        **(row.said | {"job": ""} if state == "waiting" else row.said),
         "steps_per_s": steps_per_s,
         "episodes_per_s": episodes_per_s,
         "unstored": max(0, row.said["episodes"] - row.said["trajectories"]),

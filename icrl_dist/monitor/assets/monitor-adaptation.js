@@ -86,7 +86,7 @@ function singles(plot) {
   ctx.beginPath();
   ctx.rect(plot.bbox.left, plot.bbox.top, plot.bbox.width, plot.bbox.height);
   ctx.clip();
-  ctx.strokeStyle = faint("--series-1", shown.rows.length > 60 ? 0.1 : 0.2);
+  ctx.strokeStyle = faint("--series-1", shown.rows.length > 60 ? 0.07 : 0.2);
   ctx.lineWidth = devicePixelRatio;
   for (const row of shown.rows) {
     const phase = row.phases.find((each) => each.name === shown.newest);

@@ -64,7 +64,8 @@ export class Chart {
         if (series.quiet) return [];
         const value = el("b");
         this.values.push([index, value]);
-        const swatch = el("span", { class: series.dash?.length ? "swatch dashed" : "swatch" });
+        const kind = !series.dash?.length ? "" : series.dash[0] < 4 ? " dotted" : " dashed";
+        const swatch = el("span", { class: `swatch${kind}` });
         swatch.style.color = series.stroke ?? "transparent";
         return el("span", { class: "key" }, ...(index ? [swatch] : []), `${series.label} `, value);
       }),

@@ -5,7 +5,7 @@ import { Tile } from "./monitor-episodes.js";
 import { brief, byId, clock, el, plural, say } from "./monitor-dom.js";
 import { factsOf } from "./monitor-panels.js";
 
-const INKS = ["--series-1", "--series-3", "--series-6"];
+const INKS = ["--series-1", "--series-4", "--series-6"];
 
 export class Detail {
   constructor(store, episodes) {
@@ -89,7 +89,7 @@ export class Detail {
 
   #options() {
     const { row } = this;
-    const bound = row.optimum === null ? [] : [line("optimum", "--ok", { width: 1.5, dash: [6, 4] })];
+    const bound = row.optimum === null ? [] : [line("optimum, expected", "--ok", { width: 1.5, dash: [6, 4] })];
     const newest = row.phases.length - 1;
     const lines = row.phases.map((phase, index) => line(phase.name, INKS[newest - index] ?? INKS[2], { width: index === newest ? 2.5 : 1.5, points: { show: phase.returns.length < 40, size: 5 } }));
     return {

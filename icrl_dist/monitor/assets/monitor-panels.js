@@ -44,7 +44,7 @@ export class Replay {
     this.dragging = false;
     this.speeds = "";
     this.told = null;
-    byId("pause").addEventListener("click", () => this.#send({ paused: !this.told?.paused }));
+    byId("pause").addEventListener("click", () => this.#send(this.#ended() ? { at: this.told.begin, paused: false } : { paused: !this.told.paused }));
     byId("speed").addEventListener("change", (event) => this.#send({ speed: Number(event.target.value) }));
     const seek = byId("seek");
     seek.addEventListener("input", () => {
@@ -62,6 +62,10 @@ export class Replay {
     say(byId("replay-error"), await command(fields));
   }
 
+  #ended() {
+    return this.told.at >= this.told.end;
+  }
+
   #moment() {
     const { begin, end } = this.told;
     return begin + ((end - begin) * Number(byId("seek").value)) / 1000;
@@ -75,9 +79,7 @@ export class Replay {
   draw({ replay }) {
     if (!replay) return;
     this.told = replay;
-    const done = replay.at >= replay.end;
-    say(byId("pause"), replay.paused ? "Play" : done ? "At the end" : "Pause");
-    byId("pause").disabled = done && !replay.paused;
+    say(byId("pause"), this.#ended() ? "Play again" : replay.paused ? "Play" : "Pause");
     const speeds = [...new Set([...SPEEDS, replay.speed])].sort((a, b) => a - b);
     if (speeds.join() !== this.speeds) {
       this.speeds = speeds.join();
@@ -167,6 +169,6 @@ export class Events {
 export const factsOf = (row) => [
   ["Task", parameters(row.parameters) || "–"],
   ["Adversary", [String(row.adversary.kind ?? "?"), parameters(row.adversary, ["kind"])].filter(Boolean).join(": ")],
-  ["Optimal return", brief(row.optimum)],
+  ["Optimal return, expected", brief(row.optimum)],
   ...(row.quarantine ? [["Quarantined", row.quarantine]] : []),
 ];
