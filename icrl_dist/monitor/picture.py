@@ -107,6 +107,7 @@ class Picture:
         run["stage"] = stage
         if run["state"] != "finished":  # an interrupted or failed run may go on
             run["state"] = {"collect": "collecting", "fit": "fitting"}.get(stage, stage)
+            run.pop("ended", None)
         self._heard = now
         self._pace.progress(run, now)
 
@@ -139,7 +140,7 @@ class Picture:
         elif what == "version":
             self._run["version"] = plain.integer(message.get("version"), 0)
         elif what in _OVER:
-            self._run["state"] = what
+            self._run["state"], self._run["ended"] = what, time
 
     def _belief(self, message: dict[str, Any]) -> None:
         identity, worker = _identity(message), plain.text(message.get("worker"))
@@ -179,7 +180,7 @@ class Picture:
             if run["state"] in ("collecting", "fitting") and now - self._heard > _SILENT_S and not self._recorded:
                 run["state"] = "silent"
             began = run.get("began")
-            run["elapsed_s"] = max(0.0, now - began) if began is not None else None
+            run["elapsed_s"] = max(0.0, run.get("ended", now) - began) if began is not None else None
             working = run["state"] in ("collecting", "fitting")
             run["eta_s"] = self._pace.eta_s(run) if working else None
             run["stage_eta_s"] = self._pace.stage_eta_s(run) if working else None

@@ -1,0 +1,269 @@
+"""The page's server, without a browser: a whole picture first, then what has changed; details; recordings."""
+
+import asyncio
+import contextlib
+import json
+import re
+from importlib import resources
+
+import pytest
+
+from icrl_dist.monitor import serve
+from icrl_dist.monitor.page import EVENT, Teller, showing
+from icrl_dist.monitor.picture import Picture
+from icrl_dist.monitor.serve import application, serving
+from icrl_dist.stream import wire
+from tests.monitor.test_serve import Page, wait_for
+
+ASSETS = resources.files("icrl_dist.monitor") / "assets"
+NOBODY = {"time": 1000.0, "worker": "w0"}
+
+
+class Run:
+    """A feed whose time is ours: ``tell`` is what the page's thread does four times a second."""
+
+    def __init__(self):
+        self.picture, self.time, self.recording, self.controlled = Picture(), 1000.0, None, []
+        self.snapshots = []
+        snapshot = self.picture.snapshot
+        self.picture.snapshot = lambda now, since=-1: self.snapshots.append(since) or snapshot(now, since)
+
+    def now(self):
+        return self.time
+
+    def replay(self):
+        return self.recording
+
+    def control(self, **fields):
+        self.controlled.append(fields)
+
+    def said(self, kind, **fields):
+        message = wire.encode_message(kind, **{**NOBODY, **fields})
+        self.picture.hear(f"icrl/a-run/mon/{kind}/w0", message, self.time)
+
+    def returned(self, variation, trial, earned):
+        named = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
+        weights = {"weights": 0, "digest": "d" * 64, "steps": 8, "episode_return": earned}
+        self.said("trajectory", identity=f"adapt/0/{variation}/{trial}", problem="darkroom", **named, **weights)
+
+    def tick(self):
+        self.time += 0.25
+        self.picture.tick(self.time)
+
+
+class View:
+    """What a page that follows docs/monitor.md knows."""
+
+    def __init__(self, page):
+        self.viewer, self.known, self.told = page.watch(), None, []
+
+    def next(self):
+        event, told = self.viewer.next()
+        assert event == EVENT
+        self.told.append(told)
+        if told["since"] == -1:
+            self.known = told
+        else:
+            assert told["epoch"] == self.known["epoch"] and told["since"] <= self.known["seq"]
+            rows = {row["name"]: row for row in self.known["variations"]} | {row["name"]: row for row in told["variations"]}
+            events = {e["number"]: e for e in (*self.known["events"], *told["events"])}
+            self.known = {**told, "variations": list(rows.values()), "events": list(events.values())}
+        return told
+
+    def close(self):
+        self.viewer.connection.close()
+        self.viewer.answer.close()
+
+
+@pytest.fixture
+def run():
+    return Run()
+
+
+@pytest.fixture
+def page(run):
+    teller = Teller(run)
+    routes = [serve.Route("/variation/{task}/{variation}", teller.variation)]
+    app = application("monitor.html", teller.stream, teller.command, routes)
+    with contextlib.ExitStack() as stack:
+        url = stack.enter_context(serving(app, teller.stream, "127.0.0.1", 0))
+        page = Page(url, teller.stream, None)
+        page.tell = teller.tell
+
+        def view():
+            views = page.stream.viewers
+            one = View(page)
+            stack.callback(one.close)
+            wait_for(lambda: page.stream.viewers == views + 1)
+            return one
+
+        page.view = view
+        yield page
+
+
+def test_a_viewer_is_told_the_whole_and_then_only_what_changed(run, page):
+    run.returned("0/0", 0, 1.0)
+    run.returned("0/1", 0, 2.0)
+    run.said("event", what="version", text="T^0 is fitted", version=0)
+    run.tick()
+    view = page.view()
+    whole = view.next()
+    assert whole["since"] == -1 and whole["replay"] is None
+    assert [row["name"] for row in whole["variations"]] == ["0/0", "0/1"] and len(whole["events"]) == 1
+    run.returned("0/1", 1, 3.0)
+    run.said("event", what="version", text="T^1 is fitted", version=1)
+    run.tick()
+    page.tell()
+    delta = view.next()
+    assert (delta["since"], delta["seq"]) == (whole["seq"], whole["seq"] + 1)
+    assert [event["text"] for event in delta["events"]] == ["T^1 is fitted"]
+    assert delta["run"]["version"] == 1
+    assert delta["variations"][-1]["phases"] == [{"name": "adapt/0", "trials": [0, 1], "returns": [2.0, 3.0]}]
+    run.tick()
+    page.tell()
+    assert not view.next()["variations"]
+
+
+def test_all_viewers_know_the_same_whenever_they_came(run, page):
+    run.returned("0/0", 0, 1.0)
+    run.tick()
+    first = page.view()
+    first.next()
+    for trial in range(1, 5):
+        run.returned("0/0", trial, float(trial))
+        run.tick()
+        page.tell()
+    for _ in range(4):
+        first.next()
+    late = page.view()
+    late.next()
+    run.returned("1/0", 0, 9.0)
+    run.tick()
+    page.tell()
+    first.next()
+    late.next()
+    run.snapshots.clear()
+    assert first.known == late.known
+    assert {row["name"] for row in first.known["variations"]} == {"0/0", "1/0"}
+
+
+def test_a_tick_is_computed_once_for_all(run, page):
+    run.tick()
+    views = [page.view() for _ in range(3)]
+    for view in views:
+        assert view.next()["since"] == -1
+    assert run.snapshots == [-1]
+    run.tick()
+    page.tell()
+    told = [view.next() for view in views]
+    assert told[0] == told[1] == told[2] and run.snapshots == [-1, told[0]["since"]]
+
+
+def test_nothing_is_computed_for_nobody_and_who_returns_begins_anew(run, page):
+    run.tick()
+    page.tell()
+    assert run.snapshots == []
+    first = page.view()
+    before = first.next()
+    first.close()
+    # A lost viewer is noticed when it is told something.
+    wait_for(lambda: (run.tick(), page.tell(), page.stream.viewers == 0)[-1])
+    run.snapshots.clear()
+    run.returned("0/0", 0, 1.0)
+    run.tick()
+    page.tell()
+    assert run.snapshots == []
+    again = page.view()
+    whole = again.next()
+    assert whole["since"] == -1 and whole["epoch"] == before["epoch"] and len(whole["variations"]) == 1
+
+
+def test_what_is_forgotten_is_forgotten_by_all(run, page):
+    run.returned("0/0", 0, 1.0)
+    run.tick()
+    views = [page.view(), page.view()]
+    for view in views:
+        view.next()
+    run.picture.clear()  # a recording is wound back
+    run.tick()
+    page.tell()
+    for view in views:
+        told = view.next()
+        assert told["since"] == -1 and told["variations"] == [] and told["epoch"] != view.told[0]["epoch"]
+
+
+def test_a_viewer_that_fell_behind_is_greeted_anew():
+    async def slow():
+        greetings = iter(range(10))
+        viewer = serve._Viewer(asyncio.get_running_loop(), lambda: ("picture", f"whole {next(greetings)}"))
+        heard = [await viewer.next()]
+        for number in range(serve.BEHIND):
+            viewer.put("picture", f"change {number}", False)
+        heard.append(await viewer.next())
+        for number in range(serve.BEHIND + 3):
+            viewer.put("picture", f"change {number}", False)
+        heard += [await viewer.next(), await viewer.next()]
+        return [[line[6:] for line in said.splitlines() if line.startswith("data: ")] for said in heard]
+
+    changes = [f"change {number}" for number in range(serve.BEHIND)]
+    # What comes after it fell behind may be told beside the whole: it changes nothing to hear it again.
+    assert asyncio.run(slow()) == [["whole 0"], changes, ["whole 1"], ["change 17", "change 18"]]
+
+
+def test_a_variation_can_be_asked_for(run, page):
+    run.returned("3/1", 0, 1.5)
+    run.tick()
+    status, headers, body = page.ask("GET", "/variation/3/1")
+    detail = json.loads(body)
+    assert status == 200 and headers["content-type"] == "application/json"
+    assert detail["adversary"] == {"kind": "uniform", "p": 0.5} and detail["episode"] is None
+    (made,) = detail["lineage"]
+    assert (made["identity"], made["worker"], made["weights"], made["digest"]) == ("adapt/0/3/1/0", "w0", 0, "d" * 64)
+    for name in ("3/2", "3", "3/1/0", "a/b", "-3/1", "3/%31%2f..", "9" * 30 + "/0", "%C2%B2/0"):
+        assert page.ask("GET", f"/variation/{name}")[0] == 404, name
+
+
+def test_a_recording_is_stopped_hurried_and_wound(run, page):
+    assert page.order('{"paused": true}') == (
+        400,
+        '{"error":"this run is on: only a recording can be stopped, hurried or wound"}',
+    )
+    run.recording = {"begin": 1.0, "end": 9.0, "at": 2.0, "speed": 10.0, "paused": False}
+    orders = [{"paused": True}, {"speed": 2.5}, {"at": 4, "paused": False}]
+    for order in orders:
+        assert page.order(json.dumps(order)) == (204, "")
+    for bad in ({"paused": 1}, {"speed": "fast"}, {"speed": 0}, {"speed": True}, {"at": None}, {"at": -1}, {"stop": 1}):
+        status, text = page.order(json.dumps(bad))
+        assert status == 400 and next(iter(bad)) in json.loads(text)["error"]
+    assert run.controlled == orders
+    run.tick()
+    assert page.view().next()["replay"] == run.recording
+
+
+def test_the_page_tells_by_itself_and_ends(run):
+    with showing(run, "127.0.0.1", 0) as url:
+        view = View(Page(url, None, None))
+        assert view.next()["since"] == -1
+        run.tick()
+        assert view.next()["since"] >= 0  # nobody called tell
+    while view.viewer.next() is not None:
+        pass
+    view.close()
+
+
+def test_the_page_needs_nothing_but_what_is_served_and_no_markup_from_data(page):
+    status, headers, html = page.ask("GET", "/")
+    text = html.decode()
+    assert status == 200 and headers["content-type"].startswith("text/html")
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\bstyle=|<style|\bon\w+=|https?://", text)
+    wanted = set(re.findall(r'(?:href|src)="([^"#]+)"', text))
+    scripts = [file for file in ASSETS.iterdir() if file.name.startswith(("monitor", "common")) and file.name.endswith(".js")]
+    for script in scripts:
+        code = script.read_text()
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function", code), script.name
+        wanted |= {f"/assets/{name}" for name in re.findall(r'from "\./([^"]+)"', code)}
+    for path in wanted:
+        assert page.ask("GET", path)[0] == 200, path
+    ids = set(re.findall(r'\bid="([^"]+)"', text))
+    asked = {one for script in scripts for one in re.findall(r'byId\("([^"]+)"\)', script.read_text())}
+    assert asked and asked <= ids
