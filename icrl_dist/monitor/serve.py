@@ -170,9 +170,7 @@ def _form(event: str, text: str) -> str:
     return f"event: {event}\ndata: {text}\n\n"
 
 
-def application(
-    page: str, stream: EventStream, command: Command | None = None, more: Sequence[Route] = ()
-) -> Starlette:
+def application(page: str, stream: EventStream, command: Command | None = None, more: Sequence[Route] = ()) -> Starlette:
     """``/`` is the asset ``page``, ``/assets/NAME`` every other, ``/events`` the stream, ``/command`` for JSON objects.
 
     ``more``: what else this page answers.  A command is answered 204; 400 with one line if ``command`` raises ValueError.

@@ -1,0 +1,286 @@
+"""The live view in a real browser: a real run, a killed worker, hostile messages, a server that comes back."""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import time
+
+import msgpack
+import numpy as np
+import psutil
+import pytest
+
+from icrl_dist.monitor.feed import LiveFeed
+from icrl_dist.monitor.page import showing
+from icrl_dist.stream import wire
+from icrl_dist.stream.memory_link import MemoryHub
+from tests.e2e.training import SMOKE, endpoint_of, finish, start, wait_for, workers_of
+from tests.monitor.test_page import Run
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+QUIET = (
+    "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync"
+)
+SHORT_S = 20
+MARKUP = '<img src=x onerror="window.__pwned=1;alert(1)">'
+CLEAR = "document.querySelector('#connection').textContent === 'live'"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with (
+        playwright.sync_playwright() as driver,
+        contextlib.closing(driver.chromium.launch(executable_path=CHROMIUM, args=QUIET.split())) as chromium,
+    ):
+        yield chromium
+
+
+@pytest.fixture
+def page(browser):
+    """A page that may not complain; ``page.forgiven`` says which complaints are part of the test."""
+    page = browser.new_page(viewport={"width": 1440, "height": 900})
+    page.set_default_timeout(1000 * SHORT_S)
+    page.patience = SHORT_S
+    complaints, page.forgiven = [], r"(?!)"
+    page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+    yield page
+    assert page.evaluate("window.__pwned") is None
+    page.close()
+    assert [each for each in complaints if not re.search(page.forgiven, each)] == []
+
+
+class Plane:
+    """A monitor plane in this process, and a feed that listens to it."""
+
+    def __init__(self, name):
+        self.hub = MemoryHub()
+        self.link, self.name = self.hub.link(), name
+        self.feed = LiveFeed(self.hub.link())
+
+    def put(self, payload, topic="any", run=None):
+        self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
+
+    def say(self, kind, **fields):
+        self.put(wire.encode_message(kind, **{"time": time.time(), "worker": "w0", **fields}))
+
+    def progress(self, **fields):
+        counts = {"round": 0, "step": 5, "steps": 10, "version": 0, "trajectories": 5, "workers": 1, "lag": 0}
+        self.say("learner", **{"stage": "collect", "phase": "adapt", "drops": {}, "doing": [], **counts, **fields})
+
+    def returned(self, variation, trial, earned, kind="uniform", problem="darkroom", **fields):
+        room = {"size": 3, "horizon": 8, "goal": [1, 1]}
+        adversary = {"kind": kind} if kind == "null" else {"kind": kind, "p": 0.25}
+        about = {"problem": problem, "task": room, "adversary": adversary, "weights": 0, "digest": "ab" * 32, "steps": 8}
+        self.say("trajectory", identity=f"adapt/0/{variation}/{trial}", episode_return=earned, **{**about, **fields})
+
+    def close(self):
+        self.feed.close()
+        self.link.close()
+
+
+@contextlib.contextmanager
+def plane(name="a-run"):
+    with contextlib.closing(Plane(name)) as one:
+        yield one
+
+
+def until(page, expression):
+    """Wait for the page, which forbids what Playwright's own waiting for an expression needs (eval)."""
+    return wait_for(lambda: page.evaluate(expression), expression, page.patience)
+
+
+def cells(page, column):
+    return page.locator(f"#variation-table tbody tr > :nth-child({column})").all_text_contents()
+
+
+def test_sorting_filters_and_one_variation(page):
+    with plane() as run, showing(run.feed, "127.0.0.1", 0) as url:
+        for task, earned in ((0, 4.0), (1, 6.0), (2, 5.0)):
+            for variation, kind in enumerate(("null", "uniform")):
+                run.returned(f"{task}/{variation}", 0, 0.0, kind)
+                run.returned(f"{task}/{variation}", 1, earned - variation, kind)
+        run.say("event", what="quarantine", text="variation 2/1 ended three workers", identity="adapt/0/2/1")
+        states = np.array([[0, 0], [0, 1], [1, 1]], np.float32)
+        room = {"size": 3, "horizon": 8, "goal": [1, 1]}
+        drawn = {"every": 1, "observations": wire.from_array(states), "adversary": wire.from_array(np.array([-1, 2], "<f4"))}
+        run.say("episode", identity="adapt/0/1/1/1", problem="darkroom", task=room, episode_return=5.0, **drawn)
+        law = np.eye(9)[4].tolist()
+        run.say("belief", identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=[1 / 9] * 9, exact=law)
+        run.progress()
+        page.goto(url)
+        until(page, "document.querySelectorAll('#variation-table tbody tr').length === 6")
+        assert cells(page, 1) == ["0/0", "0/1", "1/0", "1/1", "2/0", "2/1 quarantined"]
+        last = page.get_by_role("button", name="Last", exact=True)
+        last.focus()
+        page.keyboard.press("Enter")
+        assert [float(text) for text in cells(page, 4)] == [6, 5, 5, 4, 4, 3]
+        assert page.locator("th[aria-sort=descending]").inner_text().startswith("Last")
+        last.click()
+        assert [float(text) for text in cells(page, 4)] == [3, 4, 4, 5, 5, 6]
+        page.get_by_label("Adversary").select_option("uniform")
+        assert cells(page, 2) == ["uniform p 0.25"] * 3
+        page.get_by_label("Task").fill("1")
+        assert cells(page, 1) == ["1/1"] and page.locator("#variation-count").inner_text() == "1 chosen of 6"
+        page.get_by_role("button", name="Quarantined").click()
+        assert cells(page, 1) == [] and "no variation passes" in page.locator("#variation-more").inner_text()
+        page.get_by_role("button", name="Quarantined").click()
+
+        page.locator("#variation-table tbody tr").focus()
+        page.keyboard.press("Enter")
+        dialog = page.get_by_role("dialog", name="Variation 1/1")
+        dialog.get_by_text("uniform: p 0.25").wait_for()
+        copy = dialog.get_by_role("button", name="Copy: icrl-dist explain runs/a-run adapt/0/1/1/1")
+        assert copy.is_visible() and dialog.get_by_role("cell", name="abababababab").count() == 2
+        expected = "1/1: Dark Room, 3 by 3: goal reached after 2 steps, 1 of 2 actions overridden; return 5"
+        dialog.get_by_role("img", name=expected).wait_for()
+        page.keyboard.press("Escape")
+        dialog.wait_for(state="hidden")
+        assert page.evaluate("document.activeElement.textContent").startswith("1/1")
+
+        page.get_by_role("img", name="Exact posterior: most likely cell 1, 1 with 1; goal at 1, 1").wait_for()
+        page.get_by_text("total variation 0.89").wait_for()
+        tile = page.locator("#episodes canvas")
+        assert tile.get_attribute("aria-label") == expected
+        theme = page.get_by_role("button", name="Theme: system")
+        theme.click()
+        assert page.evaluate("document.documentElement.dataset.theme") == "light"
+
+
+def test_hostile_messages_are_text_or_nothing(page):
+    name = MARKUP.replace("/", "").replace("*", "")
+    with plane(name) as run, showing(run.feed, "127.0.0.1", 0) as url:
+        run.progress(doing=[MARKUP], drops={MARKUP: 1})
+        counts = dict.fromkeys(("episodes", "steps", "resent", "trajectories", "pid"), 1)
+        said = {"job": MARKUP, "doing": MARKUP, "memory_mb": 1.0, "peak_mb": 1.0}
+        run.say("worker", **{**counts, **said, "worker": MARKUP})
+        run.returned("0/0", 0, 1.0, kind=MARKUP, problem=MARKUP, worker=MARKUP, digest=MARKUP)
+        run.say("event", what=MARKUP, text=MARKUP)
+        run.say("event", what="alert", alert=MARKUP, active=True, text=MARKUP)
+        phases = [["adapt", 0, 10]]
+        about = {
+            "method": MARKUP,
+            "problem": MARKUP,
+            "phases": phases,
+            "rounds": 1,
+            "tasks": 1,
+            "variations": 1,
+            "began": 1e308,
+        }
+        run.say("run", **about)
+        run.put(b"\xff" * 100)
+        run.put(msgpack.packb({"v": 1, "kind": "event", "text": "x" * (2 << 20)}))
+        run.put(msgpack.packb({"v": 1, "kind": "trajectory", "episode_return": float("nan")}))
+        run.put(wire.encode_message("event", time=1.0, what="x", text="x"), run="another")
+        page.goto(url)
+        page.locator("#worker-table").get_by_text(MARKUP).first.wait_for()
+        assert page.locator("#name").inner_text() == name
+        assert page.locator("img").count() == 0
+        for where in ("#events", "#alerts", "#drops", "#variation-table", "#adversary-filter"):
+            assert MARKUP[:32] in page.locator(where).text_content(), where
+        page.locator("#variation-table tbody tr").click()
+        page.locator("#detail-lineage").get_by_text(MARKUP).first.wait_for()
+        page.keyboard.press("Escape")
+        until(page, "document.querySelector('#ignored').textContent.includes('another run 1')")
+        run.say("event", what="version", text="it still goes on", version=1)  # after all that
+        page.get_by_text("it still goes on").wait_for()
+
+
+def test_thousands_of_variations_and_a_server_that_comes_back(page):
+    page.forgiven = r"ERR_(CONNECTION_REFUSED|INCOMPLETE_CHUNKED_ENCODING|CONNECTION_RESET|EMPTY_RESPONSE)"
+    with plane() as run:
+        for number in range(5000):
+            run.returned(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
+        run.progress()
+        with showing(run.feed, "127.0.0.1", 0) as url:
+            page.goto(url)
+            until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")
+            words = page.locator("#variation-more").inner_text()
+            assert words == "3,996 more rows not shown; 904 beyond what is kept"
+            assert page.locator("#variation-count").inner_text() == "5,000"
+            page.get_by_role("button", name="Last", exact=True).click()
+            assert cells(page, 4) == ["96"] * 42 + ["95"] * 42 + ["94"] * 16
+            page.get_by_role("button", name="Show more").click()
+            assert page.locator("#variation-table tbody tr").count() == 200
+        until(page, f"!({CLEAR})")
+        run.returned("0/0", 1, 1000.0, problem="unknown")
+        with showing(run.feed, "127.0.0.1", int(url.rstrip("/").rpartition(":")[2])):
+            until(page, CLEAR)
+            until(page, "document.querySelector('#variation-table tbody th').textContent === '0/0'")
+
+
+def test_a_recording_is_steered_by_keyboard(page):
+    run = Run()
+    run.recording = {"begin": 1000.0, "end": 1100.0, "at": 1010.0, "speed": 10.0, "paused": False}
+    run.tick()
+    with showing(run, "127.0.0.1", 0) as url:
+        page.goto(url)
+        pause = page.get_by_role("button", name="Pause", exact=True).first
+        pause.focus()
+        page.keyboard.press("Enter")
+        page.get_by_label("Speed").select_option("50")
+        page.get_by_label("Moment in the recording").press("End")
+        wait_for(lambda: len(run.controlled) == 3, "three commands", 10)
+        assert run.controlled == [{"paused": True}, {"speed": 50}, {"at": 1100}]
+        run.recording = {**run.recording, "paused": True}
+        page.get_by_role("button", name="Play", exact=True).wait_for()
+
+
+@pytest.mark.timeout(300)
+def test_a_real_run_and_a_killed_worker(page, tmp_path):
+    folder = tmp_path / "watched"
+    many = ("--pretrain.steps", "5", "--icaa.rounds", "40", "--icaa.steps", "5")
+    training = start("train", *SMOKE, *many, "--out", folder, start_new_session=True)
+    view = None
+    try:
+        endpoint_of(folder)
+        view = start("monitor", folder, "--web", "0")
+        url = re.search(r"http://\S+", view.stdout.readline())[0]
+        page.set_default_timeout(120_000)
+        page.patience = 120
+        page.goto(url)
+        until(page, "document.querySelectorAll('#worker-table tbody tr[data-state=working]').length === 2")
+        until(page, "document.querySelector('#variation-count').textContent === '14'")
+        assert page.locator("#variation-table tbody tr").count() == 14  # 7 tasks, 2 variations
+
+        grown = "Number(document.querySelector('#variation-table tbody tr:nth-child(2) > :last-child').textContent)"
+        until(page, f"{grown} > 0")
+        before = page.evaluate(grown)
+        until(page, f"{grown} !== {before}")
+        assert "mean of 14 variations" in page.locator("#adaptation-summary").inner_text()
+        assert page.locator("#adaptation canvas").count() == 1
+
+        victim = workers_of(training)[0]
+        os.kill(victim.pid, signal.SIGKILL)
+        killed = time.monotonic()
+        troubled = "#worker-table tbody tr.troubled"
+        row = page.wait_for_selector(troubled, timeout=3000)
+        print(f"red after {time.monotonic() - killed:.2f} s")
+        name, state = row.query_selector("th").inner_text(), row.query_selector(".badge").inner_text()
+        assert state in ("gone", "silent") and name in ("w0", "w1")
+        colours = "e => [getComputedStyle(e.querySelector('.badge')).color, getComputedStyle(document.body).color]"
+        assert len(set(row.evaluate(colours))) == 2
+        page.wait_for_selector(troubled, state="detached")
+        print(f"back after {time.monotonic() - killed:.2f} s")
+        until(page, "document.querySelectorAll('#worker-table tbody tr').length === 2")
+    finally:
+        if view is not None:
+            view.send_signal(signal.SIGINT)
+            assert finish(view) is not None and view.returncode == 0
+        end(training)
+
+
+def end(process):
+    """SIGKILL to a run and all that it started: what it would still compute is of no interest."""
+    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    for member in family:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            member.kill()
+    finish(process)
+    psutil.wait_procs(family, timeout=15)
