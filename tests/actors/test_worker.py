@@ -217,15 +217,10 @@ def test_the_policy_does_not_wait_for_ever(hub, small_run):
 
 
 def test_shown_episodes_are_few_and_every_variation_has_its_turn():
-    samples = Samples(per_s=4.0, burst=8, again_s=3.0)
-    shown = []
-    for trial in range(40):  # 30 variations end an episode together, four times a second
+    samples, shown = Samples(per_s=4.0, burst=8, again_s=2.0), []
+    for trial in range(60):  # 30 variations end an episode together, four times a second
         now = 0.25 * trial
-        for variation in range(30):
-            if samples.take(Identity("adapt", 0, 0, variation, trial), now):
-                shown.append((now, variation))
-    assert len(shown) <= 8 + 4 * 10
-    assert {variation for _, variation in shown} == set(range(30))
-    for variation in range(30):
-        times = [now for now, other in shown if other == variation]
-        assert all(after - before >= 3.0 for before, after in zip(times, times[1:], strict=False))
+        shown += [v for v in range(30) if samples.take(Identity("adapt", 0, 0, v, trial), now)]
+    assert len(shown) <= 8 + 4 * 15
+    assert sorted(shown[:30]) == list(range(30))
+    assert len(shown) > 38, "and then the next turn"
