@@ -163,22 +163,27 @@ class Worker:
 class Samples:
     """Which episodes are shown whole: some a second, of every variation in turn."""
 
-    def __init__(self, per_s: float = 4.0, burst: int = 8, again_s: float = 3.0) -> None:
-        """At most ``burst`` at once; of one variation not twice within ``again_s`` seconds."""
+    def __init__(self, per_s: float = 4.0, burst: int = 8, again_s: float = 2.0) -> None:
+        """At most ``burst`` at once; a new turn begins once none has waited for its own for ``again_s`` seconds."""
         self._per_s, self._burst, self._again_s = per_s, burst, again_s
         self._left, self._since = float(burst), float("-inf")
-        self._shown: dict[tuple[int, int], float] = {}
+        self._shown: set[tuple[int, int]] = set()
+        self._waited = float("-inf")
 
     def take(self, identity: Identity, now: float) -> bool:
         """Whether this one is shown."""
         self._left = min(self._burst, self._left + (now - self._since) * self._per_s)
         self._since = now
         place = identity.task, identity.variation
-        if self._left < 1 or now - self._shown.get(place, float("-inf")) < self._again_s:
+        if place in self._shown:
+            if now - self._waited < self._again_s:
+                return False
+            self._shown.clear()
+        self._waited = now
+        if self._left < 1:
             return False
         self._left -= 1
-        self._shown = {other: then for other, then in self._shown.items() if now - then < self._again_s}
-        self._shown[place] = now
+        self._shown.add(place)
         return True
 
 

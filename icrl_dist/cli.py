@@ -91,6 +91,9 @@ class Evaluate:
 class Tap:
     """Print one JSON line a trajectory, live, from the monitor plane of a run that is on.
 
+    ``icrl-dist tap --task 3 --adversary dirichlet --every 10`` prints every tenth of those that
+    pass both filters.
+
     Nothing that a tap does can slow the run: what it cannot take in time is dropped.
     """
 
@@ -101,8 +104,17 @@ class Tap:
     certificates: str | None = None
     """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/; the run's own if
     not given."""
+    task: tuple[int, ...] = ()
+    """Only these tasks, by their numbers."""
+    adversary: tuple[str, ...] = ()
+    """Only these adversaries: numbers of variations, or kinds such as ``dirichlet`` or ``null``."""
+    every: int = 1
+    """Of those that pass, only every so manyth."""
+    format: Literal["json", "msgpack"] = "json"
+    """``json``: a line each; ``msgpack``: the messages as they came, one after another, as a
+    msgpack stream."""
     count: int = 0
-    """End after so many lines; 0 goes on until Ctrl-C."""
+    """End after so many messages; 0 goes on until Ctrl-C."""
     timeout: float = 30.0
     """Seconds to wait for the learner."""
 
@@ -138,7 +150,9 @@ class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
     name: tyro.conf.Positional[
-        Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts", "disturbance"]
+        Literal[
+            "env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts", "disturbance", "monitor"
+        ]
     ]
     """``env``: environment steps a second, of simulated problems beside their library's own loop;
     ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
@@ -148,7 +162,8 @@ class Bench:
     ``fuzz``: 100,000 hostile inputs to every reader of bytes; ``incontext``: deployment and
     training of the model, beside DPT's official layout; ``experts``: updates of experts in
     lockstep, beside stable-baselines3; ``disturbance``: the return that an undisturbed expert loses
-    under each default adversary."""
+    under each default adversary; ``monitor``: what it costs a run to be watched, and a view to watch a
+    thousand streams."""
     problem: str | None = None
     """Which environment: one such as ``dmc-cheetah-run`` (env: ``darkroom`` if not given;
     disturbance: every simulated one)."""
@@ -156,7 +171,7 @@ class Bench:
     """How long to measure (env, stream, ingest and soak)."""
     quick: bool = False
     """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
-    little and 3 episodes instead of 10 (disturbance)."""
+    little and 3 episodes instead of 10 (disturbance), 2 pairs of short windows instead of 8 (monitor)."""
     folder: Path = Path("runs")
     """Whose disk to write to (ingest, recovery), where to put the figure (soak, incontext) or an
     input that breaks something (fuzz), where to keep finished trainings (incontext)."""

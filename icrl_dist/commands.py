@@ -157,7 +157,7 @@ def monitor(arguments: Monitor, console: Console) -> int:
         raise ConfigError(f"--speed {arguments.speed:g}: must be above 0")
     what = arguments.what
     with contextlib.ExitStack() as stack:
-        if what is not None and arguments.connect is None and not (what / "endpoint").is_file():
+        if what is not None and not arguments.connect and not (what / "endpoint").is_file():
             feed: LiveFeed | ReplayFeed = stack.enter_context(ReplayFeed(what, arguments.speed))
         else:
             endpoint, certificates = _learner(what, arguments.connect, arguments.certificates)
@@ -176,26 +176,17 @@ def monitor(arguments: Monitor, console: Console) -> int:
 
 def tap(arguments: Tap, console: Console) -> int:
     """``icrl-dist tap``: a JSON line a trajectory."""
-    from icrl_dist.stream import security, wire
+    from icrl_dist.monitor.tap import Tapped
+    from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
     endpoint, certificates = _learner(arguments.what, arguments.connect, arguments.certificates)
-    left = [arguments.count]
     over = threading.Event()
-
-    def show(key: str, payload: bytes) -> None:
-        with contextlib.suppress(wire.WireError):
-            _, fields = wire.decode_message(payload)
-            if not over.is_set():
-                print(json.dumps(fields), flush=True)
-                left[0] -= 1
-                if left[0] == 0:
-                    over.set()
-
+    tapped = Tapped(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, over.set)
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: over.set())
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
-        link.subscribe("icrl/*/mon/trajectory/**", show)
+        link.subscribe("icrl/*/mon/trajectory/**", tapped)
         over.wait()
     return OK
 
@@ -219,7 +210,7 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import broadcast, disturbance, env, experts, fuzz, incontext, ingest, recovery, soak, stream
+    from icrl_dist.bench import broadcast, disturbance, env, experts, fuzz, incontext, ingest, monitor, recovery, soak, stream
 
     if arguments.seconds is not None and arguments.name in (
         "broadcast",
@@ -227,6 +218,7 @@ def bench(arguments: Bench, console: Console) -> int:
         "experts",
         "fuzz",
         "incontext",
+        "monitor",
         "recovery",
     ):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
@@ -261,6 +253,10 @@ def bench(arguments: Bench, console: Console) -> int:
             say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
             result = disturbance.run(arguments.problem, arguments.quick, say)
             text = disturbance.describe(result)
+        case "monitor":
+            with console.status("monitor"):
+                result = monitor.run(arguments.folder, *((2, 2.0) if arguments.quick else ()))
+            text = monitor.describe(result)
     console.print(text, highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))

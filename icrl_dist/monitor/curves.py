@@ -20,12 +20,14 @@ _DRAWN = 48
 """Episodes kept to be drawn."""
 _OPTIMA = 4
 """Optima computed a tick, at most: each takes some milliseconds."""
+_TOLD = 200
+"""Variations told of a tick, at most; the others follow in their turn."""
 
 
 class Curve:
     """One variation: who and where it is, and what was earned in it."""
 
-    __slots__ = ("adversary", "changed", "lineage", "optimum", "phases", "problem", "quarantine", "task")
+    __slots__ = ("adversary", "changed", "dirty", "lineage", "optimum", "phases", "problem", "quarantine", "task")
 
     def __init__(self, message: dict[str, Any]) -> None:
         self.describe(message)
@@ -34,6 +36,7 @@ class Curve:
         self.optimum: float | None = None
         self.quarantine = ""
         self.changed = 0
+        self.dirty = False
 
     def describe(self, message: dict[str, Any]) -> None:
         """What it is in the phase that begins."""
@@ -49,6 +52,7 @@ class Curves:
         self._curves: dict[tuple[int, int], Curve] = {}
         self._left_out: set[tuple[int, int]] = set()
         self._unsolved: deque[Curve] = deque()
+        self._dirty: deque[Curve] = deque()
         self._episodes: OrderedDict[tuple[int, int], dict[str, Any]] = OrderedDict()
         self._next = 1
 
@@ -87,7 +91,12 @@ class Curves:
         if len(returns) > _EPISODES:
             del returns[min(returns)]
         curve.lineage.append(lineage)
-        curve.changed = self._next
+        self._touch(curve)
+
+    def _touch(self, curve: Curve) -> None:
+        if not curve.dirty:
+            curve.dirty = True
+            self._dirty.append(curve)
 
     def quarantined(self, name: str, cause: str) -> None:
         """The run goes on without ``STAGE/ROUND/TASK/VARIATION``."""
@@ -95,7 +104,8 @@ class Curves:
         if len(parts) == 4 and all(part.isdigit() and len(part) < 10 for part in parts[2:]):
             curve = self._curves.get((int(parts[2]), int(parts[3])))
             if curve is not None:
-                curve.quarantine, curve.changed = cause, self._next
+                curve.quarantine = cause
+                self._touch(curve)
 
     def drawn(self, identity: Identity, message: dict[str, Any]) -> None:
         """An episode to be drawn; of a variation the newest is kept."""
@@ -114,13 +124,16 @@ class Curves:
             self._episodes.popitem(last=False)
 
     def tick(self, seq: int) -> None:
-        """Look up some optima; what changes from now on is newer than ``seq``."""
+        """Look up some optima, and let some of what has changed be told as of ``seq``."""
         self._next = seq + 1
         for _ in range(min(_OPTIMA, len(self._unsolved))):
             curve = self._unsolved.popleft()
             curve.optimum = sketch.optimum(curve.problem, curve.task, curve.adversary)
             if curve.optimum is not None:
-                curve.changed = self._next
+                self._touch(curve)
+        for _ in range(min(_TOLD, len(self._dirty))):
+            curve = self._dirty.popleft()
+            curve.dirty, curve.changed = False, seq
 
     def changed(self, since: int) -> tuple[list[dict[str, Any]], int]:
         """The variations that changed after ``since``, and how many were left out for want of room."""

@@ -45,6 +45,8 @@ class Picture:
             self.epoch = uuid.uuid4().hex[:8]
             self.ignored: Counter[str] = Counter()
             """Messages left out, by reason."""
+            self.heard = 0
+            """Messages, those left out among them."""
             self._seq = 0
             self._run: dict[str, Any] = {"name": "", "state": "waiting", "version": -1, "trajectories": 0}
             self._heard = float("-inf")
@@ -60,6 +62,7 @@ class Picture:
 
     def hear(self, key: str, payload: bytes, now: float) -> None:
         """Take in one message of the monitor plane, whatever it is."""
+        self.heard += 1
         try:
             message = strict.unpack(payload, LARGEST)
             kind = plain.text(message.get("kind"), 32)
@@ -202,6 +205,7 @@ class Picture:
                 "events": [event for event in self._events if event["seq"] > since],
                 "alerts": list(self._alerts.values()),
                 "beliefs": {w: b for w, b in self._beliefs.items() if b["seq"] > since},
+                "heard": self.heard,
                 "ignored": dict(self.ignored),
             }
 

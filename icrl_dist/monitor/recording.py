@@ -39,7 +39,7 @@ class Recording:
         if not (folder / "run.toml").is_file():
             raise ConfigError(f"{folder}: not a run folder (no run.toml); name one, or a run that is on with --connect")
         self._run, self._folder, self._keys = load(str(folder / "run.toml")), folder, Keys(folder.absolute().name)
-        self._rows = list(_read(folder / "metrics.jsonl"))
+        self._rows = sorted(_read(folder / "metrics.jsonl"), key=lambda row: float(row["time"]))
         self._store = Store(folder / "dataset", readonly=True)
         self._ordered = sorted(self._store.ledger, key=lambda row: (row.segment, row.offset))
         if not self._rows or not self._ordered:

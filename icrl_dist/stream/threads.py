@@ -70,7 +70,7 @@ class Mailbox:
         self._handler, self._capacity = handler, capacity
         self._waiting: deque[tuple[object, ...]] = deque()
         self._dispatcher = Dispatcher("subscriber")
-        self._closed = False
+        self._called = self._closed = False
 
     def put(self, *message: object, droppable: bool) -> None:
         """Leave a message, never waiting."""
@@ -78,7 +78,9 @@ class Mailbox:
             self.dropped += 1
             return
         self._waiting.append(message)
-        self._dispatcher.post(self._read)
+        if not self._called:  # else it is being read, or about to be
+            self._called = True
+            self._dispatcher.post(self._read)
 
     def close(self) -> None:
         """Forget what is unread; wait a second at most for the handler to return."""
@@ -86,9 +88,12 @@ class Mailbox:
         self._dispatcher.close()
 
     def _read(self) -> None:
-        message = self._waiting.popleft()
-        if not self._closed:
-            self._handler(*message)
+        self._called = False  # before looking: whoever puts a message in from now on calls again
+        while self._waiting and not self._closed:
+            try:
+                self._handler(*self._waiting.popleft())
+            except Exception:
+                _log.exception("a subscriber's handler failed")
 
 
 def handle(handler: Callable[[Query], None], query: Query) -> None:

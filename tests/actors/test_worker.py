@@ -12,7 +12,7 @@ import icrl_dist
 from actors import worker as worker_module
 from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
-from actors.worker import Worker
+from actors.worker import Samples, Worker
 from icrl_dist import jobs
 from icrl_dist.config import dumps
 from icrl_dist.envs import spec, tasks
@@ -20,7 +20,7 @@ from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
-from icrl_dist.types import Weights
+from icrl_dist.types import Identity, Weights
 
 KEYS = Keys("test")
 
@@ -214,3 +214,13 @@ def test_the_policy_does_not_wait_for_ever(hub, small_run):
     policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
     with pytest.raises(Unanswered, match=r"version 3 did not come within 0.3 s"):
         policy.at(3)
+
+
+def test_shown_episodes_are_few_and_every_variation_has_its_turn():
+    samples, shown = Samples(per_s=4.0, burst=8, again_s=2.0), []
+    for trial in range(60):  # 30 variations end an episode together, four times a second
+        now = 0.25 * trial
+        shown += [v for v in range(30) if samples.take(Identity("adapt", 0, 0, v, trial), now)]
+    assert len(shown) <= 8 + 4 * 15
+    assert sorted(shown[:30]) == list(range(30))
+    assert len(shown) > 38, "and then the next turn"

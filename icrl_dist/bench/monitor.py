@@ -1,0 +1,290 @@
+"""What being watched costs: CPU a trajectory in workers and learner with and without a viewer, and what a viewer takes.
+
+The runs are real, through Ray workers and Zenoh.  Pairs of windows, one without and one with a
+viewer, follow each other in one run, so that what else the machine does meets both.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import psutil
+
+from icrl_dist.bench.training import need_alive, training
+from icrl_dist.processes import is_learner, is_worker
+from icrl_dist.stream import wire
+from icrl_dist.stream.link import Keys
+from icrl_dist.stream.zenoh_link import ZenohLink
+
+BOUND = 0.98
+"""Being watched may cost a trajectory's CPU time this share."""
+STREAMS, PER_S = 1000, 20.0
+PAGE_CORES, TERMINAL_CORES = 0.5, 1.0
+_ROUND = ("--pretrain.contexts", "390", "--pretrain.steps", "20", "--icaa.trials", "400", "--icaa.context-trials", "5")
+_CONTEXTS = ("--method", "dpt", "--pretrain.contexts", "3900000")
+_VIEWER = (sys.executable, "-m", "icrl_dist.bench.viewer")
+
+How = Literal["live", "stopped"]
+
+
+def run(folder: Path = Path("runs"), pairs: int = 8, seconds: float = 5.0) -> dict[str, Any]:
+    """Watch an ICAA round and the making of random contexts, then the crowd.
+
+    ``ratio_live`` and ``ratio_stopped``: CPU seconds a trajectory without a viewer over those with
+    one that looks on, or that was stopped by SIGSTOP; the median of ``pairs`` pairs of windows of
+    ``seconds``, in an ICAA round; ``contexts_...``: the same where a trajectory costs least.
+    ``page_cores``, ``terminal_cores``: CPU seconds a second of the two views, ``STREAMS`` variations
+    ending ``PER_S`` episodes a second each.  ``ok``: within the bounds.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {"pairs": pairs, "window_s": seconds, "load": round(os.getloadavg()[0], 1)}
+    with tempfile.TemporaryDirectory(dir=folder, prefix="monitor-") as scratch:
+        for name, settings in (("", _ROUND), ("contexts_", _CONTEXTS)):
+            result |= _watched(Path(scratch) / (name.strip("_") or "round"), settings, pairs, seconds, name)
+    result |= _crowd(10.0)
+    result["ratio"] = min(result["ratio_live"], result["ratio_stopped"])
+    cheap = result["page_cores"] < PAGE_CORES and result["terminal_cores"] < TERMINAL_CORES
+    return {**result, "ok": result["ratio"] >= BOUND and cheap}
+
+
+def describe(result: dict[str, Any]) -> str:
+    """The result as a few lines."""
+    r = result
+    return (
+        f"CPU a trajectory without a viewer over with one: {r['ratio_live']:.3f} live, {r['ratio_stopped']:.3f} stopped "
+        f"(ICAA, {r['ms']:.2f} ms; at least {BOUND});\n"
+        f"  {r['contexts_ratio_live']:.3f} and {r['contexts_ratio_stopped']:.3f} where it is cheapest "
+        f"(random contexts, {r['contexts_ms']:.2f} ms)\n"
+        f"{STREAMS} streams at {PER_S:g}/s: page {r['page_cores']:.2f} cores (below {PAGE_CORES}), of "
+        f"{r['sent_per_s']:,.0f} messages/s it heard {r['page_heard_per_s']:,.0f}; terminal {r['terminal_cores']:.2f} cores "
+        f"(below {TERMINAL_CORES:g})\n"
+        f"{'within the bounds' if r['ok'] else 'OUT OF BOUNDS'}; load average before: {r['load']}"
+    )
+
+
+def _watched(out: Path, settings: Sequence[str], pairs: int, seconds: float, name: str) -> dict[str, Any]:
+    with training("demo", out, *settings) as process:
+        while not (out / "endpoint").is_file():
+            need_alive(process)
+            time.sleep(0.1)
+        threading.Thread(target=lambda: [None for _ in process.stdout or ()], daemon=True).start()
+        endpoint = (out / "endpoint").read_text().strip()
+        with ZenohLink.connect(endpoint, 60.0) as link, _Viewer(endpoint) as viewer:
+            meter = _Meter(process, link, out.name, "pretrain" if name else "adapt")
+            meter.wait()
+            ratios: dict[How, list[float]] = {"live": [], "stopped": []}
+            costs: list[float] = []
+            for pair in range(pairs):
+                how: How
+                for how in ("live", "stopped"):
+                    alone_first = pair % 2 == 0
+                    costs_of = {}
+                    for watched in (not alone_first, alone_first):
+                        if watched:
+                            with viewer.watching(stopped=how == "stopped"):
+                                costs_of[True] = meter.cost(seconds)
+                        else:
+                            costs_of[False] = meter.cost(seconds)
+                    ratios[how].append(costs_of[False] / costs_of[True])
+                    costs.append(costs_of[False])
+            if viewer.heard == 0:
+                raise RuntimeError("the viewer heard nothing: nothing was compared")
+    told = {f"{name}ratio_{how}": round(statistics.median(values), 4) for how, values in ratios.items()}
+    spread = {f"{name}spread_{how}": [round(min(values), 3), round(max(values), 3)] for how, values in ratios.items()}
+    return {**told, **spread, f"{name}ms": round(1000 * statistics.median(costs), 3)}
+
+
+class _Meter:
+    """CPU seconds a trajectory, in a run's workers and learner, from one of the learner's reports to another."""
+
+    def __init__(self, process: subprocess.Popen[str], link: ZenohLink, name: str, phase: str) -> None:
+        self._process, self._phase = process, phase
+        self._changed = threading.Condition()
+        self._reports = 0
+        self._now = (0.0, 0)
+        self._family: list[psutil.Process] = []
+        link.subscribe(Keys(name).monitor("learner"), self._hear)
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        _, fields = wire.decode_message(payload)
+        if fields["stage"] == "collect" and fields["phase"] == self._phase and fields["step"] > 0:
+            with self._changed:
+                self._reports += 1
+                self._now = self._cpu(), fields["trajectories"]
+                self._changed.notify_all()
+
+    def _cpu(self) -> float:
+        if not self._family:
+            everyone = psutil.Process(self._process.pid).children(recursive=True)
+            self._family = [one for one in everyone if is_learner(one) or is_worker(one)]
+        return sum(sum(one.cpu_times()[:2]) for one in self._family)
+
+    def wait(self) -> tuple[float, int]:
+        """CPU seconds so far and trajectories stored, at the next report."""
+        with self._changed:
+            reports = self._reports
+            while not self._changed.wait_for(lambda: self._reports > reports, 1.0):
+                need_alive(self._process)
+            return self._now
+
+    def cost(self, seconds: float) -> float:
+        """CPU seconds a trajectory over the next so many seconds."""
+        self.wait()  # what has just changed settles
+        cpu, stored = self.wait()
+        time.sleep(seconds)
+        later, more = self.wait()
+        return (later - cpu) / max(1, more - stored)
+
+
+class _Viewer:
+    """A viewer in a process of its own, which looks on by turns."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._process = subprocess.Popen(
+            [*_VIEWER, "view", endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        )
+        self.heard = 0
+
+    def __enter__(self) -> _Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def watching(self, stopped: bool) -> _Watching:
+        return _Watching(self, stopped)
+
+    def say(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
+    def answer(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
+
+class _Watching:
+    def __init__(self, viewer: _Viewer, stopped: bool) -> None:
+        self._viewer, self._stopped = viewer, stopped
+
+    def __enter__(self) -> None:
+        self._viewer.say("on")
+        if self._viewer.answer() != "on":
+            raise RuntimeError("the viewer could not connect")
+        if self._stopped:
+            self._viewer.signal(signal.SIGSTOP)
+
+    def __exit__(self, *_: object) -> None:
+        self._viewer.signal(signal.SIGCONT)
+        self._viewer.say("off")
+        self._viewer.heard += int(self._viewer.answer() or 0)
+
+
+def _crowd(seconds: float) -> dict[str, Any]:
+    """Both views of a crowd of streams, one after the other."""
+    crowd = subprocess.Popen(
+        [*_VIEWER, "crowd", str(STREAMS), str(PER_S)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+    try:
+        assert crowd.stdout is not None
+        endpoint = crowd.stdout.readline().strip()
+        sent = [0]
+
+        def count() -> None:
+            assert crowd.stdout is not None
+            for line in crowd.stdout:
+                sent[0] = int(line)
+
+        threading.Thread(target=count, daemon=True).start()
+        page = _page(endpoint, seconds, sent)
+        return {**page, "terminal_cores": _terminal(endpoint, seconds)}
+    finally:
+        crowd.kill()
+        crowd.wait()
+
+
+def _monitor(endpoint: str, *more: str) -> list[str]:
+    return [sys.executable, "-u", "-m", "icrl_dist.cli", "monitor", "--connect", endpoint, *more]
+
+
+def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
+    process = subprocess.Popen(_monitor(endpoint, "--web", "0"), stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        url = next(word for line in process.stdout for word in line.split() if word.startswith("http://"))
+        with urllib.request.urlopen(url.rstrip("/") + "/events", timeout=30) as events:
+            threading.Thread(target=lambda: [None for _ in events], daemon=True).start()
+            time.sleep(3.0)
+            heard, first, cores = _heard(url), sent[0], _cores(process.pid, seconds)
+            heard, said = _heard(url) - heard, sent[0] - first
+        return {
+            "page_cores": round(cores, 3),
+            "page_heard_per_s": round(heard / seconds, 1),
+            "sent_per_s": round(said / seconds, 1),
+        }
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(20)
+
+
+def _heard(url: str) -> int:
+    with urllib.request.urlopen(url.rstrip("/") + "/events", timeout=30) as events:
+        for line in events:
+            if line.startswith(b"data:"):
+                return int(json.loads(line[5:])["heard"])
+    raise RuntimeError("the page told nothing")
+
+
+def _terminal(endpoint: str, seconds: float) -> float:
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        _monitor(endpoint), stdin=slave, stdout=slave, stderr=slave, env={**os.environ, "TERM": "xterm-256color"}
+    )
+    os.close(slave)
+    ended = threading.Event()
+
+    def drain() -> None:
+        while not ended.is_set():
+            try:
+                os.read(master, 65536)
+            except OSError:
+                return
+
+    threading.Thread(target=drain, daemon=True).start()
+    try:
+        time.sleep(5.0)
+        return round(_cores(process.pid, seconds), 3)
+    finally:
+        process.send_signal(signal.SIGINT)
+        os.write(master, b"q")
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        ended.set()
+
+
+def _cores(pid: int, seconds: float) -> float:
+    one = psutil.Process(pid)
+    before, then = sum(one.cpu_times()[:2]), time.monotonic()
+    time.sleep(seconds)
+    return (sum(one.cpu_times()[:2]) - before) / (time.monotonic() - then)

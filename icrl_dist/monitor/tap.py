@@ -1,0 +1,64 @@
+"""The monitor plane as lines on standard output, for other programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+from icrl_dist.config import ConfigError
+from icrl_dist.stream import wire
+from icrl_dist.types import Identity
+
+
+class Tapped:
+    """Writes the trajectories that pass, until there are enough; a message that is none is left out."""
+
+    def __init__(
+        self,
+        tasks: Sequence[int],
+        adversaries: Sequence[str],
+        every: int,
+        format: Literal["json", "msgpack"],
+        count: int,
+        enough: Callable[[], None],
+    ) -> None:
+        """``adversaries``: numbers of variations, or kinds.  Raises ConfigError for numbers that cannot be."""
+        for name, value, least in (("--every", every, 1), ("--count", count, 0), ("--task", min(tasks, default=0), 0)):
+            if value < least:
+                raise ConfigError(f"{name} {value}: must be at least {least}")
+        self._tasks, self._adversaries = set(tasks), set(adversaries)
+        self._every, self._format, self._left, self._enough = every, format, count, enough
+        self._passed = 0
+        self._over = False
+
+    def __call__(self, key: str, payload: bytes) -> None:
+        """One message of the monitor plane."""
+        try:
+            _, fields = wire.decode_message(payload)
+            wanted = self._passes(fields)
+        except (wire.WireError, ValueError):
+            return
+        if self._over or not wanted:
+            return
+        self._passed += 1
+        if (self._passed - 1) % self._every:
+            return
+        if self._format == "msgpack":
+            sys.stdout.buffer.write(payload)
+        else:
+            sys.stdout.write(json.dumps(fields) + "\n")
+        sys.stdout.flush()
+        self._left -= 1
+        if self._left == 0:
+            self._over = True
+            self._enough()
+
+    def _passes(self, fields: dict[str, Any]) -> bool:
+        """Raises ValueError for a message that names no trajectory."""
+        identity, adversary = Identity.parse(str(fields.get("identity"))), fields.get("adversary")
+        if not isinstance(adversary, dict):
+            raise ValueError("no adversary")
+        names = {str(identity.variation), str(adversary.get("kind"))}
+        return (not self._tasks or identity.task in self._tasks) and (not self._adversaries or bool(names & self._adversaries))

@@ -1,0 +1,65 @@
+"""What a monitor plane carries, for tests of the views."""
+
+import numpy as np
+
+from icrl_dist.stream import wire
+from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
+
+ROOM = Task.of("darkroom", goal=(2, 1), size=4, horizon=9, start=(0, 0))
+PUSHY = Adversary.of("dirichlet", p=0.2, alpha=(1.0, 1.0, 1.0, 1.0, 1.0))
+
+
+def trajectory(identity="adapt/0/3/1/7", earned=2.0, worker="w0", task=ROOM, adversary=PUSHY, **changes):
+    """A trajectory of Dark Room that earned so much."""
+    horizon = 9
+    rewards = np.zeros(horizon, np.float32)
+    rewards[: int(earned)] = 1.0
+    path = np.minimum(np.arange(horizon + 1), 3).astype(np.float32)
+    fields = {
+        "identity": Identity.parse(identity),
+        "variation": Variation(task, adversary),
+        "weights": 0,
+        "digest": "d" * 64,
+        "worker": worker,
+        "actions": np.zeros(horizon, np.int16),
+        "observations": np.stack([path, np.zeros_like(path)], axis=1),
+        "rewards": rewards,
+        "adversary": np.where(np.arange(horizon) == 2, 1, -1).astype(np.int16),
+        "queries": np.zeros((0, 2), np.float32),
+        "labels": np.zeros((0, 5), np.float32),
+        "taken": np.zeros(0, np.int16),
+        "gained": np.zeros(0, np.float32),
+        "origin": "none",
+    }
+    return Trajectory(**(fields | changes))
+
+
+def beat(worker="w0", **changes):
+    """A worker's heartbeat."""
+    counts = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "pid": 7}
+    said = {"job": "adapt/0/3", "doing": "", "memory_mb": 100.0, "peak_mb": 120.0, "time": 0.0}
+    return wire.encode_message("worker", **({"worker": worker} | counts | said | changes))
+
+
+def progress(**changes):
+    """The learner's progress."""
+    where = {"stage": "collect", "phase": "adapt", "round": 0, "step": 10, "steps": 100}
+    said = {"version": 0, "trajectories": 10, "workers": 1, "lag": 0, "drops": {}, "doing": [], "time": 0.0}
+    return wire.encode_message("learner", **(where | said | changes))
+
+
+def about(**changes):
+    """What the run is about."""
+    said = {"method": "icaa", "problem": "darkroom", "rounds": 2, "tasks": 7, "variations": 14, "began": -5.0, "time": 0.0}
+    phases = [["pretrain", 0, 60], ["adapt", 0, 30], ["adapt", 1, 30]]
+    return wire.encode_message("run", **({**said, "phases": phases} | changes))
+
+
+def event(what, text, **changes):
+    """Something that happened."""
+    return wire.encode_message("event", **({"what": what, "text": text, "time": 1.0} | changes))
+
+
+def hear(picture, topic, payload, now=0.0, run="demo"):
+    """Tell a picture."""
+    picture.hear(f"icrl/{run}/mon/{topic}", payload, now)

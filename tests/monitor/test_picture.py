@@ -1,0 +1,279 @@
+"""The picture of a run: what it shows, what it bounds, what it leaves out."""
+
+import json
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from icrl_dist.monitor import curves, staff
+from icrl_dist.monitor.pace import Pace
+from icrl_dist.monitor.picture import Picture
+from icrl_dist.oracle import Hypotheses, optimal_returns
+from icrl_dist.stream import wire
+from tests.monitor.messages import PUSHY, ROOM, about, beat, event, hear, progress, trajectory
+
+
+def watch(picture, *trajectories, now=0.0):
+    for one in trajectories:
+        hear(picture, f"trajectory/{one.worker}", wire.monitor_trajectory(one, now), now)
+        hear(picture, f"episode/{one.worker}", wire.monitor_episode(one, now), now)
+
+
+def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum():
+    picture = Picture()
+    watch(picture, *(trajectory(f"adapt/1/3/1/{trial}", earned=trial) for trial in (0, 2, 1)))
+    picture.tick(1.0)
+    (row,) = picture.snapshot(1.0)["variations"]
+    assert (row["name"], row["problem"]) == ("3/1", "darkroom")
+    assert row["parameters"] == {"goal": [2, 1], "size": 4, "horizon": 9, "start": [0, 0]}
+    assert row["adversary"] == {"kind": "dirichlet", "p": 0.2, "alpha": [1.0] * 5}
+    assert row["phases"] == [{"name": "adapt/1", "trials": [0, 1, 2], "returns": [0.0, 1.0, 2.0]}]
+    assert row["optimum"] == pytest.approx(optimal_returns(Hypotheses.of([trajectory().variation]))[0])
+
+
+def test_from_random_starts_the_optimum_is_the_mean_over_the_cells():
+    picture = Picture()
+    random_start = ROOM.replace(start="random")
+    watch(picture, trajectory(task=random_start))
+    picture.tick(1.0)
+    (row,) = picture.snapshot(1.0)["variations"]
+    hypotheses = Hypotheses.of([trajectory(task=random_start).variation])
+    every = [optimal_returns(hypotheses, (x, y))[0] for x in range(4) for y in range(4)]
+    assert row["optimum"] == pytest.approx(np.mean(every))
+
+
+def test_a_variation_tells_where_it_came_from_and_shows_its_newest_episode():
+    picture = Picture()
+    watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/3/1/1", earned=3.0, worker="w1"), now=5.0)
+    found = picture.variation("3/1")
+    assert [line["identity"] for line in found["lineage"]] == ["adapt/0/3/1/0", "adapt/0/3/1/1"]
+    expected = {"episode_return": 3.0, "weights": 0, "digest": "d" * 64, "worker": "w1", "time": 5.0}
+    assert found["lineage"][-1] == {"identity": "adapt/0/3/1/1", **expected}
+    drawing = found["episode"]["drawing"]
+    assert drawing["path"] == [[min(step, 3), 0] for step in range(10)]
+    assert drawing["overridden"] == [step == 2 for step in range(9)]
+    assert (drawing["kind"], drawing["size"], drawing["goal"]) == ("room", 4, [2, 1])
+    for unknown in ("3/2", "3", "a/b", "", "1/1/1", "-1/1", "9" * 30 + "/1"):
+        assert picture.variation(unknown) is None
+
+
+def test_a_later_snapshot_has_only_what_changed():
+    picture = Picture()
+    watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/4/0/0"))
+    hear(picture, "event", event("note", "one"))
+    picture.tick(1.0)
+    first = picture.snapshot(1.0)
+    watch(picture, trajectory("adapt/0/4/0/1"))
+    hear(picture, "event", event("note", "two"))
+    picture.tick(2.5)
+    second = picture.snapshot(2.5, first["seq"])
+    assert [row["name"] for row in first["variations"]] == ["3/1", "4/0"]
+    assert [row["name"] for row in second["variations"]] == ["4/0"]
+    assert [one["name"] for one in second["episodes"]] == ["4/0"]
+    assert [one["text"] for one in second["events"]] == ["two"]
+    assert len(second["series"]["t"]) == 1
+    picture.tick(2.6)
+    third = picture.snapshot(2.6, second["seq"])
+    assert not (third["variations"] or third["episodes"] or third["events"] or third["series"]["t"])
+
+
+def test_every_change_is_told_of_however_many_there_are(monkeypatch):
+    monkeypatch.setattr(curves, "_TOLD", 3)
+    picture, told, since = Picture(), [], -1
+    picture.tick(0.0)
+    since = picture.snapshot(0.0)["seq"]
+    watch(picture, *(trajectory(f"adapt/0/{task}/0/0") for task in range(8)))
+    for now in range(1, 6):
+        picture.tick(float(now))
+        shown = picture.snapshot(float(now), since)
+        since = shown["seq"]
+        told += [row["name"] for row in shown["variations"]]
+    assert {*told} == {f"{task}/0" for task in range(8)}
+
+
+def test_workers_work_wait_fall_silent_go_and_come_again():
+    picture = Picture()
+    hear(picture, "worker/w0", beat(steps=0, episodes=4, trajectories=3), 0.0)
+    hear(picture, "worker/w1", beat("w1", job=""), 0.0)
+    for second in range(1, 5):
+        hear(picture, "worker/w0", beat(steps=100 * second, episodes=4, trajectories=3), float(second))
+        picture.tick(float(second))
+    busy, idle = picture.snapshot(4.0)["workers"]
+    assert (busy["state"], busy["unstored"], busy["steps_per_s"]) == ("working", 1, pytest.approx(100.0))
+    assert (idle["state"], idle["silent_s"]) == ("silent", 4.0)
+    assert staff.SILENT_S < 3.0
+    hear(picture, "event", event("worker", "worker w0 is gone", worker="w0", alive=False), 4.5)
+    gone = picture.snapshot(4.5)["workers"][0]
+    assert (gone["state"], gone["job"], gone["steps_per_s"]) == ("gone", "", 0.0)
+    hear(picture, "worker/w0", beat(pid=8), 5.0)
+    assert picture.snapshot(5.0)["workers"][0]["state"] == "working"
+    assert picture.snapshot(5.0)["workers"][0]["restarts"] == 1
+    hear(picture, "event", event("finished", "finished with T^2"), 6.0)
+    assert [row["state"] for row in picture.snapshot(6.0)["workers"]] == ["done", "done"]
+
+
+def test_the_run_goes_through_its_states():
+    picture = Picture()
+    assert picture.snapshot(0.0)["run"]["state"] == "waiting"
+    hear(picture, "run", about())
+    hear(picture, "learner", progress(step=10, trajectories=10), 0.0)
+    hear(picture, "learner", progress(step=30, trajectories=30, drops={"busy": 2}), 1.0)
+    run = picture.snapshot(1.0)["run"]
+    assert (run["state"], run["elapsed_s"], run["stage_eta_s"], run["eta_s"]) == ("collecting", 6.0, pytest.approx(3.5), None)
+    assert (run["method"], run["variations"], run["drops"]) == ("icaa", 14, {"busy": 2})
+    assert picture.snapshot(10.0)["run"]["state"] == "silent"
+    hear(picture, "learner", progress(stage="fit", step=5, steps=30, loss=0.5), 11.0)
+    run = picture.snapshot(11.0)["run"]
+    assert (run["state"], run["loss"]) == ("fitting", 0.5)
+    hear(picture, "event", event("version", "T^1 is fitted", version=1), 12.0)
+    hear(picture, "event", event("finished", "finished"), 12.0)
+    run = picture.snapshot(100.0)["run"]
+    assert (run["state"], run["version"]) == ("finished", 1)
+
+
+def test_the_time_left_is_that_of_the_stage_the_fit_and_the_phases_to_come():
+    pace = Pace()
+    pace.phases = [("pretrain", 0, 60), ("adapt", 0, 30), ("adapt", 1, 30)]
+
+    def at(now, **where):
+        run = {"stage": "collect", "phase": "adapt", "round": 0, "steps": 100, "trajectories": 0} | where
+        pace.progress(run, now)
+        return pace.eta_s(run)
+
+    assert at(0.0, phase="pretrain", step=0) is None
+    assert at(1.0, phase="pretrain", step=50) is None, "no fit was seen"
+    assert at(10.0, stage="fit", phase="pretrain", step=0, steps=60) is None
+    assert at(12.0, stage="fit", phase="pretrain", step=20, steps=60) is None, "no round was seen"
+    at(20.0, step=0)
+    # 10 a second: 5 s to collect, 3 s to fit at 10 steps a second; 10 s and 3 s for the last round
+    assert at(25.0, step=50) == pytest.approx(5 + 3 + 10 + 3)
+
+
+def test_rates_are_counted_once_a_second():
+    picture = Picture()
+    hear(picture, "learner", progress(trajectories=10), 0.0)
+    picture.tick(0.0)
+    watch(picture, *(trajectory(f"adapt/0/0/0/{n}") for n in range(6)), now=1.0)
+    hear(picture, "learner", progress(trajectories=14, lag=1), 1.0)
+    for now in (0.5, 1.0, 1.5, 2.0):
+        picture.tick(now)
+    series = picture.snapshot(2.0)["series"]
+    assert (series["t"], series["number"]) == ([1.0, 2.0], [1, 2])
+    assert (series["stored_per_s"], series["episodes_per_s"]) == ([4.0, 0.0], [6.0, 0.0])
+    assert (series["loss"], series["lag"]) == ([None, None], [1, 1])
+
+
+def test_alerts_are_shown_while_they_are_on_and_a_quarantine_for_good():
+    picture = Picture()
+    watch(picture, trajectory("adapt/0/3/1/0"))
+    hear(picture, "event", event("alert", "stuck at zero", alert="zero", active=True))
+    hear(picture, "event", event("quarantine", "it crashes", identity="adapt/0/3/1"))
+    shown = picture.snapshot(1.0)
+    assert shown["alerts"] == [{"name": "zero", "text": "stuck at zero", "since": 1.0}]
+    assert shown["variations"][0]["quarantine"] == "it crashes"
+    hear(picture, "event", event("alert", "over: stuck at zero", alert="zero", active=False))
+    assert picture.snapshot(1.0)["alerts"] == []
+
+
+def test_memory_is_bounded_whatever_comes(monkeypatch):
+    monkeypatch.setattr(curves, "VARIATIONS", 5)
+    monkeypatch.setattr(staff, "_MOST", 3)
+    picture = Picture()
+    for n in range(300):
+        watch(picture, trajectory(f"adapt/0/{n % 9}/0/{n}"))
+        hear(picture, f"worker/w{n}", beat(f"w{n}"))
+        hear(picture, "event", event("note", f"{n}"))
+    for n in range(10):
+        watch(picture, *(trajectory(f"adapt/{n}/0/0/{m}") for m in range(300)))
+    picture.tick(1.0)
+    shown = picture.snapshot(1.0)
+    assert (len(shown["variations"]), shown["variation_count"], shown["variations_left_out"]) == (5, 9, 4)
+    assert len(shown["workers"]) == 3 and len(shown["events"]) == 200 and len(shown["episodes"]) <= 48
+    phases = shown["variations"][0]["phases"]
+    assert [phase["name"] for phase in phases] == ["adapt/7", "adapt/8", "adapt/9"]
+    assert all(len(phase["returns"]) == 256 and phase["trials"][-1] == 299 for phase in phases)
+    assert shown["ignored"] == {"too many variations": 132, "too many workers": 297}
+
+
+def test_one_run_is_shown_and_another_at_the_same_place_left_out():
+    picture = Picture()
+    hear(picture, "learner", progress())
+    hear(picture, "learner", progress(version=9), run="other")
+    shown = picture.snapshot(0.0)
+    assert (shown["run"]["name"], shown["run"]["version"], shown["ignored"]) == ("demo", 0, {"another run": 1})
+
+
+MESSAGES = {
+    "trajectory": wire.monitor_trajectory(trajectory(), 0.0),
+    "episode": wire.monitor_episode(trajectory(), 0.0),
+    "worker": beat(),
+    "learner": progress(),
+    "run": about(),
+    "event": event("worker", "joined", worker="w0", alive=True),
+}
+ODD = [
+    None,
+    -1,
+    2**70,
+    1.5,
+    float("nan"),
+    float("inf"),
+    "",
+    "x" * 5000,
+    "\x1b[31m\n",
+    b"\xff",
+    [],
+    [[]],
+    {},
+    {"a": {"b": 1}},
+    True,
+]
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_no_field_of_any_message_can_break_it(kind):
+    picture = Picture()
+    whole = msgpack.unpackb(MESSAGES[kind])
+    for name in whole:
+        hear(picture, "x", msgpack.packb({k: v for k, v in whole.items() if k != name}))
+        for odd in ODD:
+            try:
+                message = msgpack.packb(whole | {name: odd})
+            except OverflowError:
+                continue
+            hear(picture, "x", message)
+    picture.tick(1.0)
+    text = json.dumps(picture.snapshot(1.0), allow_nan=False)
+    assert "\\u001b" not in text and sum(picture.ignored.values()) > len(ODD)
+    assert picture.heard > sum(picture.ignored.values()), "some were taken in"
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=200), st.text(max_size=20))
+def test_no_bytes_can_break_it(payload, topic):
+    picture = Picture()
+    picture.hear(f"icrl/{topic}/mon/x", payload, 0.0)
+    picture.hear(topic, payload, 0.0)
+    picture.tick(1.0)
+    assert sum(picture.ignored.values()) == picture.heard == 2
+
+
+def test_a_huge_message_is_left_out():
+    picture = Picture()
+    hear(picture, "event", event("note", "x" * (2 << 20)))
+    assert picture.snapshot(0.0)["ignored"] == {"oversized": 1}
+
+
+def test_a_belief_is_kept_a_worker():
+    picture = Picture()
+    law = [1 / 16] * 16
+    said = {"identity": "adapt/0/3/1/7", "worker": "w0", "size": 4, "goal": [2, 1], "implied": law, "exact": law}
+    hear(picture, "belief/w0", wire.encode_message("belief", time=0.0, **said))
+    hear(picture, "belief/w0", wire.encode_message("belief", time=0.0, **said | {"implied": law[:-1]}))
+    shown = picture.snapshot(0.0)
+    assert shown["beliefs"]["w0"]["goal"] == [2, 1] and shown["beliefs"]["w0"]["exact"] == law
+    assert shown["ignored"] == {"schema": 1}
+    assert PUSHY.kind == "dirichlet"

@@ -1,0 +1,139 @@
+"""A run from its folder: the picture at the end is that of the run as it was watched."""
+
+import json
+import time
+
+import pytest
+
+from icrl_dist import launch
+from icrl_dist.config import ConfigError
+from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
+from icrl_dist.monitor.picture import Picture
+from icrl_dist.monitor.recording import Recording
+from icrl_dist.store import Store
+from icrl_dist.stream.memory_link import MemoryLink
+from learner import service
+from tests.monitor.messages import progress
+
+METRICS = service.Metrics
+
+
+@pytest.fixture(scope="module")
+def watched(module_run, tmp_path_factory):
+    """A finished run in its folder, and what was published on its monitor plane."""
+    folder = tmp_path_factory.mktemp("runs") / "watched"
+    heard = []
+    publish = MemoryLink.publish
+
+    def listen(link, key, payload, droppable):
+        if "/mon/" in key:
+            heard.append((key, payload))
+        publish(link, key, payload, droppable)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        patch.setattr(MemoryLink, "publish", listen)
+        launch.prepare(module_run, folder, resume=False, overwrite=False)
+        launch.train_inline(module_run, folder, lambda event: None)
+    return folder, heard
+
+
+def played(folder):
+    picture = Picture()
+    recording = Recording(folder)
+    for now, key, payload in recording.messages():
+        picture.hear(key, payload, now)
+    picture.tick(recording.end)
+    recording.close()
+    return picture, recording
+
+
+def test_it_ends_in_the_picture_that_was_seen_live(watched):
+    folder, heard = watched
+    live = Picture()
+    for key, payload in heard:
+        live.hear(key, payload, 0.0)
+    live.tick(0.0)
+    again, recording = played(folder)
+    assert not live.ignored and not again.ignored
+    seen, shown = live.snapshot(0.0), again.snapshot(recording.end)
+    names = ("name", "phases", "adversary", "parameters")
+    assert [{n: row[n] for n in names} for row in shown["variations"]] == [
+        {n: row[n] for n in names} for row in seen["variations"]
+    ]
+    assert len(shown["variations"]) == shown["run"]["variations"] == seen["run"]["variations"] == 7 * 3
+    for name in ("method", "problem", "rounds", "version", "trajectories", "state", "tasks"):
+        assert shown["run"][name] == seen["run"][name], name
+    assert [e["text"] for e in shown["events"] if e["what"] == "version"] == [
+        e["text"] for e in seen["events"] if e["what"] == "version"
+    ]
+    assert shown["run"]["state"] == "finished" and shown["run"]["version"] == 2
+
+
+def test_its_messages_are_in_order_of_time_and_within_the_run(watched):
+    folder, _ = watched
+    recording = Recording(folder)
+    times = [now for now, _, _ in recording.messages()]
+    assert times == sorted(times) and recording.begin <= times[0] and times[-1] <= recording.end
+    store = Store(folder / "dataset", readonly=True)
+    assert sum("/mon/trajectory/" in key for _, key, _ in recording.messages()) == len(store)
+    store.close()
+    recording.close()
+
+
+def test_it_is_played_at_any_speed_paused_and_wound_back(watched):
+    folder, _ = watched
+
+    def until(condition):
+        deadline = time.monotonic() + 20
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+    with ReplayFeed(folder, speed=1e4) as feed:
+        until(lambda: feed.picture.snapshot(0.0)["run"]["state"] == "finished")
+        where, epoch = feed.replay(), feed.picture.epoch
+        assert where["at"] == where["end"] and feed.now() == where["end"]
+        feed.control(paused=True)
+        feed.control(at=where["begin"])
+        until(lambda: feed.picture.epoch != epoch)
+        until(lambda: feed.picture.snapshot(0.0)["run"]["state"] != "finished")
+        assert feed.replay()["at"] == where["begin"] and feed.replay()["paused"]
+        feed.control(speed=1e9, paused=False)
+        until(lambda: feed.picture.snapshot(0.0)["run"]["state"] == "finished")
+        assert feed.replay()["speed"] == 1e4
+
+
+def test_a_torn_line_and_a_crashed_run_are_played_as_far_as_they_go(watched, tmp_path):
+    folder, _ = watched
+    crashed = tmp_path / "crashed"
+    crashed.mkdir()
+    (crashed / "run.toml").write_text((folder / "run.toml").read_text())
+    (crashed / "dataset").symlink_to(folder / "dataset")
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    (crashed / "metrics.jsonl").write_text("\n".join(lines[:4]) + '\n{"time": 1.5, "sta')
+    picture, recording = played(crashed)
+    shown = picture.snapshot(recording.end)
+    assert shown["run"]["state"] != "finished" and len(shown["variations"]) == 21
+    assert json.dumps(shown)
+
+
+def test_a_folder_with_nothing_to_play_says_so(tmp_path, watched):
+    folder, _ = watched
+    with pytest.raises(ConfigError, match=r"not a run folder \(no run.toml\)"):
+        Recording(tmp_path)
+    (tmp_path / "run.toml").write_text((folder / "run.toml").read_text())
+    with pytest.raises(ConfigError, match="nothing to play"):
+        Recording(tmp_path)
+
+
+def test_a_live_feed_hears_what_is_published(hub):
+    link = hub()
+    with LiveFeed(hub()) as feed:
+        link.publish("icrl/demo/mon/learner", progress(), droppable=True)
+        deadline = time.monotonic() + 10
+        while feed.picture.snapshot(feed.now())["run"]["name"] != "demo":
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        assert feed.replay() is None
+        feed.control(speed=2.0, paused=True, at=0.0)
