@@ -85,3 +85,11 @@ def write(run: Path, record: dict[str, Any]) -> Path:
 def _text(text: str) -> str:
     """What any wire and file can hold: an exception's words may be no valid text."""
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+def predecessor(worker: str) -> str | None:
+    """Whose place it takes: a worker's second life is named ``w0-1``, its third ``w0-2``; None for a first life."""
+    name, _, life = worker.rpartition("-")
+    if not (name and life.isascii() and life.isdigit() and 0 < int(life) < 10**6):
+        return None
+    return name if int(life) == 1 else f"{name}-{int(life) - 1}"

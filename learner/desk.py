@@ -112,6 +112,7 @@ class Desk:
         with self._lock:
             again = self.workers.get(worker) is False
             self.workers[worker] = True
+            self._heard.pop(crashes.predecessor(worker) or "", None)  # nobody waits for that one any more
             self._board.back(worker)
         text = f"worker {worker} {'is back' if again else 'joined'}"
         self._report({"event": "worker", "worker": worker, "alive": True, "text": text})

@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from icrl_dist import crashes
 from icrl_dist.monitor import plain
 from icrl_dist.monitor.plain import Odd
 
@@ -64,6 +65,9 @@ class Staff:
             if len(self._rows) >= _MOST:
                 raise Odd("too many workers")
             row = self._rows[worker] = _Row(now)
+            before = crashes.predecessor(worker)
+            if before is not None and before in self._rows and not self._rows[before].alive:
+                row.restarts = self._rows.pop(before).restarts + 1
         return row
 
     def tick(self, now: float) -> None:

@@ -127,6 +127,16 @@ def test_counters_are_the_newest_of_every_worker_and_never_fall(office, hub):
     assert office.desk.resent == 3
 
 
+def test_nobody_waits_for_a_worker_whose_next_life_has_come(office, worker):
+    link = worker("w0")
+    office.ask("w0")
+    link.close()
+    office.wait("worker", 2)
+    assert "w0" in office.desk.told["silent"]
+    worker("w0-1")
+    assert "w0" not in office.desk.told["silent"]
+
+
 def test_a_worker_that_vanishes_leaves_a_record_of_what_it_did_last(office, worker):
     link = worker("w0")
     office.ask("w0", episodes=7)

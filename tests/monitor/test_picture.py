@@ -115,6 +115,19 @@ def test_workers_work_wait_fall_silent_go_and_come_again():
     assert [row["state"] for row in picture.snapshot(6.0)["workers"]] == ["done", "done"]
 
 
+def test_the_next_life_of_a_worker_takes_its_row():
+    picture = Picture()
+    hear(picture, "worker/w0", beat("w0"), 0.0)
+    hear(picture, "worker/w1", beat("w1"), 0.0)
+    for now, name in ((1.0, "w1"), (2.0, "w1-1")):
+        hear(picture, "event", event("worker", f"worker {name} is gone", worker=name, alive=False), now)
+        hear(picture, "worker/w1", beat(f"w1-{int(now)}", pid=8), now)
+    hear(picture, "worker/host-1", beat("host-1"), 2.0)  # two of a kind, both alive
+    hear(picture, "worker/host-2", beat("host-2"), 2.0)
+    rows = {row["name"]: (row["state"], row["restarts"]) for row in picture.snapshot(2.0)["workers"]}
+    assert rows == {name: ("working", 2 if name == "w1-2" else 0) for name in ("host-1", "host-2", "w0", "w1-2")}
+
+
 def test_the_run_goes_through_its_states():
     picture = Picture()
     assert picture.snapshot(0.0)["run"]["state"] == "waiting"
