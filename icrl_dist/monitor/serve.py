@@ -38,7 +38,7 @@ _QUIET_S = 10.0
 """After so long without an event a viewer is sent a comment, so that a lost one is noticed."""
 _HOME = {"127.0.0.1", "localhost", "::1"}
 _ASSETS = resources.files("icrl_dist.monitor") / "assets"
-_KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "LICENSE": "text/plain"}
+_KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "svg": "image/svg+xml", "LICENSE": "text/plain"}
 _HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
