@@ -87,9 +87,9 @@ function drawRoom() {
     pen.moveTo(points[i - 1][0], points[i - 1][1]);
     pen.lineTo(points[i][0], points[i][1]);
     pen.stroke();
+    pen.globalAlpha = 1;
     mark(pen, points[i], side * 0.09);
   }
-  pen.globalAlpha = 1;
   const [x, y] = middle(room.cell, side);
   pen.fillStyle = colour("--series-1");
   pen.strokeStyle = colour("--surface");
@@ -98,11 +98,13 @@ function drawRoom() {
   pen.arc(x, y, side * 0.3, 0, 2 * Math.PI);
   pen.fill();
   pen.stroke();
+  pen.lineWidth = 2;
+  if (mark(pen, [x, y, points.at(-1)[2]], side * 0.14)) pen.stroke();
 }
 
-/** An overridden step: a triangle for the law, a square for the hand. */
+/** An overridden step: a triangle for the law, a square for the hand; whether it was one. */
 function mark(pen, [x, y, cause], r) {
-  if (cause === "agent") return;
+  if (cause !== "law" && cause !== "hand") return false;
   pen.fillStyle = colour(cause === "law" ? "--series-2" : "--series-4");
   pen.beginPath();
   if (cause === "law") {
@@ -114,6 +116,7 @@ function mark(pen, [x, y, cause], r) {
     pen.rect(x - r, y - r, 2 * r, 2 * r);
   }
   pen.fill();
+  return true;
 }
 
 function showRoom() {
