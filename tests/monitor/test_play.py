@@ -180,14 +180,14 @@ def test_the_same_commands_between_the_same_steps_give_the_same_game():
         agent = load_agent("darkroom", seed=seed)
         g = PlayGame(agent, parse(agent.manifest["run"], "agent"), seed, Clock())
         g.command({"do": "p", "value": 0.3})
-        play(g, 45)
+        play(g, 15)
         g.command({"do": "new"})
-        play(g, 10)
+        play(g, 5)
         return g.path, g.snapshot()
 
     first, again, other = played(1), played(1), played(2)
     assert first == again and first[0] != other[0]
-    assert len(first[0]) == 10 and first[1]["surprise"] is not None
+    assert len(first[0]) == 5 and first[1]["surprise"] is not None
 
 
 def test_all_that_is_shown_is_json_and_stays_small(run):
