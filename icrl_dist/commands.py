@@ -18,7 +18,7 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.types import Identity
 
 if TYPE_CHECKING:
-    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Tap, Train
+    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Play, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -301,6 +301,18 @@ def chaos(arguments: Chaos, console: Console) -> int:
     if given.json:
         print(json.dumps(answer))
     return OK if answer["ok"] else FAILED
+
+
+def play(arguments: Play, console: Console) -> int:
+    """``icrl-dist play``: until Ctrl-C."""
+    from icrl_dist.monitor import player
+
+    if (arguments.what is None) == (arguments.pretrained is None):
+        raise ConfigError("play: name a run folder or a checkpoint file, or --pretrained darkroom")
+    what = arguments.pretrained or arguments.what
+    assert what is not None
+    player.play(what, (arguments.host, arguments.web), arguments.deploy, arguments.seed, arguments.paused, console)
+    return OK
 
 
 def doctor(arguments: Doctor, console: Console) -> int:
