@@ -26,10 +26,11 @@ def lines(known: dict[str, Any], width: int) -> tuple[list[Line], list[Line]]:
     body.append(_field("mean of 5", number(row["mean"], 2) + share))
     if row["quarantine"]:
         body.append([(f" QUARANTINED: {row['quarantine']}", TROUBLE)])
-    for phase in known["phases"]:
-        body += [[], *_phase(phase, known["optimum"], width)]
+    phases = [[[], *_phase(phase, known["optimum"], width)] for phase in reversed(known["phases"])]
     if known["episode"] is not None:
-        body += [[], *_episode(known["episode"])]
+        phases.insert(1, [[], *_episode(known["episode"])])
+    for part in phases:
+        body += part
     return head, [*body, [], *_lineage(known["lineage"], width)]
 
 

@@ -110,7 +110,10 @@ class Lines(Widget):
         base, width = self.rich_style, self.size.width
         if y >= len(self._lines):
             return Strip.blank(width, base)
-        return Strip([Segment(text, base + style) for text, style in self._lines[y]]).adjust_cell_length(width, base)
+        strip = Strip([Segment(text, base + style) for text, style in self._lines[y]])
+        if strip.cell_length > width > 0 and strip.text[width:].strip():
+            strip = Strip([*strip.crop(0, width - 1), Segment("…", base + DIM)])
+        return strip.adjust_cell_length(width, base)
 
 
 class Scroll(Lines, can_focus=True):

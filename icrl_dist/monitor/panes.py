@@ -24,12 +24,14 @@ from icrl_dist.monitor.lines import (
     spread,
 )
 from icrl_dist.monitor.seen import Seen, duration, number
-from icrl_dist.monitor.spark import bar, spark
+from icrl_dist.monitor.spark import bar, plot
 
 _STATES = {"collecting": GOOD, "fitting": GOOD, "finished": GOOD, "waiting": WARNING, "interrupted": WARNING}
 """Any other is trouble."""
 _ALERTS = 4
 """Alerts shown one by one."""
+_TALL = 4
+"""Lines of a sparkline of the rates, at most."""
 _SPAN = 300
 """Points, of a second each, that a sparkline of the rates is of."""
 
@@ -37,10 +39,10 @@ _SPAN = 300
 class Header(Lines):
     """The run, its stage, where a recording is, and the alerts that are on."""
 
-    def fill(self, seen: Seen, replay: dict[str, Any] | None, frozen: float | None) -> None:
-        """Tell what is seen; ``frozen``: since when nothing new is shown (Unix seconds)."""
+    def fill(self, seen: Seen, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
+        """Tell what is seen; ``frozen``: since when nothing new is shown (Unix seconds); ``brief``: rates, too."""
         width = max(20, self.size.width)
-        lines = [_run(seen, width), _stage(seen, width)]
+        lines = [_run(seen, width), _stage(seen, width), *([_brief(seen)] if brief else [])]
         if replay is not None:
             lines.append(_replay(replay, width))
         if frozen is not None:
@@ -90,6 +92,16 @@ def _stage(seen: Seen, width: int) -> Line:
     return [(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (told, PLAIN)]
 
 
+def _brief(seen: Seen) -> Line:
+    newest = {name: next((v for v in reversed(seen.series[name]) if v is not None), None) for name, _, _ in _RATES}
+    short = (("stored/s", "stored_per_s", 0), ("steps/s", "steps_per_s", 0), ("fit/s", "fit_per_s", 1), ("loss", "loss", 3))
+    line: Line = []
+    for told, name, digits in (*short, ("lag", "lag", 0), ("unstored", "unstored", 0)):
+        line += [(f" {told} ", DIM), (number(newest[name], digits) + " ", PLAIN)]
+    dropped = sum((seen.run.get("drops") or {}).values())
+    return [*line, (" dropped ", DIM), (f"{dropped:,}", WARNING if dropped else PLAIN)]
+
+
 def _replay(replay: dict[str, Any], width: int) -> Line:
     at, length = replay["at"] - replay["begin"], replay["end"] - replay["begin"]
     over = at >= length
@@ -115,12 +127,14 @@ _RATES = (
 )
 
 
-def rates(seen: Seen, width: int, focused: bool) -> tuple[list[Line], list[Line]]:
+def rates(seen: Seen, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
     """How fast every stage goes, a sparkline each; then what was dropped and ignored."""
     room = max(8, width - 23)
     head: list[Line] = [[("RATES", title(focused)), (f"  the last {_SPAN // 60} minutes", DIM)]]
     lines: list[Line] = []
     each = -(-_SPAN // room)
+    counted = [*_counted("dropped", seen.run.get("drops") or {}), *_counted("ignored", seen.ignored)]
+    tall = min(_TALL, max(1, (height - 1 - len(counted)) // len(_RATES)))
     for name, told, digits in _RATES:
         series = seen.series[name]
         kept = min(len(series), room * each)
@@ -132,8 +146,10 @@ def rates(seen: Seen, width: int, focused: bool) -> tuple[list[Line], list[Line]
         low = min(known, default=0.0) if name == "loss" else 0.0
         newest = next((value for value in reversed(series) if value is not None), None)
         line: Line = [(cell(told, 12), DIM), (cell(number(newest, digits), 9, right=True) + "  ", BOLD)]
-        lines.append([*line, (spark(buckets, room, low, max([*known, low + 1e-9])), SPARK)])
-    return head, [*lines, *_counted("dropped", seen.run.get("drops") or {}), *_counted("ignored", seen.ignored)]
+        drawn = plot(buckets, room, tall, low, max([*known, low + 1e-9]))
+        lines += [[(" " * 23, PLAIN), (above, SPARK)] for above in drawn[:-1]]
+        lines.append([*line, (drawn[-1], SPARK)])
+    return head, [*lines, *counted]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -154,7 +170,7 @@ def _counted(what: str, counts: dict[str, int]) -> list[Line]:
 _WHAT = {"alert": TROUBLE, "crash": TROUBLE, "failed": TROUBLE, "quarantine": TROUBLE, "version": GOOD, "finished": GOOD}
 
 
-def happened(seen: Seen, width: int, focused: bool) -> tuple[list[Line], list[Line]]:
+def happened(seen: Seen, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
     """What happened, the newest last."""
     head: list[Line] = [[("EVENTS", title(focused)), (f" {len(seen.events)}", BOLD), ("  newest last", DIM)]]
     lines: list[Line] = []

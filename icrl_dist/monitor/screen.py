@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import signal
 import time
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
-from textual import screen
-from textual.app import App, ComposeResult
+from textual.app import App
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.widget import Widget
@@ -16,8 +16,8 @@ from textual.widgets import Input
 
 from icrl_dist.monitor import detail, panes
 from icrl_dist.monitor.feed import Feed
-from icrl_dist.monitor.help import HELP
 from icrl_dist.monitor.lines import DIM, Scroll
+from icrl_dist.monitor.pages import HELP, Detail, Help, Page
 from icrl_dist.monitor.panes import Header, Keys, Tabs
 from icrl_dist.monitor.seen import Seen
 from icrl_dist.monitor.tables import VARIATIONS, WORKERS, Table, worker_row
@@ -30,30 +30,6 @@ _ROOMY = (110, 36)
 """From so many columns and lines on, all panes are shown at once."""
 _PANES = ("variations", "workers", "rates", "events")
 INTERRUPTED = 130
-
-
-class Page(screen.Screen[None]):
-    """Something read from top to bottom, over the view."""
-
-    def compose(self) -> ComposeResult:
-        yield Header("header")
-        yield Scroll("sheet")
-        yield Keys("keys")
-
-    def on_mount(self) -> None:
-        self.query_one(Scroll).focus()
-
-
-class Detail(Page):
-    """One variation."""
-
-    def __init__(self, variation: str) -> None:
-        super().__init__()
-        self.variation = variation
-
-
-class Help(Page):
-    """What the keys do."""
 
 
 class Screen(App[None]):
@@ -105,7 +81,7 @@ class Screen(App[None]):
         self._not_before = 0.0
         self._laid_out = False
 
-    def compose(self) -> ComposeResult:
+    def compose(self) -> Iterator[Widget]:
         yield Header("header")
         yield Tabs("tabs")
         with Horizontal(id="body"):
@@ -130,24 +106,27 @@ class Screen(App[None]):
         self._laid_out = True
         self._arrange()
         self.set_interval(PERIOD_S, self._tick)
-        self._tick()
+        self.look()
 
     # What is shown.
 
     def _tick(self) -> None:
         began = time.monotonic()
-        if began < self._not_before:
-            return
+        if began >= self._not_before:
+            self.look()
+            self._not_before = began + (time.monotonic() - began) * (1 + _SHARE)
+
+    def look(self) -> None:
+        """Bring what is shown up to date, unless it is frozen."""
         if self._frozen is None:
             self._seen.look(self._feed.now())
         self._fill()
-        self._not_before = began + (time.monotonic() - began) * (1 + _SHARE)
 
     def _fill(self) -> None:
         """Everything in sight as it is now."""
         replay = self._feed.replay()
-        self.screen.query_one(Header).fill(self._seen, replay, self._frozen)
-        self.screen.query_one(Keys).fill(self._keys(replay is not None))
+        self.screen.query_one(Header).fill(self._seen, replay, self._frozen, not self._roomy())
+        self.screen.query_one(Keys).fill(self._keys(replay))
         if isinstance(self.screen, Help):
             self.screen.query_one(Scroll).fill([], HELP)
         elif isinstance(self.screen, Detail):
@@ -175,14 +154,14 @@ class Screen(App[None]):
         for name, lines in (("rates", panes.rates), ("events", panes.happened)):
             if (pane := self._pane(name)).display:
                 assert isinstance(pane, Scroll)
-                pane.fill(*lines(seen, pane.size.width or 40, pane.has_focus))
+                pane.fill(*lines(seen, pane.size.width or 40, pane.size.height, pane.has_focus))
         if self.query_one(Tabs).display:
             counts = (len(seen.variations), len(seen.workers), None, len(seen.events))
             names = [name if n is None else f"{name} {n:,}" for name, n in zip(_PANES, counts, strict=True)]
             self.query_one(Tabs).fill(names, self._active)
 
-    def _keys(self, replay: bool) -> list[tuple[str, str]]:
-        hold = ("p", "pause" if replay else "go on" if self._frozen is not None else "freeze")
+    def _keys(self, replay: dict[str, Any] | None) -> list[tuple[str, str]]:
+        hold = ("p", "play" if replay and replay["paused"] else "pause" if replay else "go on" if self._frozen else "freeze")
         played = [("+/-", "speed"), ("←/→", "seek")] if replay else []
         if isinstance(self.screen, Page):
             beside = [("[ ]", "previous, next")] if isinstance(self.screen, Detail) else []
@@ -199,9 +178,12 @@ class Screen(App[None]):
             self._arrange()
             self.call_after_refresh(self._fill)
 
+    def _roomy(self) -> bool:
+        return self.size.width >= _ROOMY[0] and self.size.height >= _ROOMY[1]
+
     def _arrange(self) -> None:
         """All panes where there is room for them, else the one that is chosen."""
-        roomy = self.size.width >= _ROOMY[0] and self.size.height >= _ROOMY[1]
+        roomy = self._roomy()
         base = self.screen_stack[0]
         base.set_class(not roomy, "one")
         base.query_one(Tabs).display = not roomy
@@ -245,8 +227,7 @@ class Screen(App[None]):
             self._feed.control(paused=not replay["paused"])
         else:
             self._frozen = self._feed.now() if self._frozen is None else None
-        self._not_before = 0.0
-        self._tick()
+        self.look()
 
     def _table(self) -> Table | None:
         pane = self._pane(_PANES[self._active])
