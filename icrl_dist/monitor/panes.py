@@ -42,7 +42,7 @@ class Header(Lines):
     def fill(self, seen: Seen, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
         """Tell what is seen; ``frozen``: since when nothing new is shown (Unix seconds); ``brief``: rates, too."""
         width = max(20, self.size.width)
-        lines = [_run(seen, width), _stage(seen, width), *([_brief(seen)] if brief else [])]
+        lines = [_run(seen), _stage(seen, width), *([_brief(seen)] if brief else [])]
         if replay is not None:
             lines.append(_replay(replay, width))
         if frozen is not None:
@@ -55,7 +55,7 @@ class Header(Lines):
         self.show(lines)
 
 
-def _run(seen: Seen, width: int) -> Line:
+def _run(seen: Seen) -> Line:
     run = seen.run
     state = run.get("state", "waiting")
     told = {"waiting": "waiting for the learner", "silent": f"SILENT for {run.get('silent_s') or 0:.0f} s"}.get(state, state)
@@ -71,13 +71,14 @@ def _run(seen: Seen, width: int) -> Line:
     if run.get("version", -1) >= 0:
         left.append((f"  T^{run['version']}", ACCENT))
     left.append((f"  {run.get('trajectories', 0):,} stored", PLAIN))
-    return spread(left, [(f"elapsed {duration(run.get('elapsed_s'))}  left {duration(run.get('eta_s'))} ", DIM)], width)
+    return left
 
 
 def _stage(seen: Seen, width: int) -> Line:
     run = seen.run
     if not run.get("steps"):
         return [(" no stage has begun", DIM)]
+    elapsed = f"elapsed {duration(run.get('elapsed_s'))}, left {duration(run.get('eta_s'))} "
     version = run["version"]
     if run.get("stage") == "fit":
         name = f"fit T^{version + 1}"
@@ -86,10 +87,10 @@ def _stage(seen: Seen, width: int) -> Line:
     else:
         name = f"round {run['round']}: T^{version} rolls out"
     share = run["step"] / run["steps"]
-    left = f"  {duration(run['stage_eta_s'])} left" if run.get("stage_eta_s") else ""
+    left = f", {duration(run['stage_eta_s'])} more" if run.get("stage_eta_s") else ""
     told = f" {share:4.0%}  {run['step']:,} of {run['steps']:,}{left}"
-    done, rest = bar(share, max(5, min(60, width - len(name) - len(told) - 4)))
-    return [(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (told, PLAIN)]
+    done, rest = bar(share, max(5, min(60, width - len(name) - len(told) - len(elapsed) - 4)))
+    return spread([(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (told, PLAIN)], [(elapsed, DIM)], width)
 
 
 def _brief(seen: Seen) -> Line:

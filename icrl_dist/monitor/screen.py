@@ -124,6 +124,8 @@ class Screen(App[None]):
 
     def _fill(self) -> None:
         """Everything in sight as it is now."""
+        if not self.screen.query(Keys):
+            return  # a page that is not composed yet, or is being left
         replay = self._feed.replay()
         self.screen.query_one(Header).fill(self._seen, replay, self._frozen, not self._roomy())
         self.screen.query_one(Keys).fill(self._keys(replay))
@@ -162,12 +164,12 @@ class Screen(App[None]):
 
     def _keys(self, replay: dict[str, Any] | None) -> list[tuple[str, str]]:
         hold = ("p", "play" if replay and replay["paused"] else "pause" if replay else "go on" if self._frozen else "freeze")
-        played = [("+/-", "speed"), ("←/→", "seek")] if replay else []
+        played = [("+-", "speed"), ("←→", "seek")] if replay else []
         if isinstance(self.screen, Page):
             beside = [("[ ]", "previous, next")] if isinstance(self.screen, Detail) else []
             return [("Esc", "back"), ("↑↓", "scroll"), *beside, hold, *played, ("q", "quit")]
         return [
-            ("q", "quit"), hold, ("s/S", "sort"), ("/", "filter"), ("⏎", "open"), ("Tab", "next"), *played, ("?", "help")
+            ("q", "quit"), hold, ("s", "sort"), ("/", "filter"), ("⏎", "open"), ("Tab", "next"), *played, ("?", "help")
         ]  # fmt: skip
 
     def _pane(self, name: str) -> Widget:

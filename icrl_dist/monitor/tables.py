@@ -45,6 +45,10 @@ class Kind:
     """Ways to sort, by name: of each, what is compared; the first is the default."""
     draw: Callable[[Row, str, int], Part]
     """A row's cell in the named column, so many cells wide."""
+    across: Callable[[Row], str]
+    """What to say of a row instead of its figures, if anything."""
+    named: tuple[str, ...]
+    """The columns that are no figures."""
     empty: str
     """What to say as long as there are none."""
 
@@ -156,12 +160,17 @@ class Table(Lines, can_focus=True):
     def _body(self, fitted: list[tuple[Column, int]], width: int, room: int) -> list[Line]:
         if not self._rows:
             return [[("none matches; Esc shows all" if self._total else self._kind.empty, DIM)]]
-        lines = []
+        lines: list[Line] = []
         for index in range(self._top, min(len(self._rows), self._top + room)):
-            line: Line = []
+            row, line, used = self._rows[index], [], 0
+            across = self._kind.across(row)
             for column, wide in fitted:
-                text, style = self._kind.draw(self._rows[index], column.name, wide)
+                if across and column.name not in self._kind.named:
+                    line.append((cell(across, width - used), TROUBLE))
+                    break
+                text, style = self._kind.draw(row, column.name, wide)
                 line.append((cell(text, wide, column.right) + " ", style))
+                used += wide + 1
             if index == self._cursor and self.has_focus:
                 line = [(text, style + CURSOR) for text, style in spread(line, [("", PLAIN)], width)]
             lines.append(line)
@@ -218,17 +227,14 @@ WORKERS = Kind(
         "memory": lambda row: (-row["memory_mb"], row["name"]),
     },
     draw=_draw_worker,
+    across=lambda row: "",
+    named=(),
     empty="none has been heard of yet",
 )
 
 
 def _draw_variation(row: Row, column: str, width: int) -> Part:
-    if row["quarantine"]:
-        if column == "returns":
-            return f"QUARANTINED: {row['quarantine']}", TROUBLE
-        style = TROUBLE
-    else:
-        style = PLAIN
+    style = TROUBLE if row["quarantine"] else PLAIN
     if column == "returns":
         low, high = bounds(row["returns"], row["optimum"])
         return spark(row["returns"], width, low, high), SPARK
@@ -278,5 +284,7 @@ VARIATIONS = Kind(
         "episodes": lambda row: (-row["episodes"], _place(row)),
     },
     draw=_draw_variation,
+    across=lambda row: f"QUARANTINED: {row['quarantine']}" if row["quarantine"] else "",
+    named=("name", "where", "played"),
     empty="none has been heard of yet: a trajectory tells of its variation",
 )

