@@ -34,7 +34,7 @@ class Seen:
         self.variation_count = self.left_out = 0
         self.series: dict[str, deque[float | None]] = {name: deque(maxlen=_POINTS) for name in SERIES}
         self.points = 0
-        """Points that there were of each series, those no longer kept among them."""
+        """The number of the newest point of each series; from 1 on."""
         self.events: deque[Row] = deque(maxlen=_EVENTS)
         """The oldest first."""
         self.time = 0.0
@@ -52,10 +52,13 @@ class Seen:
         self.left_out = shot["variations_left_out"]
         for variation in shot["variations"]:
             self.variations[variation["name"]] = summary(variation)
+        numbers = shot["series"]["number"]
+        new = sum(number > self.points for number in numbers)
         for name in SERIES:
-            self.series[name].extend(shot["series"][name])
-        self.points += len(shot["series"]["number"])
-        self.events.extend(shot["events"])
+            self.series[name].extend(shot["series"][name][len(numbers) - new :])
+        self.points = numbers[-1] if new else self.points
+        known = self.events[-1]["number"] if self.events else 0  # what comes between two ticks is told twice
+        self.events.extend(event for event in shot["events"] if event["number"] > known)
 
 
 def summary(variation: Row) -> Row:
