@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -155,6 +156,8 @@ def monitor(arguments: Monitor, console: Console) -> int:
 
     if arguments.speed <= 0:
         raise ConfigError(f"--speed {arguments.speed:g}: must be above 0")
+    if arguments.web is None and not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
+        raise ConfigError("monitor: no terminal here; --web PORT serves it as a page, `icrl-dist tap` prints a JSON line each")
     what = arguments.what
     with contextlib.ExitStack() as stack:
         if what is not None and not arguments.connect and not (what / "endpoint").is_file():
@@ -168,10 +171,9 @@ def monitor(arguments: Monitor, console: Console) -> int:
             from icrl_dist.monitor.page import serve
 
             return serve(feed, arguments.host, arguments.web, console)
-        from icrl_dist.monitor.screen import Screen
+        from icrl_dist.monitor.screen import watch
 
-        Screen(feed).run()
-    return OK
+        return watch(feed)
 
 
 def tap(arguments: Tap, console: Console) -> int:
