@@ -307,12 +307,12 @@ def chaos(arguments: Chaos, console: Console) -> int:
 
 def play(arguments: Play, console: Console) -> int:
     """``icrl-dist play``: until Ctrl-C."""
+    from icrl_dist.agent import shipped
     from icrl_dist.monitor import player
 
-    if (arguments.what is None) == (arguments.pretrained is None):
+    what = arguments.what if arguments.pretrained is None else shipped(arguments.pretrained)
+    if what is None or (arguments.what and arguments.pretrained):
         raise ConfigError("play: name a run folder or a checkpoint file, or --pretrained darkroom")
-    what = arguments.pretrained or arguments.what
-    assert what is not None
     player.play(what, (arguments.host, arguments.web), arguments.deploy, arguments.seed, arguments.paused, console)
     return OK
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from icrl_dist.agent import InContextAgent, load_agent
-from icrl_dist.config import parse
+from icrl_dist.cli import main
+from icrl_dist.config import dumps, load, parse
 from icrl_dist.envs.darkroom import MOVES, cells
 from icrl_dist.monitor import player
 from icrl_dist.monitor.play import HELD_S, PlayGame
@@ -283,3 +284,28 @@ def test_nothing_moves_while_nobody_looks_on(run):
     over.set()
     thread.join()
     assert g.steps == 0 and g.p == 0.5
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "play: name a run folder or a checkpoint file, or --pretrained darkroom"),
+        (["here", "--pretrained", "darkroom"], "play: name a run folder"),
+        (["--pretrained", "lightroom"], "no agent of that name is shipped; there are darkroom"),
+        (["nowhere"], "nowhere: no such run folder or checkpoint"),
+        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port is 0 (any free one) to 65535"),
+        (["--pretrained", "darkroom", "--host", "nowhere.invalid"], "name an address of this machine"),
+    ],
+)
+def test_what_cannot_be_played_is_said_in_a_line(words, said, capsys):
+    assert main(["play", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_only_a_dark_room_can_be_played(monkeypatch, capsys):
+    agent = Agent()
+    agent.manifest = {"run": dumps(load("dmc-cheetah-run"))}
+    monkeypatch.setattr(player, "load_agent", lambda *_: agent)
+    assert main(["play", "runs/cheetah"]) == 2
+    assert "play runs/cheetah: its agent knows dmc-cheetah-run; only a Dark Room can be played" in capsys.readouterr().err
