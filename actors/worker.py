@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import icrl_dist
+from actors.beliefs import Beliefs
 from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
 from icrl_dist import crashes, jobs
@@ -59,6 +60,7 @@ class Worker:
         run = parse(hello["run"], "the learner's run")
         policy = LivePolicy(self._link, self._keys, tasks.spec(run), run.model, run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
+        beliefs = Beliefs(self._link, self._keys.monitor(f"belief/{self.name}"), self.name, run)
         watchdog = Watchdog(self._folder, self.name)
         with contextlib.closing(watchdog), contextlib.closing(sender), self._heartbeat(sender):
             while not self._stop.is_set():
@@ -69,16 +71,23 @@ class Worker:
                     self._stop.wait(float(fields["seconds"]))
                 else:
                     job = wire.decode_job(fields["job"])
-                    self._do(job, float(fields["deadline_s"]), policy, sender, watchdog, run.stream.lease_s)
+                    self._do(job, float(fields["deadline_s"]), policy, beliefs, sender, watchdog, run.stream.lease_s)
 
     def _do(
-        self, job: Job, deadline_s: float, policy: LivePolicy, sender: CreditSender, watchdog: Watchdog, drain_s: float
+        self,
+        job: Job,
+        deadline_s: float,
+        policy: LivePolicy,
+        beliefs: Beliefs,
+        sender: CreditSender,
+        watchdog: Watchdog,
+        drain_s: float,
     ) -> None:
         """Do a job, each trajectory within ``deadline_s``; waiting for others does not count."""
         self._job = job.label
         made: set[Identity] = set()
         try:
-            work = jobs.do(job, _Waiting(policy, watchdog), self.name, self._tell)
+            work = jobs.do(job, _Waiting(policy, watchdog), self.name, self._tell, beliefs)
             while (trajectory := _next(work, watchdog, deadline_s)) is not None:
                 made.add(trajectory.identity)
                 self._episodes += 1

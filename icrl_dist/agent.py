@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from icrl_dist.config import ConfigError, ContextConfig, Deployment, parse
+from icrl_dist.config import ConfigError, ContextConfig, Deployment, default_deployment, parse
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
 from icrl_dist.models.outcomes import OutcomeModel
@@ -48,7 +48,9 @@ class InContextAgent:
         self.manifest = manifest
         """Where the agent comes from: method, version, digests, seeds, versions of the
         libraries; in Dark Room also ``test_goals`` as ``[x, y]`` pairs, ``size``, ``horizon``."""
-        self._context, self._deploy = context, deploy
+        self.deploy: Deployment = deploy or default_deployment(model.config)
+        """The rule by which the context grows."""
+        self._context = context
         self._rng = np.random.default_rng(seed)
         self.reset_context()
 
@@ -56,7 +58,7 @@ class InContextAgent:
         """Forget everything and begin anew in ``batch`` environments, with the model's weights as they are now."""
         self._surprise = Surprise(self.outcomes, self.model.spec, batch) if self.outcomes else None
         watch = self._surprise.observe if self._surprise else None
-        self._policy = in_context(self.model, batch, self._context, self._deploy, watch)
+        self._policy = in_context(self.model, batch, self._context, self.deploy, watch)
 
     @property
     def surprise(self) -> Float[np.ndarray, " B"]:
@@ -99,6 +101,20 @@ class InContextAgent:
             self._shaped("next_obs", next_obs, np.float32, size),
             bool(ended.all()),
         )
+
+    def law(self, states: ArrayLike, row: int = 0) -> Float[np.ndarray, "Q A"]:
+        """T_theta(. | s, D) over discrete actions at states ``(Q, S)``, given the context of environment ``row``.
+
+        What the agent would do anywhere, were it there: nothing that it does later is changed by asking.
+        Raises ValueError for vectors of actions.
+        """
+        if not self.model.spec.discrete:
+            raise ValueError("law: this agent's actions are vectors; only a law over discrete ones can be listed")
+        return self._policy.law(np.asarray(states, np.float32), row)
+
+    def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
+        """D of ``law``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
+        return self._policy.context(row)
 
     def _shaped(self, name: str, value: ArrayLike, dtype: type, *rest: int) -> np.ndarray:
         array: np.ndarray = np.asarray(value, dtype)

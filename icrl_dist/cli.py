@@ -241,6 +241,30 @@ class Chaos:
 
 
 @dataclass(frozen=True)
+class Play:
+    """Be the adversary of a trained agent in a Dark Room, live in the browser.
+
+    Move the goal, override actions by hand or by a law, and watch it adapt: its returns beside the
+    oracle's, its surprise, and what it believes of the goal beside the exact posterior.
+    """
+
+    what: tyro.conf.Positional[Path | None] = None
+    """A run folder, or a checkpoint file."""
+    pretrained: str | None = None
+    """Instead, the name of an agent that comes with the package: ``darkroom``."""
+    web: int = 8000
+    """Port of the page; 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """Address to listen on.  Whoever reaches another than this machine's own may play."""
+    deploy: Deployment | None = None
+    """As for ``evaluate``."""
+    seed: int = 0
+    """Of the agent's and the adversary's draws."""
+    paused: bool = False
+    """Begin paused, so that the same clicks give the same game."""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each."""
 
@@ -259,6 +283,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "explain": (Explain, commands.explain),
     "export": (Export, commands.export),
     "chaos": (Chaos, commands.chaos),
+    "play": (Play, commands.play),
     "doctor": (Doctor, commands.doctor),
 }
 

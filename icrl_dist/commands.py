@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -18,7 +19,7 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.types import Identity
 
 if TYPE_CHECKING:
-    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Tap, Train
+    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Play, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -155,6 +156,8 @@ def monitor(arguments: Monitor, console: Console) -> int:
 
     if arguments.speed <= 0:
         raise ConfigError(f"--speed {arguments.speed:g}: must be above 0")
+    if arguments.web is None and not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
+        raise ConfigError("monitor: no terminal here; --web PORT serves it as a page, `icrl-dist tap` prints a JSON line each")
     what = arguments.what
     with contextlib.ExitStack() as stack:
         if what is not None and not arguments.connect and not (what / "endpoint").is_file():
@@ -168,10 +171,9 @@ def monitor(arguments: Monitor, console: Console) -> int:
             from icrl_dist.monitor.page import serve
 
             return serve(feed, arguments.host, arguments.web, console)
-        from icrl_dist.monitor.screen import Screen
+        from icrl_dist.monitor.screen import watch
 
-        Screen(feed).run()
-    return OK
+        return watch(feed)
 
 
 def tap(arguments: Tap, console: Console) -> int:
@@ -301,6 +303,18 @@ def chaos(arguments: Chaos, console: Console) -> int:
     if given.json:
         print(json.dumps(answer))
     return OK if answer["ok"] else FAILED
+
+
+def play(arguments: Play, console: Console) -> int:
+    """``icrl-dist play``: until Ctrl-C."""
+    from icrl_dist.agent import shipped
+    from icrl_dist.monitor import player
+
+    what = arguments.what if arguments.pretrained is None else shipped(arguments.pretrained)
+    if what is None or (arguments.what and arguments.pretrained):
+        raise ConfigError("play: name a run folder or a checkpoint file, or --pretrained darkroom")
+    player.play(what, (arguments.host, arguments.web), arguments.deploy, arguments.seed, arguments.paused, console)
+    return OK
 
 
 def doctor(arguments: Doctor, console: Console) -> int:

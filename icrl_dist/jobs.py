@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
@@ -17,7 +17,7 @@ from icrl_dist.experts import Tell, train_expert, unheard
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.heads import sample
 from icrl_dist.oracle import Hypotheses, cell_numbers, heuristic_labels, soft_labels
-from icrl_dist.rollout import Episodes, deploy_online, episode, in_context
+from icrl_dist.rollout import Episodes, InContextPolicy, deploy_online, episode, in_context
 from icrl_dist.types import Identity, Job, Spec, Trajectory, Variation
 
 
@@ -29,8 +29,14 @@ class Policies(Protocol):
         ...
 
 
-def do(job: Job, policies: Policies, worker: str, tell: Tell = unheard) -> Iterator[Trajectory]:
-    """Do the job, yielding each trajectory when its episode ends; ``tell`` hears of what takes long before that.
+Look = Callable[[InContextPolicy, int, Identity, Variation], None]
+"""Shown T_theta after every decision of one of its environments: the policy, the environment's row, identity and variation."""
+
+
+def do(job: Job, policies: Policies, worker: str, tell: Tell = unheard, look: Look | None = None) -> Iterator[Trajectory]:
+    """Do the job, yielding each trajectory when its episode ends.
+
+    ``tell`` hears of what takes long before that; ``look`` sees T_theta at work, and must leave it as it is.
 
     Raises ValueError for a job of an unknown kind.
     """
@@ -39,7 +45,7 @@ def do(job: Job, policies: Policies, worker: str, tell: Tell = unheard) -> Itera
     if job.kind == "train_expert":
         return train_expert(job, worker, tell)
     if job.kind == "adapt":
-        return adapt(job, policies, worker)
+        return adapt(job, policies, worker, look)
     raise ValueError(f"job kind {job.kind!r}: this worker knows random_context, train_expert and adapt")
 
 
@@ -61,7 +67,7 @@ def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
         yield _trajectory(job, identity, ran, row, worker, "", known)
 
 
-def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
+def adapt(job: Job, policies: Policies, worker: str, look: Look | None = None) -> Iterator[Trajectory]:
     """Online rollouts of T^j in each variation, N + 1 trials each (Algorithm 3, line 12).
 
     One T^j acts in all trials: the version that the job names.  Settings: ``context_max``, ``deploy``;
@@ -71,7 +77,13 @@ def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
     model, digest = policies.at(job.weights)
     context = ContextConfig(max=int(_number(job, "context_max")), keep="all")
     env = envs.batch(job.variations)
-    policy = in_context(model, env.batch, context, cast(Deployment, job.setting("deploy")))
+    trial, shown = 0, env.batch - 1
+
+    def watch(*decision: np.ndarray) -> None:
+        if look is not None:
+            look(policy, shown, rows[trial][shown], job.variations[shown])
+
+    policy = in_context(model, env.batch, context, cast(Deployment, job.setting("deploy")), watch if look else None)
     labeller = None if job.setting("labels") == "none" else _Labeller(job)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
@@ -82,6 +94,7 @@ def adapt(job: Job, policies: Policies, worker: str) -> Iterator[Trajectory]:
         known = labeller(row, chance) if labeller else [_nothing(env.spec)] * len(row)
         for b, identity in enumerate(row):
             yield _trajectory(job, identity, ran, b, worker, digest, known[b])
+        trial = min(trial + 1, job.trials - 1)
 
 
 class _Known(NamedTuple):

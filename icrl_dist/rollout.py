@@ -99,6 +99,38 @@ class InContextPolicy:
         """The law over discrete actions."""
         return self._decide(observation).softmax(-1).cpu().numpy()
 
+    def law(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]:
+        """T_theta(. | s, D) at any states s, D being the context of environment ``row`` as the next decision sees it.
+
+        Every state stands alone: what the agent did last (zeta) is not told.  Nothing changes: later
+        actions are as if nobody had asked.
+        """
+        (queries,) = self._tensors(states)
+        arrived = Transitions(*self._tensors(*(column[None] for column in self._stacked(self._arrived(), row))))
+        outputs = self._deployed.peek(row, queries, arrived)
+        return outputs.softmax(-1).cpu().numpy()
+
+    def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
+        """D of ``law``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
+        taken_up = zip(*([c[row].cpu().numpy() for c in episode] for episode in self._episodes), strict=True)
+        columns = [np.concatenate(column) for column in taken_up] or self._stacked([], row)
+        return tuple(np.concatenate(both) for both in zip(columns, self._stacked(self._running(), row), strict=True))
+
+    def _running(self) -> list[tuple[np.ndarray, ...]]:
+        """What of the running episode is in the context."""
+        return []
+
+    def _arrived(self) -> list[tuple[np.ndarray, ...]]:
+        """What of it the decoder has not been told yet."""
+        return []
+
+    def _stacked(self, steps: list[tuple[np.ndarray, ...]], row: int) -> list[np.ndarray]:
+        spec = self.model.spec
+        shapes = ((spec.observation,), () if spec.discrete else (spec.actions,), (spec.observation,), ())
+        kinds = (np.float32, np.int64 if spec.discrete else np.float32, np.float32, np.float32)
+        columns = ([step[i][row] for step in steps] for i in range(len(kinds)))
+        return [np.array(c, kind).reshape(-1, *shape) for c, kind, shape in zip(columns, kinds, shapes, strict=True)]
+
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
         return self._deployed.decide(torch.from_numpy(np.array(observation)).to(self.model.low.device))
 
@@ -179,6 +211,12 @@ class CommittedPolicy(InContextPolicy):
         columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
         states, taken, _, gained = (np.stack(column, axis=1)[:, None] for column in columns)
         return self._deployed.follow(Stretches(*self._tensors(states, taken, gained)), arrived)
+
+    def _running(self) -> list[tuple[np.ndarray, ...]]:
+        return self._pending
+
+    def _arrived(self) -> list[tuple[np.ndarray, ...]]:
+        return self._pending[self._read :]
 
     def _one(self, step: tuple[np.ndarray, ...]) -> Transitions:
         return Transitions(*self._tensors(*(column[:, None] for column in step)))

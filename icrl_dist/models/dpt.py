@@ -168,6 +168,15 @@ class Deployed:
         self.state = self._decoder.query(F.linear(self._model.features(states), *self._embed))
         return F.linear(self.state, *self._head)
 
+    @torch.inference_mode()
+    def peek(self, row: int, states: Float[Tensor, "Q S"], arrived: Transitions) -> Float[Tensor, "Q O"]:
+        """Outputs at any query states given the whole context ``row`` and E transitions (of one context) more.
+
+        The same as ``decide`` for each state, and later decisions are as if nobody had asked.
+        """
+        queries = F.linear(self._model.features(states), *self._embed)
+        return F.linear(self._decoder.peek(row, queries, self._model.tokens(arrived)[0]), *self._head)
+
 
 def weights_of(model: nn.Module) -> dict[str, np.ndarray]:
     """The parameters as numpy arrays by name: copies, little-endian."""

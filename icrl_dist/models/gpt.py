@@ -268,6 +268,25 @@ class Decoder:
             x = layer.finish(x, torch.bmm(torch.bmm(q, keys).softmax(-1), values).view(self._batch, -1))
         return _normed(x, self._norm)
 
+    def peek(self, row: int, x: Float[Tensor, "Q D"], arrived: Float[Tensor, "E D"]) -> Float[Tensor, "Q D"]:
+        """Final states of query tokens, each of which sees the whole of context ``row`` and itself.
+
+        They also see tokens that have ``arrived``, as if these had joined the context.  Nothing of the
+        decoder changes.
+        """
+        new, queries = len(arrived), len(x)
+        x = torch.cat([arrived, x])
+        hidden = ~torch.eye(new + queries, dtype=torch.bool, device=x.device)
+        hidden[:, :new] = ~_causal(new + queries, x.device)[:, :new]
+        for layer, tokens, fresh in zip(self._layers, self._tokens, self._fresh, strict=True):
+            normed = _normed(x, layer.norm_attention)
+            seen = torch.cat([tokens[row, :-1], fresh[row, : self._recent], normed])
+            q = F.linear(normed, *layer.ask).view(len(x), layer.heads, -1)
+            scores = q @ seen.T
+            scores[..., -len(x) :].masked_fill_(hidden[:, None], float("-inf"))
+            x = layer.finish(x, (scores.softmax(-1) @ seen).flatten(1))
+        return _normed(x[new:], self._norm)
+
 
 def _normed(x: Float[Tensor, "*B D"], norm: Linear) -> Float[Tensor, "*B D"]:
     return torch.layer_norm(x, x.shape[-1:], *norm)

@@ -1,1 +1,1 @@
-"""The live view: terminal and browser, reading the monitor plane only."""
+"""The live view: terminal and browser.  Pages are served by ``serve``; ``play`` has a game of its own."""

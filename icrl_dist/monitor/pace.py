@@ -35,8 +35,8 @@ class Pace:
     def progress(self, run: dict[str, Any], now: float) -> None:
         """The learner told how far it is."""
         name, step = (run["stage"], run["phase"], run["round"]), run["step"]
-        if self._stage is None:
-            self._mark = None  # what was stored before anybody looked is no rate
+        if self._stage is None:  # what was stored before anybody watched is no rate
+            self._mark = (now, run["trajectories"], self._episodes)
         if self._stage is None or self._stage[0] != name or step < self._stage[2]:
             self._stage, self._stage_per_s = (name, now, step), None
         _, began, first = self._stage

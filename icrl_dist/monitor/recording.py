@@ -54,7 +54,12 @@ class Recording:
 
     def _times(self) -> list[float]:
         """When each trajectory was stored, in that order."""
-        marks = [(row["trajectories"], row["time"]) for row in self._rows if row["stage"] == "ingest"]
+        marks: list[tuple[int, float]] = []
+        for row in self._rows:
+            if row["stage"] == "ingest":
+                marks.append((row["trajectories"], row["time"]))
+            elif row["stage"] == "version" and marks:  # none is stored during a fit: the next come after it
+                marks.append((marks[-1][0], row["time"]))
         marks = [(0, self._rows[0]["time"] - 1.0), *sorted(marks)] if marks else [(0, self._rows[0]["time"])]
         counts = [count for count, _ in marks]
         times = []

@@ -2,14 +2,310 @@
 
 from __future__ import annotations
 
-from textual.app import App
+import asyncio
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any, ClassVar
 
+from textual.app import App
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical
+from textual.widget import Widget
+from textual.widgets import Input
+
+from icrl_dist.monitor import detail, panes
 from icrl_dist.monitor.feed import Feed
+from icrl_dist.monitor.lines import DIM, Scroll
+from icrl_dist.monitor.pages import HELP, Detail, Help, Page
+from icrl_dist.monitor.panes import Header, Keys, Tabs
+from icrl_dist.monitor.seen import Seen
+from icrl_dist.monitor.tables import VARIATIONS, WORKERS, Table, worker_row
+
+PERIOD_S = 0.25
+"""What is seen is brought up to date this often, and less often where that takes long."""
+_SHARE = 8
+"""It rests so many times as long as it worked."""
+_ROOMY = (110, 36)
+"""From so many columns and lines on, all panes are shown at once."""
+_PANES = ("variations", "workers", "rates", "events")
+INTERRUPTED = 130
 
 
 class Screen(App[None]):
     """One run, live or played again."""
 
+    ENABLE_COMMAND_PALETTE = False
+    TITLE = "icrl-dist monitor"
+    CSS = """
+    Screen { background: #11151c; color: #d6dbe5; }
+    #header { height: 2; background: #1b2230; }
+    #tabs, #keys { height: 1; background: #1b2230; }
+    #typed { height: 1; border: none; padding: 0 1; background: #1b2230; display: none; }
+    #sheet, #body { height: 1fr; }
+    #left { width: 7fr; }
+    #right { width: 4fr; margin-left: 2; }
+    #variations { height: 3fr; }
+    #workers { height: 1fr; min-height: 6; margin-top: 1; }
+    #rates { height: 11; }
+    #events { height: 1fr; margin-top: 1; }
+    .one #left, .one #right { width: 1fr; margin: 0; }
+    .one .pane { height: 1fr; margin: 0; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("ctrl+c", "interrupt", priority=True),
+        Binding("tab", "pane(1)", priority=True),
+        Binding("shift+tab", "pane(-1)", priority=True),
+        *(Binding(str(i + 1), f"show({i})") for i in range(len(_PANES))),
+        Binding("q", "quit"),
+        Binding("p,space", "hold"),
+        Binding("s", "sort"),
+        Binding("S", "reverse"),
+        Binding("slash", "filter"),
+        Binding("escape", "clear", priority=True),
+        Binding("question_mark", "help"),
+        Binding("plus,equals_sign", "speed(2.0)"),
+        Binding("minus", "speed(0.5)"),
+        Binding("left", "seek(-1)"),
+        Binding("right", "seek(1)"),
+        Binding("left_square_bracket", "beside(-1)"),
+        Binding("right_square_bracket", "beside(1)"),
+    ]
+
     def __init__(self, feed: Feed) -> None:
         super().__init__()
         self._feed = feed
+        self._seen = Seen(feed.picture)
+        self._frozen: float | None = None
+        self._active = 0
+        self._not_before = 0.0
+        self._laid_out = False
+
+    def compose(self) -> Iterator[Widget]:
+        yield Header("header")
+        yield Tabs("tabs")
+        with Horizontal(id="body"):
+            with Vertical(id="left"):
+                yield Table("variations", VARIATIONS)
+                yield Table("workers", WORKERS)
+            with Vertical(id="right"):
+                yield Scroll("rates")
+                yield Scroll("events", follow=True)
+        yield Input(id="typed", placeholder="task 3, task 3/1, dirichlet, quarantined, ...", select_on_focus=False)
+        yield Keys("keys")
+
+    def on_mount(self) -> None:
+        for name in _PANES:
+            self.query_one(f"#{name}").add_class("pane")
+        self.query_one(Input).cursor_blink = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            try:
+                asyncio.get_running_loop().add_signal_handler(number, self.action_interrupt)
+            except (ValueError, RuntimeError):  # not the main thread: signals are not ours
+                break
+        self._laid_out = True
+        self._arrange()
+        self.set_interval(PERIOD_S, self._tick)
+        self.look()
+
+    # What is shown.
+
+    def _tick(self) -> None:
+        began = time.monotonic()
+        if began >= self._not_before:
+            self.look()
+            self._not_before = began + (time.monotonic() - began) * (1 + _SHARE)
+
+    def look(self) -> None:
+        """Bring what is shown up to date, unless it is frozen."""
+        if self._frozen is None:
+            self._seen.look(self._feed.now())
+        self._fill()
+
+    def _fill(self) -> None:
+        """Everything in sight as it is now."""
+        if not self.screen.query(Keys):
+            return  # a page that is not composed yet, or is being left
+        replay = self._feed.replay()
+        self.screen.query_one(Header).fill(self._seen, replay, self._frozen, not self._roomy())
+        self.screen.query_one(Keys).fill(self._keys(replay))
+        if isinstance(self.screen, Help):
+            self.screen.query_one(Scroll).fill([], HELP)
+        elif isinstance(self.screen, Detail):
+            self._fill_detail(self.screen)
+        else:
+            self._fill_panes()
+
+    def _fill_detail(self, page: Detail) -> None:
+        known = self._feed.picture.variation(page.variation) if self._frozen is None else None
+        sheet = page.query_one(Scroll)
+        if known is not None:
+            sheet.fill(*detail.lines(known, sheet.size.width or self.size.width))
+        elif self._frozen is None:
+            sheet.fill([], [[(f" {page.variation}: not heard of at this time", DIM)]])
+
+    def _fill_panes(self) -> None:
+        seen = self._seen
+        if (pane := self._pane("variations")).display:
+            assert isinstance(pane, Table)
+            pane.note = f"{seen.left_out:,} more are not kept" if seen.left_out else ""
+            pane.fill(seen.variations.values())
+        if (pane := self._pane("workers")).display:
+            assert isinstance(pane, Table)
+            pane.fill(worker_row(row) for row in seen.workers)
+        for name, lines in (("rates", panes.rates), ("events", panes.happened)):
+            if (pane := self._pane(name)).display:
+                assert isinstance(pane, Scroll)
+                pane.fill(*lines(seen, pane.size.width or 40, pane.size.height, pane.has_focus))
+        if self.query_one(Tabs).display:
+            counts = (len(seen.variations), len(seen.workers), None, len(seen.events))
+            names = [name if n is None else f"{name} {n:,}" for name, n in zip(_PANES, counts, strict=True)]
+            self.query_one(Tabs).fill(names, self._active)
+
+    def _keys(self, replay: dict[str, Any] | None) -> list[tuple[str, str]]:
+        hold = ("p", "play" if replay and replay["paused"] else "pause" if replay else "go on" if self._frozen else "freeze")
+        played = [("+-", "speed"), ("←→", "seek")] if replay else []
+        if isinstance(self.screen, Page):
+            beside = [("[ ]", "previous, next")] if isinstance(self.screen, Detail) else []
+            return [("Esc", "back"), ("↑↓", "scroll"), *beside, hold, *played, ("q", "quit")]
+        return [
+            ("q", "quit"), hold, ("s", "sort"), ("/", "filter"), ("⏎", "open"), ("Tab", "next"), *played, ("?", "help")
+        ]  # fmt: skip
+
+    def _pane(self, name: str) -> Widget:
+        return self.screen_stack[0].query_one(f"#{name}")
+
+    def on_resize(self) -> None:
+        if self._laid_out:
+            self._arrange()
+            self.call_after_refresh(self._fill)
+
+    def _roomy(self) -> bool:
+        return self.size.width >= _ROOMY[0] and self.size.height >= _ROOMY[1]
+
+    def _arrange(self) -> None:
+        """All panes where there is room for them, else the one that is chosen."""
+        roomy = self._roomy()
+        base = self.screen_stack[0]
+        base.set_class(not roomy, "one")
+        base.query_one(Tabs).display = not roomy
+        for i, name in enumerate(_PANES):
+            self._pane(name).display = roomy or i == self._active
+        base.query_one("#left").display = roomy or self._active < 2
+        base.query_one("#right").display = roomy or self._active >= 2
+        self._pane(_PANES[self._active]).focus()
+
+    # What the keys do.
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Some keys are for the tables, some for a page over them, and while one types they are letters."""
+        if action in ("pane", "show", "sort", "reverse", "filter"):
+            return not isinstance(self.screen, Page) and not self._typing()
+        if action in ("speed", "seek"):
+            return self._feed.replay() is not None and not self._typing()
+        if action == "beside":
+            return isinstance(self.screen, Detail)
+        return True
+
+    def _typing(self) -> bool:
+        return isinstance(self.focused, Input)
+
+    def action_interrupt(self) -> None:
+        """Leave, as Ctrl-C does."""
+        self.exit(return_code=INTERRUPTED)
+
+    def action_pane(self, step: int) -> None:
+        self.action_show((self._active + step) % len(_PANES))
+
+    def action_show(self, number: int) -> None:
+        self._active = number
+        self._arrange()
+        self.call_after_refresh(self._fill)
+
+    def action_hold(self) -> None:
+        """Pause a recording; of a run that is on, freeze what is shown of it."""
+        replay = self._feed.replay()
+        if replay is not None:
+            self._feed.control(paused=not replay["paused"])
+        else:
+            self._frozen = self._feed.now() if self._frozen is None else None
+        self.look()
+
+    def _table(self) -> Table | None:
+        pane = self._pane(_PANES[self._active])
+        return pane if isinstance(pane, Table) else None
+
+    def action_sort(self) -> None:
+        if table := self._table():
+            table.sort_next()
+
+    def action_reverse(self) -> None:
+        if table := self._table():
+            table.sort_reverse()
+
+    def action_filter(self) -> None:
+        if table := self._table():
+            typed = self.query_one(Input)
+            typed.display, typed.value = True, table.filter
+            typed.focus()
+
+    def on_input_changed(self, event: Input.Changed) -> None:
+        if (table := self._table()) and self._typing():
+            table.filter = event.value
+            table.again()
+
+    def on_input_submitted(self) -> None:
+        self._typed()
+
+    def _typed(self) -> None:
+        self.query_one(Input).display = False
+        self._pane(_PANES[self._active]).focus()
+
+    def action_clear(self) -> None:
+        """Back from a page; in a table, all rows again."""
+        if isinstance(self.screen, Page):
+            self.pop_screen()
+            self.call_after_refresh(self._fill)
+            return
+        if table := self._table():
+            table.filter = ""
+            table.again()
+        if self._typing():
+            self._typed()
+
+    def action_help(self) -> None:
+        self._open(Help())
+
+    def on_table_opened(self, event: Table.Opened) -> None:
+        if self._active == 0:
+            self._open(Detail(event.row))
+
+    def _open(self, page: Page) -> None:
+        if not isinstance(self.screen, type(page)):
+            self.push_screen(page)
+            self.call_after_refresh(self._fill)
+
+    def action_beside(self, step: int) -> None:
+        if isinstance(self.screen, Detail):
+            table = self._pane("variations")
+            assert isinstance(table, Table)
+            self.screen.variation = table.beside(step) or self.screen.variation
+            self._fill()
+
+    def action_speed(self, factor: float) -> None:
+        if replay := self._feed.replay():
+            self._feed.control(speed=replay["speed"] * factor)
+            self._fill()
+
+    def action_seek(self, direction: int) -> None:
+        """A twentieth of the recording back or on."""
+        if replay := self._feed.replay():
+            self._feed.control(at=replay["at"] + direction * (replay["end"] - replay["begin"]) / 20)
+            self._fill()
+
+
+def watch(feed: Feed) -> int:
+    """Show a run until it is left; returns the exit code."""
+    app: Any = Screen(feed)
+    app.run(mouse=False)
+    return int(app.return_code or 0)

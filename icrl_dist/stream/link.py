@@ -141,6 +141,9 @@ class Link(Protocol):
     def publish(self, key: str, payload: bytes, droppable: bool) -> None:
         """Tell whoever subscribes.  What is droppable is dropped sooner than it makes anyone wait."""
 
+    def watched(self, key: str) -> bool:
+        """Whether somebody subscribes to what is published, droppable, under ``key``, as far as is known here by now."""
+
     def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
         """Hear, on a thread of its own, what is published under ``key_expr`` (``*`` one part, ``**`` any).
 

@@ -84,6 +84,11 @@ class MemoryLink(Link):
                     if matches(expr, key):
                         mailbox.put(key, payload, droppable=droppable)
 
+    def watched(self, key: str) -> bool:
+        with self._hub._lock:
+            self._dispatcher()
+            return any(matches(expr, key) for link in self._hub._links for expr, _ in link._mailboxes)
+
     def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
         with self._hub._lock:
             self._dispatcher()

@@ -16,6 +16,7 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import zenoh
 from zenoh import CongestionControl, ConsolidationMode, Priority
@@ -133,15 +134,12 @@ class ZenohLink(Link):
 
     def publish(self, key: str, payload: bytes, droppable: bool) -> None:
         with self._errors():
-            with self._declaring:
-                publisher = self._publishers.get((key, droppable))
-                if publisher is None:
-                    publisher = self._publishers[key, droppable] = self._session.declare_publisher(
-                        key,
-                        congestion_control=CongestionControl.DROP if droppable else CongestionControl.BLOCK,
-                        priority=Priority.BACKGROUND if droppable else Priority.DATA,
-                    )
-            publisher.put(payload)
+            self._publisher(key, droppable).put(payload)
+
+    def watched(self, key: str) -> bool:
+        with self._errors():
+            status: Any = self._publisher(key, droppable=True).matching_status  # its stub says bool, which is always true
+            return bool(status.matching)
 
     def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
         mailbox = self._mailbox(handler)
@@ -185,6 +183,17 @@ class ZenohLink(Link):
         for mailbox in self._mailboxes:
             mailbox.close()
         self._dispatcher.close()
+
+    def _publisher(self, key: str, droppable: bool) -> zenoh.Publisher:
+        with self._declaring:
+            publisher = self._publishers.get((key, droppable))
+            if publisher is None:
+                publisher = self._publishers[key, droppable] = self._session.declare_publisher(
+                    key,
+                    congestion_control=CongestionControl.DROP if droppable else CongestionControl.BLOCK,
+                    priority=Priority.BACKGROUND if droppable else Priority.DATA,
+                )
+        return publisher
 
     def _querier(self, key: str, timeout_s: float) -> zenoh.Querier:
         querier = self._queriers.get((key, timeout_s))

@@ -9,17 +9,20 @@ import pytest
 import torch
 
 import icrl_dist
+from actors import beliefs
 from actors import worker as worker_module
 from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
 from actors.worker import Samples, Worker
 from icrl_dist import jobs
+from icrl_dist.belief import Room
 from icrl_dist.config import dumps
 from icrl_dist.envs import spec, tasks
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
+from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Identity, Weights
 
 KEYS = Keys("test")
@@ -104,7 +107,7 @@ def test_the_record_names_the_trajectory_that_was_under_way(hub, small_run, monk
     job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
     real = jobs.do
 
-    def breaks_at_the_third(job, policies, worker, tell):
+    def breaks_at_the_third(job, policies, worker, *_):
         work = real(job, policies, worker)
         yield next(work)
         yield next(work)
@@ -148,7 +151,7 @@ def test_every_ask_says_what_was_done_and_heartbeats_go_on_meanwhile(hub, small_
     watching.subscribe(KEYS.heartbeats, hear)
     real = jobs.do
 
-    def stuck_for_three_beats(job, policies, worker, tell):
+    def stuck_for_three_beats(job, policies, worker, *_):
         assert beaten.wait(30)
         return real(job, policies, worker)
 
@@ -173,6 +176,65 @@ def test_a_refused_hello_ends_the_worker_with_the_reason(hub):
 def test_a_worker_gives_up_when_the_learner_stays_away(hub):
     with pytest.raises(Unanswered):
         Worker(hub(), "test", "w0", patience_s=0.3).run()
+
+
+@pytest.fixture
+def committed_run(small_run):
+    more = {"model": {"stretch": 3}, "pretrain": {"stretches": 1}, "optim": {"stretches": 1}}
+    parts = {name: dataclasses.replace(getattr(small_run, name), **numbers) for name, numbers in more.items()}
+    return dataclasses.replace(small_run, **parts)
+
+
+@pytest.mark.parametrize("deploy", ["paper", "committed"])
+def test_whoever_looks_on_sees_beliefs_and_changes_no_byte(committed_run, deploy, monkeypatch):
+    monkeypatch.setattr(beliefs, "PERIOD_S", 0.0)
+    round_0 = METHODS["icaa"].phases(committed_run)[1]
+    job = METHODS["icaa"].ask(committed_run, round_0)[0]
+    settings = {**dict(job.settings), "deploy": deploy, "context_max": 20}
+    job = dataclasses.replace(job, settings=tuple(sorted(settings.items())))
+
+    def work(topic):
+        network = MemoryHub().link
+        learner = Learner(network(), committed_run, [job_message(job), STOP])
+        latest = wire.encode_weights(weights(committed_run, 0))
+        network().serve(KEYS.weights_latest, lambda query: query.reply(latest))
+        heard = []
+        network().subscribe(KEYS.monitor(topic), lambda key, payload: heard.append(wire.decode_message(payload)))
+        read = []
+        real = Room.read
+        with monkeypatch.context() as patched:
+            patched.setattr(Room, "read", lambda *asked: read.append(real(*asked)) or read[-1])
+            Worker(network(), "test", "w0").run()
+        return [wire.trajectory_digest(t) for t in learner.stored], heard, read
+
+    watched, heard, read = work("belief/w0")
+    unwatched, _, unread = work("belief/w1")
+    assert watched == unwatched and len(watched) == len(list(job.identities()))
+    decisions = job.trials * committed_run.darkroom.horizon
+    assert len(read) == decisions and not unread
+    shown = [identity for identity in job.identities() if (identity.task, identity.variation) == job.rows()[-1]]
+    assert [fields["identity"] for _, fields in heard][:: committed_run.darkroom.horizon] == [str(one) for one in shown]
+    kind, fields = heard[-1]
+    variation = job.variation(shown[-1])
+    assert (kind, fields["worker"], fields["size"]) == ("belief", "w0", 3)
+    assert tuple(fields["goal"]) == variation.task.vector("goal")
+    assert sum(fields["implied"]) == pytest.approx(1, abs=1e-4) and sum(fields["exact"]) == pytest.approx(1, abs=1e-4)
+    assert fields["exact"] == pytest.approx(read[-1].exact, abs=1e-5)
+    kept = [fields["transitions"] for _, fields in heard]
+    assert kept[0] == 0 and max(kept) <= 20 + committed_run.darkroom.horizon and fields["time"] > 1e9
+    assert (kept[1] == 1) == (deploy == "committed"), "Algorithm 1 lets an episode in when it has ended"
+
+
+def test_a_belief_that_fails_is_lost_and_the_job_is_not(hub, small_run, monkeypatch, caplog):
+    monkeypatch.setattr(beliefs, "PERIOD_S", 0.0)
+    monkeypatch.setattr(Room, "read", lambda *asked: 1 / 0)
+    job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
+    learner = Learner(hub(), small_run, [job_message(job), STOP])
+    hub().serve(KEYS.weights_latest, lambda query: query.reply(wire.encode_weights(weights(small_run, 0))))
+    hub().subscribe(KEYS.monitor_all, lambda key, payload: None)
+    Worker(hub(), "test", "w0").run()
+    assert len(learner.stored) == len(list(job.identities()))
+    assert "a belief is lost: division by zero" in caplog.text
 
 
 def test_the_policy_waits_for_exactly_the_version_that_is_named(hub, small_run):

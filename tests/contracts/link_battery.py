@@ -181,6 +181,26 @@ class LinkBattery:
         assert sorted(heard) == [(KEYS.monitor("learner"), b"2"), (KEYS.monitor("worker/w0"), b"1")]
         assert exact == [(KEYS.weights, b"3")]
 
+    def test_a_publisher_knows_whether_anybody_listens(self, links: Links) -> None:
+        belief, other = KEYS.monitor("belief/w0"), KEYS.monitor("belief/w1")
+        tap, worker = links.worker(), links.worker()
+        tap.subscribe(KEYS.monitor("trajectory/w0"), lambda key, payload: None)
+        links.settle()
+        assert not worker.watched(belief)
+        links.settle()
+        assert not worker.watched(belief), "what others listen to is not this"
+        tap.subscribe(belief, lambda key, payload: None)
+        eventually(lambda: worker.watched(belief))
+        assert not worker.watched(other)
+        everything = links.worker()
+        everything.subscribe(KEYS.monitor_all, lambda key, payload: None)
+        eventually(lambda: worker.watched(other))
+        everything.close()
+        eventually(lambda: not worker.watched(other))
+        assert worker.watched(belief)
+        tap.close()
+        eventually(lambda: not worker.watched(belief))
+
     def test_reliable_messages_wait_for_a_slow_subscriber(self, links: Links) -> None:
         heard: list[int] = []
         worker = links.worker()
@@ -243,6 +263,7 @@ class LinkBattery:
         for use in (
             lambda: worker.request(KEYS.work, b"", 1.0),
             lambda: worker.publish(KEYS.weights, b"", droppable=True),
+            lambda: worker.watched(KEYS.weights),
             lambda: worker.serve(KEYS.work, held.append),
             lambda: worker.announce(KEYS.alive("w")),
         ):

@@ -196,7 +196,7 @@ def test_a_rerun_that_comes_out_otherwise_is_said(parent, monkeypatch):
 def test_a_variation_that_cannot_be_run_is_left_out_and_listed(parent, tmp_path, monkeypatch):
     run, real, broken = parent[2], jobs.adapt, []
 
-    def failing(job, policies, worker):
+    def failing(job, policies, worker, *_):
         if not broken:
             broken.append(job.variations[4])  # of the first job: the second task's second variation
         for trajectory in real(job, policies, worker):

@@ -47,12 +47,12 @@ def test_limbs_stand_as_the_simulation_has_them(kind):
 def message(problem, task, states, **changes):
     states = np.asarray(states, np.float32)
     arrays = {"observations": strict.from_array(states), "adversary": strict.from_array(np.full(len(states), 0.5, np.float32))}
-    return {"problem": problem, "task": dict(task)} | arrays | changes
+    return {"problem": problem, "task": dict(task), "every": 2} | arrays | changes
 
 
 def test_a_swing_of_force_is_drawn_a_frame():
     drawn = sketch.of(message("dmc-cartpole-balance", {}, np.tile([0, 1, 0, 0, 0], (4, 1))))
-    assert drawn["kind"] == "sticks" and drawn["force"] == [0.5] * 4
+    assert drawn["kind"] == "sticks" and drawn["force"] == [0.5] * 4 and drawn["frame_s"] == pytest.approx(0.02)
     cart, pole = drawn["frames"][0]
     assert pole[0] == pole[2] == 0.0 and abs(pole[3] - pole[1]) == pytest.approx(1.0, abs=1e-3), "upright, a metre long"
     assert cart[1] == cart[3]

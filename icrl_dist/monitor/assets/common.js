@@ -9,7 +9,12 @@ export function onTheme(paint) {
   paint();
 }
 
-const repaint = () => repaints.forEach((paint) => paint());
+const known = new Map(); // colours, until the theme changes
+
+function repaint() {
+  known.clear();
+  repaints.forEach((paint) => paint());
+}
 
 /** The theme button: light, dark, or what the system has. */
 export function themeButton(button) {
@@ -53,9 +58,11 @@ probe.hidden = true;
 
 /** What a custom property such as "--accent" is at present, as rgb(...), for a canvas. */
 export function colour(name) {
+  if (known.has(name)) return known.get(name);
   if (!probe.isConnected) document.body.append(probe);
   probe.style.color = `var(${name})`;
-  return getComputedStyle(probe).color;
+  known.set(name, getComputedStyle(probe).color);
+  return known.get(name);
 }
 
 /** Listen to the server; `handlers` by name of event.  `status` is an element that says how it goes. */

@@ -1,0 +1,282 @@
+"""Be the adversary: a Dark Room in which a person disturbs an agent that acts live.
+
+The person moves the goal and overrides actions, by hand or by a law; the agent is told of
+none of it, and its weights never change.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from icrl_dist.agent import InContextAgent
+from icrl_dist.belief import Belief, Room
+from icrl_dist.config import Run
+from icrl_dist.envs.darkroom import ACTIONS, cells, next_cell
+from icrl_dist.oracle import Hypotheses, optimal_returns
+from icrl_dist.types import NULL, Adversary
+
+EPISODES = 400
+"""Returns that are kept and shown."""
+SPEEDS = (0.5, 100.0)
+"""Slowest and fastest, steps a second."""
+HELD_S = 1.5
+"""A hand that is held lets go by itself after so long, unless it is held anew: its viewer may be gone."""
+_SUPPOSED = (NULL, Adversary.of("uniform", p=0.4))
+"""What the adversary may be in beliefs about the goal; the exact one depends on it in nothing."""
+
+Cause = Literal["agent", "law", "hand"]
+
+
+class Played(NamedTuple):
+    """One finished episode."""
+
+    total: float
+    optimum: float | None
+    """What the oracle earns on average that knows goal and law; None if either changed meanwhile."""
+    overridden: int
+    by_hand: int
+
+
+class PlayGame:
+    """One agent in one room, stepped by whoever asks; every episode starts in the corner, as at test time.
+
+    Not thread-safe.  The same agent, seed and commands between the same steps give the same game.
+    """
+
+    def __init__(self, agent: InContextAgent, run: Run, seed: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+        """``run``: what the agent was trained by.  ``clock``: seconds, for hands that let go."""
+        room, goals = run.darkroom, agent.manifest.get("test_goals") or [[run.darkroom.size - 1] * 2]
+        self.agent, self.size, self.horizon = agent, room.size, room.horizon
+        self.goal, self.p, self.law = int(goals[0][0]) * room.size + int(goals[0][1]), 0.0, _UNIFORM
+        self.speed, self.paused, self.keep = 8.0, False, False
+        self._rng, self._clock = np.random.default_rng(seed), clock
+        self._next, self._cells = next_cell(room.size), cells(room.size)
+        self._beliefs = Room(room.size, room.horizon, _SUPPOSED, room.gamma, room.label_slack)
+        self.context_max = run.context.max
+        self._hand: int | None = None
+        self._held: int | None = None
+        self._held_until = 0.0
+        self._owed = 0
+        self.renew()
+
+    def renew(self) -> None:
+        """A new agent: the same weights, an empty context, a first episode."""
+        self._forget()
+        self.episodes: deque[Played] = deque(maxlen=EPISODES)
+        self.number = 1
+        self._begin()
+
+    def _forget(self) -> None:
+        self.agent.reset_context()
+        self._since = self._unread = 0
+
+    def _begin(self) -> None:
+        self.cell, self.steps, self.total, self._changed = 0, 0, 0.0, False
+        self.path: list[tuple[int, Cause]] = []
+
+    @property
+    def optimum(self) -> float:
+        """Expected return of the policy that knows goal and law: exact, by value iteration."""
+        return _optimum(self.size, self.horizon, self.goal, self.p, self.law)
+
+    @property
+    def wait_s(self) -> float | None:
+        """From one step to the next; None if it is paused."""
+        return 0.0 if self._owed else None if self.paused else 1.0 / self.speed
+
+    def step(self) -> None:
+        """The agent acts, something is executed, the agent is told what came of its own action."""
+        if self.steps == self.horizon:
+            self.number += 1
+            self._begin()
+        self._owed = max(0, self._owed - 1)
+        before = self._cells[self.cell]
+        (action,) = self.agent.act([before])
+        executed, cause = self._executed(int(action))
+        self.cell = int(self._next[self.cell, executed])
+        self.steps += 1
+        reward, done = float(self.cell == self.goal), self.steps == self.horizon
+        self.agent.observe([before], [action], [reward], [self._cells[self.cell]], [done])
+        self.total += reward
+        self._since += 1
+        self._unread = 0 if done or self.agent.deploy == "committed" else self._unread + 1
+        self.path.append((self.cell, cause))
+        if done:
+            causes = [c for _, c in self.path]
+            optimum = None if self._changed else self.optimum
+            self.episodes.append(Played(self.total, optimum, self.horizon - causes.count("agent"), causes.count("hand")))
+
+    def _executed(self, action: int) -> tuple[int, Cause]:
+        chance, drawn = self._rng.random(), int(self._rng.choice(ACTIONS, p=self.law))
+        hand, self._hand = self._hand, None
+        if hand is None and self._clock() < self._held_until:
+            hand = self._held
+        if hand is not None:
+            return hand, "hand"
+        return (drawn, "law") if chance < self.p else (action, "agent")
+
+    def belief(self) -> Belief:
+        """What the agent's laws imply of the goal, beside the exact posterior, which is told when the goal moves.
+
+        The exact one is given what the agent's context holds of the time since then.
+        """
+        return self._beliefs.read(self.agent, last=max(0, self._since - self._unread))
+
+    def command(self, fields: dict[str, Any]) -> None:
+        """Do what a viewer asks for.  Raises ValueError naming what is wrong."""
+        known = {name: kind for name, (kind, _) in COMMANDS.items()}
+        do = fields.get("do")
+        if not isinstance(do, str) or do not in known:
+            raise ValueError(f"do={str(do)[:40]!r}: expected one of {', '.join(known)}")
+        names = {"do", *([] if known[do] is None else ["value"])}
+        if fields.keys() != names:
+            raise ValueError(f"{do}: expected the fields {', '.join(sorted(names))}")
+        check, carry_out = COMMANDS[do]
+        carry_out(self, *([] if check is None else [check(self, fields["value"])]))
+
+    def move_goal(self, cell: int) -> None:
+        """The goal is elsewhere from the next step on.
+
+        That is another task, so the agent begins with an empty context.  With ``keep`` it keeps one that
+        tells of the old goal, and nothing in its training ever moved a goal.
+        """
+        if cell == self.goal:
+            return
+        self.goal, self._since = cell, 0
+        self._changed |= self.steps < self.horizon and self.steps > 0
+        if not self.keep:
+            self._forget()
+
+    def keep_context(self, keep: bool) -> None:
+        self.keep = keep
+
+    def override(self, p: float) -> None:
+        """From now on p of the actions are overridden."""
+        self._changed |= p != self.p and self.steps > 0
+        self.p = p
+
+    def choose_law(self, action: int | None) -> None:
+        """Overrides come from this action alone, or uniformly from all."""
+        law = _UNIFORM if action is None else tuple(float(a == action) for a in range(ACTIONS))
+        self._changed |= law != self.law and self.p > 0 and self.steps > 0
+        self.law = law
+
+    def push(self, action: int) -> None:
+        """The next step executes this action, whatever the agent does."""
+        self._hand = action
+
+    def hold(self, action: int | None) -> None:
+        """As ``push``, and so does every step until None, or for ``HELD_S``."""
+        if action is None:
+            self._held_until = 0.0
+            return
+        if action != self._held or self._clock() >= self._held_until:
+            self._hand = action
+        self._held, self._held_until = action, self._clock() + HELD_S
+
+    def pause(self, paused: bool) -> None:
+        self.paused, self._owed = paused, 0
+
+    def one_step(self) -> None:
+        """Pause, if it runs, and make one step."""
+        self.paused, self._owed = True, min(self._owed + 1, self.horizon)
+
+    def one_episode(self) -> None:
+        """Pause, if it runs, and go to the end of this episode, or of the next if it has ended, as fast as can be."""
+        self.paused, self._owed = True, self.horizon - self.steps % self.horizon
+
+    def change_speed(self, speed: float) -> None:
+        self.speed = speed
+
+    def snapshot(self) -> dict[str, Any]:
+        """The room now, for JSON; cells are numbers, x * size + y."""
+        surprise = float(self.agent.surprise[0]) if self.agent.outcomes else None
+        return {
+            "size": self.size,
+            "horizon": self.horizon,
+            "goal": self.goal,
+            "cell": self.cell,
+            "episode": self.number,
+            "step": self.steps,
+            "total": self.total,
+            "optimum": round(self.optimum, 2),
+            "path": [[0, "start"], *([cell, cause] for cell, cause in self.path)],
+            "p": self.p,
+            "law": None if self.law == _UNIFORM else self.law.index(1.0),
+            "held": self._held if self._clock() < self._held_until else None,
+            "speed": self.speed,
+            "paused": self.paused,
+            "surprise": None if surprise is None or not np.isfinite(surprise) else round(surprise, 3),
+            "keep": self.keep,
+            "context_max": self.context_max,
+            "deploy": self.agent.deploy,
+        }
+
+    def history(self) -> dict[str, Any]:
+        """Every finished episode that is kept, for JSON, in columns; the first one's number."""
+        columns = zip(*self.episodes, strict=True) if self.episodes else ([] for _ in Played._fields)
+        finished = self.number - (self.steps < self.horizon)
+        first = finished - len(self.episodes) + 1
+        return {"first": first, **{name: list(c) for name, c in zip(Played._fields, columns, strict=True)}}
+
+
+_UNIFORM = (1.0 / ACTIONS,) * ACTIONS
+
+
+@functools.lru_cache(maxsize=4096)
+def _optimum(size: int, horizon: int, goal: int, p: float, law: tuple[float, ...]) -> float:
+    h = Hypotheses(size, horizon, np.array([goal]), np.array([p]), np.array([law]))
+    return float(optimal_returns(h)[0])
+
+
+def _cell(game: PlayGame, value: object) -> int:
+    if not (isinstance(value, list) and len(value) == 2 and all(type(c) is int and 0 <= c < game.size for c in value)):
+        raise ValueError(f"goal={str(value)[:40]}: expected [x, y], each 0 to {game.size - 1}")
+    return int(value[0] * game.size + value[1])
+
+
+def _action(game: PlayGame, value: object) -> int:
+    if type(value) is not int or not 0 <= value < ACTIONS:
+        raise ValueError(f"action={str(value)[:40]}: expected 0 to {ACTIONS - 1} (+x, -x, +y, -y, stay)")
+    return value
+
+
+def _maybe(game: PlayGame, value: object) -> int | None:
+    return None if value is None else _action(game, value)
+
+
+def _number(low: float, high: float, what: str) -> Callable[[PlayGame, object], float]:
+    def check(game: PlayGame, value: object) -> float:
+        if type(value) not in (int, float) or not low <= value <= high:  # type: ignore[operator]
+            raise ValueError(f"{what}={str(value)[:40]}: expected a number from {low:g} to {high:g}")
+        return round(float(value), 3)  # type: ignore[arg-type]
+
+    return check
+
+
+def _flag(game: PlayGame, value: object) -> bool:
+    if type(value) is not bool:
+        raise ValueError(f"value={str(value)[:40]}: expected true or false")
+    return value
+
+
+COMMANDS: dict[str, tuple[Callable[[PlayGame, object], Any] | None, Callable[..., None]]] = {
+    "goal": (_cell, PlayGame.move_goal),
+    "p": (_number(0.0, 1.0, "p"), PlayGame.override),
+    "law": (_maybe, PlayGame.choose_law),
+    "push": (_action, PlayGame.push),
+    "hold": (_maybe, PlayGame.hold),
+    "speed": (_number(*SPEEDS, "speed"), PlayGame.change_speed),
+    "pause": (_flag, PlayGame.pause),
+    "keep": (_flag, PlayGame.keep_context),
+    "step": (None, PlayGame.one_step),
+    "episode": (None, PlayGame.one_episode),
+    "new": (None, PlayGame.renew),
+}
+"""What a viewer can ask for: how its value is checked, if it has one, and what is done."""

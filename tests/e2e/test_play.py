@@ -1,0 +1,171 @@
+"""``icrl-dist play`` in a real browser: a person moves the goal and overrides actions, and sees the agent adapt."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+
+CHROMIUM = Path("/usr/bin/chromium")
+QUIET = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
+QUIET += ("--disable-background-networking", "--disable-component-update")
+PATIENT_MS = 60_000
+
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}")
+
+
+@pytest.fixture(scope="module")
+def served():
+    command = [sys.executable, "-m", "icrl_dist.cli", "play", "--pretrained", "darkroom", "--web", "0", "--paused"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    url = process.stdout.readline().partition(": ")[0]
+    yield process, url
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130 and not errors
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=str(CHROMIUM), args=list(QUIET))
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def viewer(browser, url):
+    """A page of the game, none of whose scripts may complain."""
+    page, complaints = browser.new_page(viewport={"width": 1000, "height": 700}), []
+    page.set_default_timeout(PATIENT_MS)
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(url)
+    expect(page, "#status").to_have_text("live")
+    yield page
+    assert not complaints
+    page.close()
+
+
+def expect(page, what):
+    playwright.expect.set_options(timeout=PATIENT_MS)
+    return playwright.expect(page.locator(what))
+
+
+def finish(page, episode):
+    """Go to the end of an episode; its return, the oracle's, and how many steps were overridden."""
+    page.click("#through")
+    expect(page, "#returns tr").to_have_count(episode)
+    cells = page.locator("#returns tr").first.locator("td").all_text_contents()
+    assert cells[0] == str(episode)
+    return [float(text) for text in cells[1:4]]
+
+
+def painted(page, colour):
+    """How many pixels of the room are of one of the style's colours."""
+    script = """(name) => {
+        const probe = document.createElement("span");
+        document.body.append(probe);
+        probe.style.color = `var(${name})`;
+        const wanted = getComputedStyle(probe).color.match(/\\d+/g).map(Number);
+        probe.remove();
+        const room = document.getElementById("room");
+        const data = room.getContext("2d").getImageData(0, 0, room.width, room.height).data;
+        let count = 0;
+        for (let i = 0; i < data.length; i += 4) if (wanted.every((c, k) => Math.abs(c - data[i + k]) < 40)) count++;
+        return count;
+    }"""
+    return page.evaluate(script, colour)
+
+
+def test_a_person_moves_the_goal_and_disturbs_the_agent_which_adapts(served, browser):
+    _, url = served
+    with viewer(browser, url) as page:
+        assert page.get_attribute("#room", "aria-label").startswith("A room of 10 by 10 cells. Agent at (0, 0), goal at (5, 7)")
+        undisturbed = [finish(page, episode) for episode in (1, 2)]
+        assert [oracle for _, oracle, _ in undisturbed] == [89.0, 89.0] and undisturbed[1][0] > 80
+        assert painted(page, "--series-2") == 0
+
+        box = page.locator("#room").bounding_box()
+        page.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 0.75 * box["height"])
+        expect(page, "#room").to_have_attribute("aria-label", contains("goal at (2, 2)"))
+        page.locator("#p").fill("0.5")
+        disturbed = [finish(page, episode) for episode in range(3, 9)]
+        returns, oracles, overridden = zip(*disturbed, strict=True)
+        assert set(oracles) == {45.7}
+        assert all(30 < count < 70 for count in overridden) and painted(page, "--series-2") > 100
+        assert sum(returns[2:]) / 4 > 0.8 * oracles[0], "a fifth below the oracle from the third episode on"
+        expect(page, "#implied").to_have_attribute("aria-label", contains("most likely (2, 2)"))
+        expect(page, "#exact").to_have_attribute("aria-label", contains("most likely (2, 2) with 100 %"))
+        expect(page, "#surprise").to_have_attribute("aria-valuetext", contains("training"))
+        with viewer(browser, url) as other:
+            expect(other, "#returns tr").to_have_count(8)
+            expect(other, "#p-text").to_have_text("0.50")
+            other.click("#new")
+            expect(page, "#returns tr").to_have_count(0)
+
+
+def test_by_keyboard_alone_and_live(served, browser):
+    _, url = served
+    with viewer(browser, url) as page:
+        page.focus("#new")
+        page.keyboard.press("Enter")
+        expect(page, "#step").to_have_text("0 of 100")
+        page.focus("#room")
+        page.keyboard.press("ArrowUp")
+        page.focus("#one")
+        page.keyboard.press("Enter")
+        expect(page, "#step").to_have_text("1 of 100")
+        expect(page, "#overridden").to_have_text("1 (1 you)")
+        assert "Agent at (0, 1)" in page.get_attribute("#room", "aria-label") and painted(page, "--series-4") > 10
+        page.fill("#goal-x", "9")
+        page.fill("#goal-y", "1")
+        page.keyboard.press("Enter")
+        expect(page, "#room").to_have_attribute("aria-label", contains("goal at (9, 1)"))
+        before = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        for _ in range(2):
+            page.click("#theme")
+        assert page.text_content("#theme") == "Theme: dark"
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") != before
+        page.click("#pause")
+        expect(page, "#step").not_to_have_text("1 of 100")
+        page.click("#pause")
+        unlabelled = "button:not([aria-label]):empty, canvas[id]:not([aria-label]):not([aria-hidden])"
+        assert page.locator(unlabelled).count() == 0
+
+
+def test_hostile_commands_are_refused_and_the_game_goes_on(served):
+    _, url = served
+
+    def post(body, **headers):
+        request = urllib.request.Request(f"{url}command", body, {"content-type": "application/json", **headers}, method="POST")
+        try:
+            with urllib.request.urlopen(request, timeout=30) as answer:
+                return answer.status, b""
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.read()
+
+    assert post(b'{"do": "new"}', origin="http://evil.example")[0] == 403
+    assert post(b'{"do": "new"}', host="evil.example")[0] == 403
+    assert post(b'{"do": "new"}', **{"content-type": "text/plain"})[0] == 415
+    assert post(b'{"do": "new"' + b" " * 5000 + b"}")[0] == 413
+    for body in (b"", b"\x00\xff", b'{"do": "p", "value": 1e999}', b'{"do": "goal", "value": [10, 0]}', b'{"do": "__init__"}'):
+        status, answer = post(body)
+        assert status == 400 and len(json.loads(answer)["error"].splitlines()) == 1
+    assert post(b'{"do": "pause", "value": true}', origin=url.rstrip("/"))[0] == 204
+
+
+def contains(text):
+    return re.compile(re.escape(text))
