@@ -254,7 +254,7 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         page.goto(url)
         until(page, "document.querySelectorAll('#worker-table tbody tr[data-state=working]').length === 2")
         until(page, "document.querySelector('#variation-count').textContent === '14'")
-        assert page.locator("#variation-table tbody tr").count() == 14  # 7 tasks, 2 variations
+        until(page, "document.querySelectorAll('#variation-table tbody tr').length === 14")  # 7 tasks, 2 variations
 
         grown = "Number(document.querySelector('#variation-table tbody tr:nth-child(2) > :last-child').textContent)"
         until(page, f"{grown} > 0")
