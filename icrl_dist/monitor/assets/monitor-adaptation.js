@@ -6,6 +6,7 @@ import { later } from "./monitor-store.js";
 
 const DRAWN = 200; // single variations drawn at most, and used for the quantiles
 const PHASES = 3;
+const LONGEST = 1000; // episodes on the axis
 const INKS = ["--series-1", "--series-6", "--series-6"];
 const DASHES = [[], [7, 4], [2, 3]];
 
@@ -25,28 +26,31 @@ export function drawAdaptation(rows) {
   say(byId("adaptation-unit"), `${scaled ? "return over the optimal return" : "return"}, by episode`);
   if (!newest) return;
   const columns = phases.map((name) => means(known, name, scale));
-  const x = columns[0].map((_, index) => index + 1);
-  const [low, high] = spread(known, newest, scale, x.length);
+  const trials = ordered(columns[0]).slice(-LONGEST);
+  const x = trials.map((trial) => trial + 1);
+  const [low, high] = spread(known, newest, scale, trials);
   shown = { rows: sample(known), newest, scale, x };
   chart ??= new Chart(byId("adaptation"), options);
   shown.phases = phases;
-  const lines = columns.map((column) => x.map((_, index) => column[index] ?? null));
+  const lines = columns.map((column) => trials.map((trial) => column.get(trial) ?? null));
   chart.draw([x, high, low, ...lines.toReversed()], [scaled, x.length < 2, ...phases].join());
   describe(columns, phases, known.length, rows.length, scaled);
 }
 
+/** Mean over variations by trial; any numbers may be trials. */
 function means(rows, name, scale) {
-  const sums = [];
+  const sums = new Map();
   for (const row of rows) {
     const phase = row.phases.find((each) => each.name === name);
     phase?.trials.forEach((trial, index) => {
-      const cell = (sums[trial] ??= [0, 0]);
-      cell[0] += phase.returns[index] / scale(row);
-      cell[1] += 1;
+      const [sum, count] = sums.get(trial) ?? [0, 0];
+      sums.set(trial, [sum + phase.returns[index] / scale(row), count + 1]);
     });
   }
-  return Array.from(sums, (cell) => (cell ? cell[0] / cell[1] : null));
+  return new Map(Array.from(sums, ([trial, [sum, count]]) => [trial, sum / count]));
 }
+
+const ordered = (column) => [...column.keys()].sort((one, other) => one - other);
 
 function sample(rows) {
   const every = Math.ceil(rows.length / DRAWN);
@@ -54,13 +58,13 @@ function sample(rows) {
 }
 
 /** Tenth and ninetieth percentile over variations, by episode. */
-function spread(rows, name, scale, length) {
-  const values = Array.from({ length }, () => []);
+function spread(rows, name, scale, trials) {
+  const values = new Map(trials.map((trial) => [trial, []]));
   for (const row of sample(rows)) {
     const phase = row.phases.find((each) => each.name === name);
-    phase?.trials.forEach((trial, index) => values[trial].push(phase.returns[index] / scale(row)));
+    phase?.trials.forEach((trial, index) => values.get(trial)?.push(phase.returns[index] / scale(row)));
   }
-  const quantile = (q) => values.map((of) => (of.sort((a, b) => a - b), of.length ? of[Math.round(q * (of.length - 1))] : null));
+  const quantile = (q) => [...values.values()].map((of) => (of.sort((a, b) => a - b), of.length ? of[Math.round(q * (of.length - 1))] : null));
   return [quantile(0.1), quantile(0.9)];
 }
 
@@ -103,7 +107,7 @@ function singles(plot) {
 }
 
 function describe(columns, phases, known, all, scaled) {
-  const [newest, ...earlier] = columns.map((column) => column.filter((value) => value !== null));
+  const [newest, ...earlier] = columns.map((column) => ordered(column).map((trial) => column.get(trial)));
   const ends = earlier.map((values, index) => `${phases[index + 1]} ended at ${brief(mean(values.slice(-5)))}`);
   const left = known < all && scaled ? ` (${plural(all - known, "optimum")} not known yet)`.replace("optimums", "optima") : "";
   say(

@@ -64,14 +64,13 @@ export class Detail {
   #show(row) {
     this.row = row;
     byId("detail-facts").replaceChildren(...factsOf(row).map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
-    const length = Math.max(1, ...row.phases.flatMap((phase) => phase.trials)) + 1;
-    const x = Array.from({ length }, (_, index) => index + 1);
-    const columns = row.phases.map(({ trials, returns }) => {
-      const column = Array(length).fill(null);
-      trials.forEach((trial, index) => (column[trial] = returns[index]));
-      return column;
+    const trials = [...new Set(row.phases.flatMap((phase) => phase.trials))].sort((one, other) => one - other);
+    const columns = row.phases.map((phase) => {
+      const returns = new Map(phase.trials.map((trial, index) => [trial, phase.returns[index]]));
+      return trials.map((trial) => returns.get(trial) ?? null);
     });
-    const bound = row.optimum === null ? [] : [Array(length).fill(row.optimum)];
+    const bound = row.optimum === null ? [] : [trials.map(() => row.optimum)];
+    const x = trials.map((trial) => trial + 1);
     this.chart.draw([x, ...bound, ...columns], JSON.stringify([row.name, row.optimum, row.phases.map((phase) => phase.name)]));
     const last = row.phases.at(-1);
     say(

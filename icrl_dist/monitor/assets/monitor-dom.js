@@ -44,7 +44,7 @@ export function span(seconds) {
 }
 
 /** A moment, Unix seconds, as the time of day. */
-export const clock = (time) => new Date(time * 1000).toLocaleTimeString("en-GB");
+export const clock = (time) => (Math.abs(time) < 8e12 ? new Date(time * 1000).toLocaleTimeString("en-GB") : "–");
 
 /** A number to three digits or so. */
 export function brief(value) {

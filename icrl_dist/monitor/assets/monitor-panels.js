@@ -155,7 +155,7 @@ export class Events {
     for (const event of events) {
       if (event.number <= this.newest) continue;
       this.newest = event.number;
-      const time = el("time", { datetime: new Date(event.time * 1000).toISOString(), class: "muted small" }, clock(event.time));
+      const time = el("time", { class: "muted small" }, clock(event.time));
       list.prepend(el("li", { "data-what": event.what }, time, el("span", { class: "what small" }, event.what), el("span", {}, event.text)));
     }
     while (list.children.length > 200) list.lastChild.remove();
