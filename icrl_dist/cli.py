@@ -201,8 +201,14 @@ class Chaos:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each."""
+    """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each.
 
+    Or, with --cluster, a cluster file before `ray up`, without asking any machine or cloud; run it
+    where `ray up` will be run.
+    """
+
+    cluster: Path | None = None
+    """Cluster file to look through, such as deploy/clusters/aws.yaml."""
     endpoint: str = "tcp/127.0.0.1:0"
     """Where a learner would listen."""
     folder: Path = Path("runs")

@@ -282,8 +282,11 @@ def chaos(arguments: Chaos, console: Console) -> int:
 
 def doctor(arguments: Doctor, console: Console) -> int:
     """``icrl-dist doctor``: exit code 1 if anything would stop a run."""
-    from icrl_dist.doctor import diagnose, table
+    from icrl_dist.doctor import diagnose, diagnose_file, table
 
-    findings = diagnose(arguments.endpoint, arguments.folder)
+    if arguments.cluster is not None:
+        findings = diagnose_file(arguments.cluster, Path())
+    else:
+        findings = diagnose(arguments.endpoint, arguments.folder)
     console.print(table(findings), highlight=False, markup=False)
     return FAILED if any(finding.ok is False for finding in findings) else OK

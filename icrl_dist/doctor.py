@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import io
 import os
 import re
 import resource
@@ -10,30 +13,22 @@ import socket
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import psutil
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from icrl_dist import clusterfile
 from icrl_dist.config import ConfigError
+from icrl_dist.findings import Finding, table
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
 GIB = 1 << 30
 
-
-@dataclass(frozen=True)
-class Finding:
-    """The answer to one question."""
-
-    name: str
-    ok: bool | None
-    """None is a warning: a run starts, but something may go short."""
-    value: str
-    remedy: str = ""
-    """What to do; empty where there is nothing to do."""
+__all__ = ["Finding", "diagnose", "diagnose_file", "need_ray_token", "table"]
 
 
 def diagnose(endpoint: str, folder: Path) -> list[Finding]:
@@ -53,14 +48,6 @@ def diagnose(endpoint: str, folder: Path) -> list[Finding]:
         _ray_token(),
         _gpu(),
     ]
-
-
-def table(findings: list[Finding]) -> str:
-    """The findings for people, one line each, the remedy behind an arrow."""
-    mark = {True: "ok  ", None: "warn", False: "FAIL"}
-    width = max((len(f.name) for f in findings), default=0)
-    lines = [f"{mark[f.ok]}  {f.name:<{width}}  {f.value}" + (f"  -> {f.remedy}" if f.remedy else "") for f in findings]
-    return "\n".join(line.replace("\n", " ") for line in lines)
 
 
 def _python() -> Finding:
@@ -212,3 +199,29 @@ def _gpu() -> Finding:
         return Finding("GPU", True, "none seen by torch: the learner fits on the CPU")
     count = torch.cuda.device_count()
     return Finding("GPU", True, f"{count} x {torch.cuda.get_device_name(0)}")
+
+
+def diagnose_file(file: Path, root: Path) -> list[Finding]:
+    """A cluster file, offline: Ray's own opinion of it, then ours.  Raises ConfigError if it is none."""
+    config = clusterfile.load(file)
+    ray = _ray_accepts(config)
+    return [ray, *(clusterfile.findings(config, root) if ray.ok else ())]
+
+
+def _ray_accepts(config: dict[str, Any]) -> Finding:
+    from jsonschema import ValidationError
+    from ray.autoscaler._private.util import prepare_config, validate_config
+
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # Ray warns of mounts that are files, which concerns Docker only
+            validate_config(prepare_config(copy.deepcopy(config)))
+    except ValidationError as error:
+        where = ".".join(map(str, error.absolute_path)) or "the file"
+        return Finding(
+            "Ray's schema", False, f"{where}: {error.message}", "correct it: docs.ray.io, cluster YAML configuration"
+        )
+    except Exception as error:  # Ray raises whatever its providers do, down to AttributeError
+        return Finding(
+            "Ray's schema", False, f"{type(error).__name__}: {error}", "compare it with the files in deploy/clusters/"
+        )
+    return Finding("Ray's schema", True, "accepted")
