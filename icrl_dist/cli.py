@@ -215,6 +215,30 @@ class Doctor:
     """Where run folders would be made."""
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a run would take on N machines: hours, network, disk, and what holds it up first.
+
+    Times a little of each part of the run on this machine, some tens of seconds while nothing else
+    should run; machines are taken to be like this one.
+    """
+
+    run: tyro.conf.Positional[str]
+    """Name of a packaged run, or path of a run file."""
+    nodes: int = 1
+    """Machines that run workers."""
+    cores: int | None = None
+    """Workers on each; as many as this machine has cores if not given."""
+    gbit: float = 1.0
+    """What the learner's network carries, Gbit/s."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """SECTION.NAME=VALUE, as in adversary.count=16; may be given many times."""
+    rates: Path | None = None
+    """Rates that were measured before, or on another machine: what --json printed there."""
+    json: bool = False
+    """Print one JSON object on the last line, the rates included."""
+
+
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "train": (Train, commands.train),
     "evaluate": (Evaluate, commands.evaluate),
@@ -224,6 +248,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "export": (Export, commands.export),
     "chaos": (Chaos, commands.chaos),
     "doctor": (Doctor, commands.doctor),
+    "plan": (Plan, commands.plan),
 }
 
 

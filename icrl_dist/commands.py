@@ -18,7 +18,7 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.types import Identity
 
 if TYPE_CHECKING:
-    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Tap, Train
+    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Plan, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -290,3 +290,21 @@ def doctor(arguments: Doctor, console: Console) -> int:
         findings = diagnose(arguments.endpoint, arguments.folder)
     console.print(table(findings), highlight=False, markup=False)
     return FAILED if any(finding.ok is False for finding in findings) else OK
+
+
+def plan(arguments: Plan, console: Console) -> int:
+    """``icrl-dist plan``: an estimate from measured rates."""
+    from icrl_dist import estimate
+    from icrl_dist.bench import rates
+
+    run = override(load(arguments.run), arguments.set, "--set")
+    if arguments.rates is not None:
+        found = estimate.Rates.read(arguments.rates, arguments.run)
+    else:
+        with console.status("plan") as status:
+            found = rates.measure(run, arguments.run, lambda said: status.update(f"timing {said}"))
+    answer = estimate.estimate(found, arguments.nodes, arguments.cores or found.cores, arguments.gbit)
+    console.print(estimate.describe(answer), highlight=False, markup=False)
+    if arguments.json:
+        print(json.dumps({**answer, "rates": found.as_dict()}))
+    return OK
