@@ -43,8 +43,10 @@ class Train:
     """``ray``: a learner process and Ray workers; ``inline``: all in this process, same results."""
     address: str | None = None
     """Address of a Ray cluster to take workers from; without it Ray starts here."""
-    actors: int = 2
-    """Workers."""
+    actors: int | None = None
+    """Workers: 2 on this machine; on a cluster as many as its machines have cores, and more when more join."""
+    min_actors: int | None = None
+    """On a cluster: begin with so many after a minute, though other machines have not joined."""
     oversubscribe: bool = False
     """Allow more workers than cores: slower, and the same results."""
     out: Path | None = None

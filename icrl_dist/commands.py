@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Plan, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+LOCAL_ACTORS = 2
+"""Workers on one machine, if nobody says how many."""
 
 
 def train(arguments: Train, console: Console) -> int:
@@ -38,10 +40,12 @@ def train(arguments: Train, console: Console) -> int:
     run = override(arguments.config, arguments.set, "--set")
     validate(run, arguments.run or str(arguments.source))
     folder = (arguments.out or Path("runs") / name).absolute()
-    if arguments.actors < 1:
-        raise ConfigError(f"--actors {arguments.actors}: at least 1 worker is needed")
+    for option, value in (("--actors", arguments.actors), ("--min-actors", arguments.min_actors)):
+        if value is not None and value < 1:
+            raise ConfigError(f"{option} {value}: at least 1 worker is needed")
+    actors = LOCAL_ACTORS if arguments.actors is None and arguments.address is None else arguments.actors
     if arguments.engine == "ray" and arguments.address is None and not arguments.oversubscribe:
-        check_cores(arguments.actors)
+        check_cores(actors or LOCAL_ACTORS)
     if arguments.engine == "ray":
         launch.check_security(run, arguments.address)
     launch.prepare(run, folder, arguments.resume, arguments.overwrite, source)
@@ -51,9 +55,8 @@ def train(arguments: Train, console: Console) -> int:
             if arguments.engine == "inline":
                 result = launch.train_inline(run, folder, display.report)
             else:
-                result = launch.train_ray(
-                    run, folder, arguments.actors, arguments.address, display.report, arguments.oversubscribe
-                )
+                options = (arguments.oversubscribe, arguments.min_actors)
+                result = launch.train_ray(run, folder, actors, arguments.address, display.report, *options)
             if run.method != "experts":
                 save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
                 results = heldout.online(run, folder, display)
