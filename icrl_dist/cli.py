@@ -114,11 +114,14 @@ class Bench:
     """Measure one part of the system on this machine, beside what it is compared with."""
 
     name: tyro.conf.Positional[
-        Literal["env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts", "disturbance"]
+        Literal[
+            "env", "stream", "ingest", "scale", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts", "disturbance"
+        ]
     ]
     """``env``: environment steps a second, of simulated problems beside their library's own loop;
     ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
-    ``ingest``: trajectories a second onto the disk, with and without fsync; ``broadcast``: weights
+    ``ingest``: trajectories a second onto the disk, with and without fsync; ``scale``: the same from
+    1 to 256 simulated workers; ``broadcast``: weights
     to eight processes, beside ``ray.put`` and ``get``; ``recovery``: how soon a run is at work again
     after a worker or the learner was killed; ``soak``: does any process of a long run grow;
     ``fuzz``: 100,000 hostile inputs to every reader of bytes; ``incontext``: deployment and
@@ -129,12 +132,12 @@ class Bench:
     """Which environment: one such as ``dmc-cheetah-run`` (env: ``darkroom`` if not given;
     disturbance: every simulated one)."""
     seconds: float | None = None
-    """How long to measure (env, stream, ingest and soak)."""
+    """How long to measure (env, stream, ingest, scale and soak)."""
     quick: bool = False
     """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
     little and 3 episodes instead of 10 (disturbance)."""
     folder: Path = Path("runs")
-    """Whose disk to write to (ingest, recovery), where to put the figure (soak, incontext) or an
+    """Whose disk to write to (ingest, scale, recovery), where to put the figure (soak, incontext) or an
     input that breaks something (fuzz), where to keep finished trainings (incontext)."""
     json: bool = False
     """Print one JSON object on the last line."""

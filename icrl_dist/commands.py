@@ -195,7 +195,7 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import broadcast, disturbance, env, experts, fuzz, incontext, ingest, recovery, soak, stream
+    from icrl_dist.bench import broadcast, disturbance, env, experts, fuzz, incontext, ingest, recovery, scale, soak, stream
 
     if arguments.seconds is not None and arguments.name in (
         "broadcast",
@@ -214,6 +214,10 @@ def bench(arguments: Bench, console: Console) -> int:
             result, text = (r := stream.run(**timed)), stream.describe(r)
         case "ingest":
             result, text = (r := ingest.run(arguments.folder, **timed)), ingest.describe(r)
+        case "scale":
+            with console.status("scale"):
+                result = scale.run(arguments.folder, **timed)
+            text = scale.describe(result)
         case "broadcast":
             result, text = (r := broadcast.run()), broadcast.describe(r)
         case "recovery":
