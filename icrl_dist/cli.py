@@ -209,11 +209,16 @@ class Doctor:
     """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each.
 
     Or, with --cluster, a cluster file before `ray up`, without asking any machine or cloud; run it
-    where `ray up` will be run.
+    where `ray up` will be run.  Or, with --address on its head, a cluster that is up: every
+    machine's versions, clock, shared memory, certificates, and the ports between them.
     """
 
     cluster: Path | None = None
     """Cluster file to look through, such as deploy/clusters/aws.yaml."""
+    address: str | None = None
+    """Address of a Ray cluster, such as ``auto``."""
+    certificates: str = ""
+    """With --address: the folder of certificates on its machines."""
     endpoint: str = "tcp/127.0.0.1:0"
     """Where a learner would listen."""
     folder: Path = Path("runs")

@@ -289,10 +289,12 @@ def chaos(arguments: Chaos, console: Console) -> int:
 
 def doctor(arguments: Doctor, console: Console) -> int:
     """``icrl-dist doctor``: exit code 1 if anything would stop a run."""
-    from icrl_dist.doctor import diagnose, diagnose_file, table
+    from icrl_dist.doctor import diagnose, diagnose_cluster, diagnose_file, table
 
     if arguments.cluster is not None:
         findings = diagnose_file(arguments.cluster, Path())
+    elif arguments.address is not None:
+        findings = diagnose_cluster(arguments.address, arguments.endpoint, arguments.certificates)
     else:
         findings = diagnose(arguments.endpoint, arguments.folder)
     console.print(table(findings), highlight=False, markup=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import logging
 import os
 import re
 import resource
@@ -21,14 +22,14 @@ import psutil
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from icrl_dist import clusterfile
+from icrl_dist import clusterfile, endpoints, machines, nodes
 from icrl_dist.config import ConfigError
 from icrl_dist.findings import Finding, table
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
 GIB = 1 << 30
 
-__all__ = ["Finding", "diagnose", "diagnose_file", "need_ray_token", "table"]
+__all__ = ["Finding", "diagnose", "diagnose_cluster", "diagnose_file", "need_ray_token", "table"]
 
 
 def diagnose(endpoint: str, folder: Path) -> list[Finding]:
@@ -225,3 +226,27 @@ def _ray_accepts(config: dict[str, Any]) -> Finding:
             "Ray's schema", False, f"{type(error).__name__}: {error}", "compare it with the files in deploy/clusters/"
         )
     return Finding("Ray's schema", True, "accepted")
+
+
+def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Finding]:
+    """A live cluster, asked through Ray: every machine's versions, clock, shared memory, certificates and the ports it needs.
+
+    ``endpoint``: where the learner would listen on this machine, which is taken to be the head.
+    Raises ConfigError if the cluster does not answer.
+    """
+    import ray as module
+
+    ray: Any = module
+    need_ray_token(address)
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+        raise ConfigError(f"--address {address}: {error}; `ray status` there says whether a cluster is up") from None
+    try:
+        where = endpoints.parse(endpoint)
+        with nodes.listening(where.host, where.port) as port:
+            return machines.examine(ray, (where.host, port), certificates)
+    except OSError as error:
+        return [Finding("stream endpoint", False, f"{endpoint}: {error}", "choose an address of the head and a free port")]
+    finally:
+        ray.shutdown()
