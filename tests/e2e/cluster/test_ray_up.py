@@ -114,13 +114,18 @@ def wait_until(condition, what, timeout=100):
         time.sleep(0.05)
 
 
+def plain(text):
+    """What a terminal shows, on one line: `ray exec` gives the command one."""
+    return re.sub(r"\s+", " ", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)).strip()
+
+
 @contextlib.contextmanager
 def underway(cluster, tmp_path, words):
     """A command on the desk: its process, and a function that gives what it has printed."""
     output = tmp_path / "output"
     with output.open("w") as file, subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT) as process:
         try:
-            yield process, output.read_text
+            yield process, lambda: plain(output.read_text())
         finally:
             process.kill()
 
@@ -174,7 +179,7 @@ def test_a_run_that_was_submitted_from_outside_is_the_same(cluster, inline, tmp_
             for process in [*psutil.Process(tunnel.pid).children(recursive=True), tunnel]:
                 with contextlib.suppress(psutil.NoSuchProcess):
                     process.kill()
-    assert "succeeded" in printed
+    assert "succeeded" in plain(printed)
     same(result_of(cluster, "submitted"), inline())
 
 
@@ -182,7 +187,7 @@ def test_machines_that_do_not_fit_or_have_no_token_stop_a_run_before_it_starts(c
     def refused(*options, environment=""):
         words = f"{environment} {cluster.train('refused', *options)}"
         done = subprocess.run(exec_(cluster, words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=100)
-        lines = [line for line in done.stdout.splitlines() if line.startswith("icrl-dist: ")]
+        lines = [plain(line) for line in done.stdout.splitlines() if plain(line).startswith("icrl-dist: ")]
         assert done.returncode != 0 and len(lines) == 1, done.stdout
         assert not cluster.folder("refused").exists(), "the same command could not be given again"
         return lines[0]
