@@ -39,12 +39,13 @@ def _work(endpoint: str, run_name: str, name: str, folder: str | None, certifica
     """A worker's whole life, in a process that Ray made."""
     import torch
 
+    from actors import router
     from actors.worker import Worker
-    from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
     torch.set_num_threads(1)
-    with ZenohLink.connect(endpoint, timeout_s=30.0, config=security.client(certificates, "worker")) as link:
+    where, settings = router.reached(endpoint, certificates)
+    with ZenohLink.connect(where, timeout_s=30.0, config=settings) as link:
         Worker(link, run_name, name, folder=Path(folder) if folder else None).run()
 
 
