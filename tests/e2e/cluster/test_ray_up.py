@@ -6,9 +6,9 @@ One cluster serves all of it: `ray up` takes longer than a run.
 import contextlib
 import json
 import re
+import shutil
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -229,21 +229,20 @@ def test_killed_raylets_a_killed_learner_and_a_machine_that_joins_midway(cluster
             for machine in machines:
                 for victim in machine.processes(word):
                     victim.kill()
-        threading.Thread(target=joins, args=(cluster,)).start()
+        joins(cluster)
         assert process.wait(timeout=200) == 0, printed()
     result = result_of(cluster, "killed")
     same(result, inline())
     assert result["learner_deaths"] == 1 and "the learner died (exit code -9)" in printed()
-    landed = re.search(r"late \(10.0.0.5\): (w\d(-\d)?)", printed())
-    assert landed, printed()
-    assert cluster.workers_of("killed")[landed[1]], printed()
+    assert re.search(r"late \(10.0.0.5\): w\d", printed()), printed()
+    assert set(cluster.workers_of("killed")) - {"w0", "w1"}, "nobody was needed but those that were killed"
 
 
 def joins(cluster):
     """What the cluster file does on a worker, by hand."""
     late, head = cluster.late, cluster.head
     for folder in (".ray", ".icrl"):
-        late.run("cp", "-r", cluster.desk.home / folder, hosts.HOME)
+        shutil.copytree(cluster.desk.home / folder, late.home / folder)
     start = f"RAY_AUTH_MODE=token RAY_worker_niceness=0 {hosts.CODE} ray start --address={head.address}:6379 --num-cpus=1"
     late.run("bash", "-c", f"ulimit -n $(ulimit -Hn); {start} --node-ip-address={late.address} --object-store-memory=104857600")
 
