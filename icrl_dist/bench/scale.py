@@ -149,10 +149,10 @@ def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
     process = psutil.Process()
     stored: list[float] = []
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
-    before = process.memory_info().rss
     with contextlib.closing(Store(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
         inbox = _inbox(store, count, stored, failures)
         link.serve(KEYS.data, inbox.put)
+        before = process.memory_info().rss
         with _workers(link.endpoints[0], count, seconds) as others:
             connected, cpu, began = process.memory_info().rss, _cpu(process), time.monotonic()
             for one in others:
