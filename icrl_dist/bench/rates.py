@@ -146,7 +146,7 @@ def _continued(spent: np.ndarray, count: int, longest: int) -> float:
     """Seconds of ``count`` trials given those of the first, each a little longer than the last until contexts are full."""
     if len(spent) >= count:
         return float(spent.sum())
-    slope, first = np.polyfit(np.arange(len(spent)), spent, 1)
+    slope, first = np.polyfit(np.arange(len(spent)), spent, 1) if len(spent) > 1 else (0.0, spent[0])
     later = first + max(0.0, slope) * np.minimum(np.arange(len(spent), count), max(longest, len(spent)))
     return float(spent.sum() + later.sum())
 
@@ -174,13 +174,12 @@ def _training(job: Job, budget_s: float) -> float:
 
     def progress(experts: Any, returns: np.ndarray) -> None:
         times.append(time.perf_counter())
-        if experts.steps > short.warmup + 2 * horizon and times[-1] - times[0] > budget_s:
+        if len(times) > 2 and times[-1] - times[0] > budget_s:
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        train(env, short, short.warmup // horizon * horizon + 20 * horizon, 0, progress)
-    learning = np.diff(times)[-(short.warmup // horizon) - 2 :] if len(times) > 3 else np.diff(times)
-    return float(np.median(learning)) * config.steps / horizon
+        train(env, short, 20 * horizon, 0, progress)
+    return float(np.median(np.diff(times))) * config.steps / horizon  # the first episode is over before they learn
 
 
 class _EnoughSeen(Exception):  # noqa: N818
