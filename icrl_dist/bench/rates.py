@@ -24,13 +24,13 @@ import numpy as np
 import torch
 
 from icrl_dist import context, envs, evaluate, jobs, pretrain, surprise
+from icrl_dist.bench.samples import Sample, in_full, made_up
 from icrl_dist.config import Run
 from icrl_dist.envs import tasks
 from icrl_dist.estimate import PhaseRates, Rates
 from icrl_dist.histories import sac_of
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
-from icrl_dist.recipes import METHODS, Key, Phase
-from icrl_dist.rollout import episode
+from icrl_dist.recipes import METHODS, Phase
 from icrl_dist.store import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
@@ -76,7 +76,7 @@ def _measure(run: Run, name: str, tell: Tell, budget_s: float) -> Rates:
             ingest = min(ingest, _ingest(run, asked[0], seen[phase.stage][1]))
             tell(f"{phase.stage}: steps of the fit")
             torch.set_num_threads(run.learner.threads or len(os.sched_getaffinity(0)))
-            fit_step = _fit(run, phase, model.to(device), _Sample({s: t for s, (_, t) in seen.items()}), budget_s)
+            fit_step = _fit(run, phase, model.to(device), Sample({s: t for s, (_, t) in seen.items()}), budget_s)
             model.to("cpu")
         job_s, sample = seen[phase.stage]
         count = sum(job.trials * len(job.variations) for job in asked)
@@ -128,7 +128,7 @@ class _Weights:
 def _job(run: Run, job: Job, model: PretrainedTransformer, budget_s: float) -> tuple[float, list[Trajectory]]:
     """Seconds that the job takes, and trajectories such as it delivers, all trials of some of its variations."""
     if job.kind == "train_expert":
-        return _training(job, budget_s), _made_up(job)
+        return _training(job, budget_s), made_up(job)
     rows, made, times = len(job.variations), [], [time.perf_counter()]
     work = jobs.do(job, _Weights(model), "plan")
     while group := list(itertools.islice(work, rows)):
@@ -139,7 +139,7 @@ def _job(run: Run, job: Job, model: PretrainedTransformer, budget_s: float) -> t
     if job.kind != "adapt":  # all its episodes are stepped at once
         return times[-1] - times[0], made
     spent = np.diff(times)
-    return _continued(spent, job.trials, run.context.max // model.spec.horizon), _in_full(job, made)
+    return _continued(spent, job.trials, run.context.max // model.spec.horizon), in_full(job, made)
 
 
 def _continued(spent: np.ndarray, count: int, longest: int) -> float:
@@ -149,18 +149,6 @@ def _continued(spent: np.ndarray, count: int, longest: int) -> float:
     slope, first = np.polyfit(np.arange(len(spent)), spent, 1) if len(spent) > 1 else (0.0, spent[0])
     later = first + max(0.0, slope) * np.minimum(np.arange(len(spent), count), max(longest, len(spent)))
     return float(spent.sum() + later.sum())
-
-
-def _in_full(job: Job, made: Sequence[Trajectory]) -> list[Trajectory]:
-    """Every trial of the job: those that were not made are repeats of those that were."""
-    have: dict[tuple[int, int], list[Trajectory]] = {}
-    for one in made:
-        have.setdefault((one.identity.task, one.identity.variation), []).append(one)
-    return [
-        dataclasses.replace(trials[n % len(trials)], identity=trials[0].identity._replace(trial=n))
-        for trials in have.values()
-        for n in range(job.trials)
-    ]
 
 
 def _training(job: Job, budget_s: float) -> float:
@@ -186,54 +174,7 @@ class _EnoughSeen(Exception):  # noqa: N818
     """Enough was timed."""
 
 
-def _made_up(job: Job) -> list[Trajectory]:
-    """Trajectories of the job's form, of random actions and labels: what they hold costs nothing more or less."""
-    rng, made = np.random.default_rng(0), []
-    rows = job.rows()[: max(2, job.tasks)]
-    chosen = list(job.variations[: len(rows)])
-    ran = episode(envs.batch(chosen), evaluate.random_vectors(chosen), [np.random.default_rng(r) for r in range(len(rows))])
-    queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
-    count, actions = queries + stretches * length, ran.actions.shape[-1]
-    for row, (task, variation) in enumerate(rows):
-        for trial in range(job.trials):
-            made.append(
-                Trajectory(
-                    identity=next(iter(job.identities()))._replace(task=task, variation=variation, trial=trial),
-                    variation=chosen[row],
-                    weights=job.weights,
-                    digest="",
-                    worker="plan",
-                    observations=ran.observations[row],
-                    actions=ran.actions[row],
-                    rewards=ran.rewards[row],
-                    adversary=ran.adversary[row],
-                    queries=ran.observations[row][rng.integers(0, len(ran.actions[row]), count)],
-                    labels=rng.uniform(-1, 1, (count, actions)).astype(np.float32),
-                    taken=np.zeros((stretches * length, actions), np.float32),
-                    gained=np.zeros(stretches * length, np.float32),
-                    origin="expert",
-                )
-            )
-    return made
-
-
-class _Sample:
-    """Timed trajectories as a method's dataset."""
-
-    def __init__(self, stages: dict[str, list[Trajectory]]) -> None:
-        self._trials: dict[Key, list[Trajectory]] = {}
-        for stage, trajectories in stages.items():
-            for one in trajectories:
-                self._trials.setdefault((stage, 0, one.identity.task, one.identity.variation), []).append(one)
-
-    def variations(self, stage: str, round: int) -> Sequence[Key]:
-        return [key for key in self._trials if key[0] == stage and round == 0]
-
-    def trials(self, key: Key) -> list[Trajectory]:
-        return self._trials[key]
-
-
-def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: _Sample, budget_s: float) -> float:
+def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, budget_s: float) -> float:
     """Seconds of an optimiser step, the drawing of its batch included; 0 if the phase has no fit."""
     if not phase.steps:
         return 0.0
