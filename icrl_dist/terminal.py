@@ -55,7 +55,9 @@ class Display:
                 highlight=False,
             )
         elif kind == "listening":
-            self.console.print(f"learner listens at {event['endpoint']}, weights version {event['version']}", highlight=False)
+            where = f"learner on {event['host']} ({event['device']})"
+            told = f"{where} listens at {event['endpoint']}, weights version {event['version']}"
+            self.console.print(told, highlight=False, markup=False)
         elif kind in ("note", "worker", "alert", "crash", "quarantine", "repaired", "interrupted"):
             self.console.print(event["text"], highlight=False, markup=False)
 
