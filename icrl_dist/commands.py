@@ -26,8 +26,7 @@ OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
-    from icrl_dist import heldout, launch
-    from icrl_dist.agent import checkpoint_file
+    from icrl_dist import launch
     from icrl_dist.files import atomic_write, save_checkpoint
     from icrl_dist.terminal import Display
 
@@ -54,6 +53,9 @@ def train(arguments: Train, console: Console) -> int:
                 result = launch.train_ray(
                     run, folder, arguments.actors, arguments.address, display.report, arguments.oversubscribe
                 )
+            from icrl_dist import heldout  # torch with it, which neither the learner nor the workers should wait for
+            from icrl_dist.agent import checkpoint_file
+
             if run.method != "experts":
                 save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
                 results = heldout.online(run, folder, display)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for programs that tests start; two threads wait for each other beside others
 
 import jaxtyping
 import pytest
@@ -35,6 +38,19 @@ from icrl_dist.config import (  # noqa: E402
 from icrl_dist.envs import darkroom  # noqa: E402
 from icrl_dist.stream.memory_link import MemoryHub, MemoryLink  # noqa: E402
 from icrl_dist.types import Task  # noqa: E402
+
+FIRST = ("e2e", "learner", "actors")
+"""Folders whose tests wait and run long: begun first, they leave no processor idle at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+
+    def turn(item: pytest.Item) -> int:
+        folder = item.path.relative_to(here).parts[0]
+        return FIRST.index(folder) if folder in FIRST else len(FIRST)
+
+    items.sort(key=turn)
 
 
 @pytest.fixture
