@@ -9,7 +9,6 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for programs that tests start; two threads wait for each other beside others
 
-import jaxtyping
 import pytest
 import torch
 
@@ -19,7 +18,7 @@ pytest.register_assert_rewrite("tests.contracts")
 
 imported = [name for name in sys.modules if name.split(".")[0] == "icrl_dist"]
 assert not imported, f"{imported} were imported before the import hook: their shapes would go unchecked"
-jaxtyping.install_import_hook("icrl_dist", f"{tests.typecheck.__name__}.check")
+tests.typecheck.install("icrl_dist")
 torch.set_num_threads(1)
 
 from icrl_dist.config import (  # noqa: E402
