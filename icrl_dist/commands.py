@@ -29,8 +29,7 @@ LOCAL_ACTORS = 2
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
-    from icrl_dist import heldout, launch
-    from icrl_dist.agent import checkpoint_file
+    from icrl_dist import launch
     from icrl_dist.files import atomic_write, save_checkpoint
     from icrl_dist.terminal import Display
 
@@ -58,6 +57,9 @@ def train(arguments: Train, console: Console) -> int:
             else:
                 options = (arguments.oversubscribe, arguments.min_actors)
                 result = launch.train_ray(run, folder, actors, arguments.address, display.report, *options)
+            from icrl_dist import heldout  # torch with it, which neither the learner nor the workers should wait for
+            from icrl_dist.agent import checkpoint_file
+
             if run.method != "experts":
                 save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
                 results = heldout.online(run, folder, display)
