@@ -40,6 +40,9 @@ class ControlConfig:
     """Strength of a pretraining adversary: 1 is Table 2's largest force, or the full ``disturbance``.
     ``bite:0.25``: the smallest at which the undisturbed experts lose a quarter of their return, as
     ``icrl-dist bench disturbance --bite`` has measured it."""
+    histories: Literal["sac", "scripted"] = "sac"
+    """What contexts are: episodes of SAC experts' trainings (appendix C.2), or, in Meta-World, of the
+    scripted policy, told the right goal and wrong ones by turns, with noise (``icrl_dist.scripted``)."""
     solved: str = ""
     """What a bite came to when the run was read, as PROBLEM/FORCES/bite:SHARE=STRENGTH; not for you to set."""
     forces: Literal["paper", "qarl"] = "paper"

@@ -120,6 +120,14 @@ Need = Callable[[bool, str, object, str], None]
 def _validate_control(run: Run, need: Need) -> None:
     """What a run of a continuous game may be."""
     control, count = run.control, run.control.train_tasks
+    scripted = control.histories == "scripted"
+    need(
+        run.problem.startswith("metaworld") or not scripted,
+        "control.histories",
+        control.histories,
+        "only Meta-World has a scripted policy",
+    )
+    need(run.method != "experts" or not scripted, "control.histories", control.histories, "experts are made for sac")
     if run.problem.startswith("dmc-"):
         need(count in (4, 16, 36), "control.train_tasks", count, "the centre of the grid has 4, 16 or 36 tasks")
         need(

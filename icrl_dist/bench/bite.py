@@ -32,9 +32,9 @@ STEPS = {"dmc-cartpole-balance": 12_000}
 """Steps of SAC after which a problem's four experts were found competent here."""
 COMPETENT = 0.25
 """Mean reward a step, of at most 1, that experts must earn undisturbed: what bites a worse one says nothing."""
-FIRST, MOST = 2.0**-6, 2.0**10
+FIRST, MOST = 2.0**-3, 2.0**10
 """The strengths between which a bite is looked for, each twice the one before; then within 2% by bisection."""
-SIZES = Sizes(episodes=4)
+SIZES = Sizes(episodes=3)
 
 Loss = Callable[[float], float]
 """Share of the return that is lost at a strength; the same chance at every call."""
@@ -82,7 +82,7 @@ def run(
     problem: str | None = None,
     steps: int | None = None,
     report: Report = lambda said: None,
-    sizes: Sizes = SIZES,
+    sizes: Sizes | None = None,
 ) -> dict[str, Any]:
     """Solve ``bite`` for a problem, or for every one with competent experts, and keep it in the user's own table.
 
@@ -104,7 +104,7 @@ def run(
     torch.set_num_threads(1)
     try:
         for kind in (*STEPS, pick_place.KIND) if problem is None else (problem,):
-            rows += _solved(kind, bite, steps, report, sizes)
+            rows += _solved(kind, bite, steps, report, sizes or SIZES)
     finally:
         torch.set_num_threads(threads)
     return {"bite": bite, "problems": rows, "file": str(bites.own_file()), "ok": all(row["reached"] for row in rows)}
