@@ -118,20 +118,20 @@ def test_the_packaged_table_has_what_it_was_solved_from():
 
 
 def test_solving_keeps_the_strength_for_runs_that_ask_for_it(own, monkeypatch, capsys):
-    settings = [Setting("qarl", problems.task(KIND, forces="qarl", horizon=25), 2)]
+    settings = [Setting("qarl", problems.task(KIND, forces="qarl", horizon=20), 2)]
     monkeypatch.setattr(disturbance, "settings", lambda kind: settings)
     monkeypatch.setattr(bite, "settings", lambda kind: settings)
     monkeypatch.setattr(bite, "_tasks", lambda kind, one, sizes: (one.task,))
     monkeypatch.setattr(bite, "_expert", lambda kind, config, report: Balances)
     monkeypatch.setattr(bite, "solve", functools.partial(bite.solve, first=0.5, most=8.0, tolerance=0.4))
-    monkeypatch.setattr(bite, "SIZES", Sizes(adversaries=2, episodes=1))
+    monkeypatch.setattr(bite, "SIZES", Sizes(adversaries=1, episodes=1))
     assert cli.main(["bench", "disturbance", "--problem", KIND, "--bite", "0.01", "--json"]) == 0
     out = capsys.readouterr().out
     (solved,) = json.loads(out.splitlines()[-1])["problems"]
     assert solved["lost_mean"] >= 0.01 and solved["reached"] and len(solved["tried"]) > 1
     kept = bites.own()
     assert kept == [solved]
-    slow = disturbance.pushes(settings[0], 2, solved["strength"])
+    slow = disturbance.pushes(settings[0], 1, solved["strength"])
     measured = disturbance.measure([bite.Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
     assert disturbance.lost(measured.returns)["lost_mean"] == pytest.approx(solved["lost_mean"])
     bite._keep(solved)
@@ -143,10 +143,11 @@ def test_an_incompetent_expert_is_not_asked_what_bites_it(own, monkeypatch):
         def act(self, observation, u):
             return np.full((len(observation), 1), np.float32(1))
 
-    settings = Setting("qarl", problems.task(KIND, forces="qarl"), 2)
+    settings = Setting("qarl", problems.task(KIND, forces="qarl", horizon=20), 2)
+    monkeypatch.setattr(bite, "_tasks", lambda kind, one, sizes: (one.task,))
     monkeypatch.setattr(bite, "settings", lambda kind: [settings])
     monkeypatch.setattr(bite, "_expert", lambda kind, config, report: Idle)
-    with pytest.raises(ConfigError, match=r"earn .* undisturbed, not 190: train longer"):
+    with pytest.raises(ConfigError, match=r"earn .* undisturbed, not 19: train longer"):
         monkeypatch.setattr(bite, "COMPETENT", 0.95)
         bite.run(0.25, KIND, sizes=Sizes(adversaries=1, episodes=1))
     assert not bites.own_file().exists()
