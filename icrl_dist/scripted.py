@@ -68,8 +68,8 @@ class Lead(NamedTuple):
     @classmethod
     def drawn(cls, rng: np.random.Generator, goal: Float64[np.ndarray, " 3"], right: bool, spec: Spec) -> Lead:
         """Of an episode that is told the ``right`` goal, or wrong ones."""
-        steps, box = spec.horizon, np.array(pick_place.GOALS)
-        told = rng.uniform(*box, size=(2, 3))
+        steps, (low, high) = spec.horizon, np.array(pick_place.GOALS)
+        told = low + (high - low) * rng.random((2, 3))
         change = int(rng.integers(steps // 3, steps + 1))
         chosen = np.where(np.arange(steps)[:, None] < change, told[0], told[1])
         noise = rng.uniform(0, NOISE) * rng.standard_normal((steps, spec.actions))
