@@ -32,7 +32,7 @@ STEPS = {"dmc-cartpole-balance": 12_000}
 """Steps of SAC after which a problem's four experts were found competent here."""
 COMPETENT = 0.25
 """Mean reward a step, of at most 1, that experts must earn undisturbed: what bites a worse one says nothing."""
-FIRST, MOST = 2.0**-3, 2.0**10
+FIRST, MOST = 2.0**-3, 2.0**14
 """The strengths between which a bite is looked for, each twice the one before; then within 2% by bisection."""
 SIZES = Sizes(episodes=3)
 
