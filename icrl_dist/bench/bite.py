@@ -28,8 +28,8 @@ from icrl_dist.games import SACConfig
 from icrl_dist.tables import nearest
 from icrl_dist.types import Job, Task, Variation
 
-STEPS = {"dmc-cartpole-balance": 12_000}
-"""Steps of SAC after which a problem's four experts were found competent here."""
+KNOWN = ("dmc-cartpole-balance", pick_place.KIND)
+"""Problems whose experts are known to be competent with their laptop numbers."""
 COMPETENT = 0.25
 """Mean reward a step, of at most 1, that experts must earn undisturbed: what bites a worse one says nothing."""
 FIRST, MOST = 2.0**-3, 2.0**14
@@ -84,10 +84,10 @@ def run(
     report: Report = lambda said: None,
     sizes: Sizes | None = None,
 ) -> dict[str, Any]:
-    """Solve ``bite`` for a problem, or for every one with competent experts, and keep it in the user's own table.
+    """Solve ``bite`` for a problem, or for those with experts known to be competent, and keep it in the user's own table.
 
-    ``steps`` of SAC for a problem's experts.  Raises ConfigError for an unknown problem, and for one
-    without competent experts.
+    ``steps`` of SAC for a problem's experts, instead of those of ``bench disturbance``.  Raises ConfigError
+    for an unknown problem, and for experts that are not competent.
     """
     bites.share(f"bite:{bite:g}")
     known = (*problems.PROBLEMS, pick_place.KIND)
@@ -95,15 +95,10 @@ def run(
         raise ConfigError(
             f"bench disturbance: problem = {problem!r}{nearest(problem, known)}: choose one of {', '.join(known)}"
         )
-    if steps is None and problem is not None and problem not in (*STEPS, pick_place.KIND):
-        raise ConfigError(
-            f"bench disturbance --bite {bite:g}: no number of SAC steps is known that makes a competent expert of {problem}; "
-            "try one with --steps"
-        )
     threads, rows = torch.get_num_threads(), []
     torch.set_num_threads(1)
     try:
-        for kind in (*STEPS, pick_place.KIND) if problem is None else (problem,):
+        for kind in KNOWN if problem is None else (problem,):
             rows += _solved(kind, bite, steps, report, sizes or SIZES)
     finally:
         torch.set_num_threads(threads)
@@ -112,7 +107,7 @@ def run(
 
 def _solved(kind: str, bite: float, steps: int | None, report: Report, sizes: Sizes) -> list[dict[str, Any]]:
     """One problem under each of its disturbances."""
-    config = disturbance.numbers(kind, STEPS.get(kind, 0))
+    config = disturbance.numbers(kind)
     config = config if steps is None else dataclasses.replace(config, steps=steps)
     make = _expert(kind, config, report)
     rows: list[dict[str, Any]] = []
