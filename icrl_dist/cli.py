@@ -186,6 +186,11 @@ class Bench:
     quick: bool = False
     """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
     little and 3 episodes instead of 10 (disturbance), 2 pairs of short windows instead of 8 (monitor)."""
+    bite: float | None = None
+    """disturbance: instead, the strength at which that share of the return is lost, as in 0.25; solved once
+    a problem and kept for ``control.strength`` of later runs, as ``bite:0.25``."""
+    steps: int | None = None
+    """Steps of the experts' training (disturbance --bite)."""
     folder: Path = Path("runs")
     """Whose disk to write to (ingest, scale, recovery), where to put the figure (soak, incontext) or an
     input that breaks something (fuzz), where to keep finished trainings (incontext)."""

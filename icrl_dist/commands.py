@@ -218,6 +218,7 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
     from icrl_dist.bench import (
+        bite,
         broadcast,
         disturbance,
         env,
@@ -242,6 +243,10 @@ def bench(arguments: Bench, console: Console) -> int:
         "recovery",
     ):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
+    if (arguments.name != "disturbance" or arguments.quick) and arguments.bite is not None:
+        raise ConfigError(f"--bite {arguments.bite:g}: it belongs to `bench disturbance`, without --quick")
+    if arguments.bite is None and arguments.steps is not None:
+        raise ConfigError(f"--steps {arguments.steps}: it belongs to `bench disturbance --bite`")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
         case "env":
@@ -275,8 +280,10 @@ def bench(arguments: Bench, console: Console) -> int:
             text = experts.describe(result)
         case "disturbance":
             say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
-            result = disturbance.run(arguments.problem, arguments.quick, say)
-            text = disturbance.describe(result)
+            if arguments.bite is None:
+                text = disturbance.describe(result := disturbance.run(arguments.problem, arguments.quick, say))
+            else:
+                text = bite.describe(result := bite.run(arguments.bite, arguments.problem, arguments.steps, say))
         case "monitor":
             with console.status("monitor"):
                 result = monitor.run(arguments.folder, *((2, 2.0) if arguments.quick else ()))
