@@ -31,7 +31,7 @@ export function drawAdaptation(rows) {
   chart ??= new Chart(byId("adaptation"), options);
   shown.phases = phases;
   const lines = columns.map((column) => x.map((_, index) => column[index] ?? null));
-  chart.draw([x, high, low, ...lines.toReversed()], [scaled, ...phases].join());
+  chart.draw([x, high, low, ...lines.toReversed()], [scaled, x.length < 2, ...phases].join());
   describe(columns, phases, known.length, rows.length, scaled);
 }
 

@@ -145,7 +145,7 @@ export class Timeline {
       axes: [axis({ size: 22, values: (_, ticks) => ticks.map(ago), space: 60 }), axis()],
       series: [
         { label: "", words: (value) => (value === undefined ? "" : ago(value)) },
-        ...names.map(({ label, ink: name, dash }) => line(label, name, { dash: dash ?? [] })),
+        ...names.map(({ label, ink: name, dash, points }) => line(label, name, { dash: dash ?? [], points: { show: points ?? false, size: 4 } })),
       ],
     }));
   }

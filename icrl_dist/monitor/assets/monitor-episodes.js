@@ -118,7 +118,8 @@ export class Beliefs {
     for (const [worker, belief] of Object.entries(beliefs)) {
       const pair = this.pairs.get(worker) ?? this.#pair(worker);
       const apart = belief.implied.reduce((sum, value, index) => sum + Math.abs(value - belief.exact[index]), 0) / 2;
-      say(pair.title, `${worker}, ${belief.identity}`);
+      say(pair.title, worker);
+      pair.title.title = belief.identity;
       say(pair.words, `total variation ${brief(apart)}`);
       const top = Math.max(...belief.implied, ...belief.exact);
       for (const [side, law] of [[pair.implied, belief.implied], [pair.exact, belief.exact]]) {
@@ -133,7 +134,7 @@ export class Beliefs {
   #pair(worker) {
     const map = (what) => el("canvas", { role: "img", "data-what": what, class: "map" });
     const pair = { title: el("p", { class: "small strong" }), words: el("p", { class: "small muted" }), implied: map("Implied by the model"), exact: map("Exact posterior") };
-    const figure = (canvas) => el("figure", {}, canvas, el("figcaption", { class: "small muted" }, canvas.dataset.what));
+    const figure = (canvas) => el("figure", {}, canvas, el("figcaption", { class: "small muted" }, canvas.dataset.what.split(" ")[0]));
     pair.element = el("div", { class: "stack" }, pair.title, el("div", { class: "pair" }, figure(pair.implied), figure(pair.exact)), pair.words);
     byId("beliefs").append(pair.element);
     this.pairs.set(worker, pair);

@@ -107,12 +107,11 @@ const COLUMNS = [
       cell.title = row.state === "gone" || row.state === "silent" ? `nothing heard for ${span(row.silent_s)}` : row.doing;
     },
   },
-  count("episodes_per_s", "Ep./s", "Episodes a second"),
+  { name: "job", title: "Job", value: (row) => row.job, fill: (cell, row) => (say(cell, row.job || "–"), (cell.title = row.doing)) },
   count("steps_per_s", "Steps/s", "Environment steps a second"),
   count("unstored", "Unstored", "Episodes finished and not yet acknowledged by the learner"),
   count("restarts", "Restarts", "Times it came back as another process"),
   { ...count("memory_mb", "MB", "Resident memory, megabytes"), text: (row) => (row.memory_mb ? number(row.memory_mb) : "–") },
-  { name: "job", title: "Job", value: (row) => row.job, fill: (cell, row) => (say(cell, row.job || "–"), (cell.title = row.doing)) },
 ];
 
 export class Workers {

@@ -33,7 +33,7 @@ const timelines = [
     { name: "unstored", label: "not yet stored", ink: "--series-4" },
     { name: "lag", label: "lag", ink: "--series-5", dash: [5, 3] },
   ]],
-  ["losses", [{ name: "loss", label: "loss", ink: "--series-1" }]],
+  ["losses", [{ name: "loss", label: "loss", ink: "--series-1", points: true }]],
 ].map(([id, names]) => ({ id, names, line: new Timeline(byId(id), names), title: byId(id).getAttribute("aria-label") }));
 
 watchTheme();
