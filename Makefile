@@ -3,14 +3,16 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# What Python compiles and pytest rewrites is kept for every process after the first.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test check format env clean
 
 demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
 	$(BIN)/icrl-dist train demo --overwrite
 
-test: env ## every test, file by file in three processes, the long ones first: many of them wait
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder tests/e2e tests/learner tests/actors tests
+test: env ## every test, file by file in three processes: many of them wait
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 check: env ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

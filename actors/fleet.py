@@ -13,7 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from icrl_dist import endpoints
+from actors.cluster import Cluster
+from actors.placement import Machine, Placement
 from icrl_dist.config import ConfigError
 
 _SETTINGS = {
@@ -23,6 +24,11 @@ _SETTINGS = {
 }
 JOIN_S = 600.0
 """Seconds that the machines of a cluster have to join it; the first time they install everything."""
+SHORT_S = 45.0
+"""Seconds after which a run says which machines are missing, and why."""
+NOTE_S = 5.0
+"""Seconds after which a run says that it waits."""
+_PAUSE_S = 0.25
 
 
 class FleetFailed(RuntimeError):  # noqa: N818
@@ -33,12 +39,13 @@ def _work(endpoint: str, run_name: str, name: str, folder: str | None, certifica
     """A worker's whole life, in a process that Ray made."""
     import torch
 
+    from actors import router
     from actors.worker import Worker
-    from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
     torch.set_num_threads(1)
-    with ZenohLink.connect(endpoint, timeout_s=30.0, config=security.client(certificates, "worker")) as link:
+    where, settings = router.reached(endpoint, certificates)
+    with ZenohLink.connect(where, timeout_s=30.0, config=settings) as link:
         Worker(link, run_name, name, folder=Path(folder) if folder else None).run()
 
 
@@ -50,19 +57,35 @@ def check_cores(actors: int) -> None:
 
 
 class Fleet:
-    """``actors`` Ray workers spread over the machines, each restarted at most ``restarts`` times in a row."""
+    """Ray workers spread over the machines, each restarted at most ``restarts`` times in a row.
 
-    def __init__(self, actors: int, restarts: int, address: str | None = None, oversubscribe: bool = False) -> None:
+    On a cluster machines may join and leave at any time: workers are placed where there is room, and
+    those of a machine that left go elsewhere, or wait for one.
+    """
+
+    def __init__(
+        self,
+        actors: int | None,
+        restarts: int,
+        address: str | None = None,
+        oversubscribe: bool = False,
+        at_least: int | None = None,
+    ) -> None:
         """Starts Ray here, or joins the cluster at ``address``.
 
-        Raises ConfigError if this machine has fewer cores than workers, unless they may share
-        them (``oversubscribe``): they would wait for ever.
+        ``actors``: how many workers, on a cluster as many as it has cores if None.  ``at_least``: so
+        many are enough to begin with, when others have not joined for ``SHORT_S``; ``actors`` of
+        them, or one, if None.  Raises ConfigError if this machine has fewer cores than workers, unless
+        they may share them (``oversubscribe``): they would wait for ever.
         """
         os.environ.update(_SETTINGS)
         import ray
 
         self._ray: Any = ray
+        self._address, self._restarts = address, restarts
+        self._at_least = at_least or actors or 1
         if address is None:
+            actors = actors or 1
             if not oversubscribe:
                 check_cores(actors)
             ray.init(
@@ -78,17 +101,59 @@ class Fleet:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             except (ConnectionError, ray.exceptions.AuthenticationError) as error:
                 raise ConfigError(f"--address {address}: {error}; `ray status` there says whether a cluster is up") from None
-        self._address, self._placed, self._noted = address, False, False
         self.deaths = 0
-        """Workers that died, however it happened."""
-        self._actors, self._restarts = actors, restarts
-        self._budget = dict.fromkeys(range(actors), restarts)
-        self._at_death = dict.fromkeys(range(actors), -1)
-        self._running: dict[Any, tuple[int, Any]] = {}
+        """Workers that died, however it happened; those that went with their machine are not among them."""
+        self._placement = Placement(actors)
+        self._cluster = Cluster(ray, self._placement) if address is not None else None
+        if address is None:
+            self._placement.join(Machine("", "127.0.0.1", "", actors or 1))
+        self._budget: dict[int, int] = {}
+        self._at_death: dict[int, int] = {}
+        self._running: dict[Any, tuple[int, Any, str]] = {}
         self._spare: Any = None
-        self._lives = dict.fromkeys(range(actors), 0)
+        self._lives: dict[int, int] = {}
         self._endpoint = self._run_name = self._certificates = ""
         self._folder: str | None = None
+        self._alone_since: float | None = None
+
+    def gather(
+        self, endpoint: str, connect: str, certificates: str, note: Callable[[str], None], stopped: Callable[[], bool]
+    ) -> None:
+        """Wait until the cluster's machines are here, each fit and able to reach the learner-to-be; nothing to do without one.
+
+        ``endpoint`` and ``connect`` as in ``config.StreamConfig``.  Returns early once ``stopped``.  After
+        ``SHORT_S`` it names what is missing and begins with what there is, if that is enough.
+        Raises ConfigError for a machine that does not fit, or if there are too few after ``JOIN_S``.
+        """
+        if self._cluster is None:
+            return
+        self._cluster.look_for(endpoint, connect, certificates)
+        began, noted, told = time.monotonic(), False, False
+        with self._cluster.listening(endpoint, connect):
+            while not stopped():
+                unfit = self._cluster.refresh(note)
+                if unfit:
+                    raise ConfigError("; ".join(unfit))
+                waited, room, wanted = time.monotonic() - began, self._placement.room, self._placement.wanted
+                if room >= self._at_least and (wanted is not None or not self._cluster.absent()) and room >= (wanted or 1):
+                    return
+                text = f"the cluster at {self._address} has {room} cores for {wanted or 'its'} workers"
+                if waited >= NOTE_S and not noted:
+                    noted = True
+                    note(f"{text} so far: waiting for more machines to join")
+                if waited >= SHORT_S and not told:
+                    told = True
+                    for line in self._cluster.absent() or [f"{text}: no machine is missing by its cluster file"]:
+                        note(line)
+                if waited >= SHORT_S and room >= self._at_least:
+                    note(f"beginning with {room} workers; others join when their machines do")
+                    return
+                if waited >= JOIN_S:
+                    raise ConfigError(
+                        f"{text} after {JOIN_S:.0f} s: ask for fewer with --actors or --min-actors; "
+                        "`ray status` says which machines are there"
+                    )
+                time.sleep(_PAUSE_S)
 
     def start(self, endpoint: str, run_name: str, folder: Path | None = None, certificates: str = "") -> None:
         """Take up the run whose learner is reached at ``endpoint``; ``watch`` launches its workers.
@@ -98,76 +163,101 @@ class Fleet:
         """
         self._endpoint, self._run_name, self._certificates = endpoint, run_name, certificates
         self._folder = str(folder.absolute()) if folder is not None else None
-        self._deadline = time.monotonic() + JOIN_S
+        if self._cluster is not None:
+            self._cluster.listens(endpoint)
 
-    def _place(self, note: Callable[[str], None]) -> None:
-        """Launch every worker once the cluster has a core for each: its machines join one by one.
+    def _host(self, cpus: int, node: str = "") -> Any:
+        where: Any = "SPREAD"
+        if node:
+            where = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node, soft=False)
+        return self._ray.remote(num_cpus=cpus, max_restarts=0, scheduling_strategy=where)(_Host).remote()
 
-        Raises ConfigError if they do not, or if other machines could not reach the learner.
-        """
-        cores = int(self._ray.cluster_resources().get("CPU", 0))
-        if cores < self._actors:
-            text = f"the cluster at {self._address} has {cores} cores for {self._actors} workers"
-            if time.monotonic() > self._deadline:
-                raise ConfigError(
-                    f"{text} after {JOIN_S:.0f} s: ask for fewer with --actors; `ray status` says which machines are there"
-                )
-            if not self._noted:
-                note(f"{text} so far: waiting for more machines to join")
-                self._noted = True
-            return
-        several = sum(node["Alive"] for node in self._ray.nodes()) > 1
-        if self._address is not None and several and endpoints.parse(self._endpoint).loopback:
-            raise ConfigError(
-                f"stream.endpoint = {self._endpoint!r}: other machines cannot reach it; name an address of this one, "
-                "as in --stream.endpoint tls/HEAD_IP:7447 --stream.certificates FOLDER"
-            )
-        for index in range(self._actors):
-            self._launch(index)
-        self._placed = True
+    def _name(self, index: int) -> str:
+        lives = self._lives.get(index, 0)
+        return f"w{index}-{lives}" if lives else f"w{index}"
 
-    def _host(self, cpus: int) -> Any:
-        return self._ray.remote(num_cpus=cpus, max_restarts=0, scheduling_strategy="SPREAD")(_Host).remote()
-
-    def _launch(self, index: int) -> None:
-        host, self._spare = self._spare or self._host(1), None
-        name = f"w{index}" if not self._lives[index] else f"w{index}-{self._lives[index]}"
-        self._running[host.work.remote(self._endpoint, self._run_name, name, self._folder, self._certificates)] = (index, host)
+    def _launch(self, index: int, node: str) -> None:
+        host, self._spare = self._spare or self._host(1, node), None
+        work = host.work.remote(self._endpoint, self._run_name, self._name(index), self._folder, self._certificates)
+        self._running[work] = (index, host, node)
 
     def watch(self, note: Callable[[str], None], progress: int) -> int:
         """Look after the workers once: restart those that died; returns how many are at work or to come.
 
         ``progress`` is any number that grows while the run gets on, such as trajectories stored:
         when it has grown since a worker's last death, that worker's budget is whole again.
-        Raises FleetFailed when a worker has died more often than its budget allows.
+        Raises FleetFailed when a worker has died more often than its budget allows, or when there
+        has been no machine for ``JOIN_S``.
         """
-        if not self._placed:
-            self._place(note)
-        elif progress and self._spare is None and self._address is None:
+        if self._cluster is not None:
+            for line in self._cluster.refresh(note):
+                note(f"{line}; no worker is placed there")
+            self._forget_those_that_went_with_their_machine()
+        elif progress and self._spare is None:
             self._spare = self._host(0)  # a cluster has no place that costs nothing
         ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0) if self._running else ([], [])
         for done in ready:
-            index, _host = self._running.pop(done)
+            index, _host, node = self._running.pop(done)
             try:
                 self._ray.get(done)
             except Exception as error:
-                cause = _cause(error)
-                self.deaths += 1
-                if progress > self._at_death[index]:
-                    self._budget[index] = self._restarts
-                self._at_death[index] = progress
-                if self._budget[index] == 0:
-                    times = self._restarts + 1
-                    raise FleetFailed(f"worker w{index} died {times} times without progress; last: {cause}") from None
-                self._budget[index] -= 1
-                self._lives[index] += 1
-                note(f"worker w{index} died ({cause}); starting it again")
-                self._launch(index)
-        return len(self._running) if self._placed else self._actors
+                self._ended(index, node, error, note, progress)
+            else:
+                self._leaves_its_place(index)
+        settled = self._placement.settle()
+        for index, machine in settled:
+            self._launch(index, machine.node)
+        if settled and self._cluster is not None:
+            note(f"workers: {self._placement.landed(self._name)}")
+        self._not_alone()
+        return len(self._running) + len(self._placement.waiting)
+
+    def _forget_those_that_went_with_their_machine(self) -> None:
+        for work, (index, host, node) in list(self._running.items()):
+            if node not in self._placement.machines:
+                del self._running[work]
+                self._lives[index] = self._lives.get(index, 0) + 1
+                with contextlib.suppress(Exception):  # it may be alive, cut off for good
+                    self._ray.kill(host)
+
+    def _leaves_its_place(self, index: int) -> None:
+        """It was told to stop: nobody stands where it stood, and nobody comes."""
+        if (machine := self._placement.where(index)) is not None:
+            machine.workers.discard(index)
+            machine.cores -= 1
+
+    def _ended(self, index: int, node: str, error: Exception, note: Callable[[str], None], progress: int) -> None:
+        """A worker died: with its machine, or by itself, which counts."""
+        self._lives[index] = self._lives.get(index, 0) + 1
+        if self._cluster is not None and self._cluster.lost(node, note):
+            return
+        self.deaths += 1
+        cause = _cause(error)
+        if progress > self._at_death.get(index, -1):
+            self._budget[index] = self._restarts
+        self._at_death[index] = progress
+        if self._budget.setdefault(index, self._restarts) == 0:
+            times = self._restarts + 1
+            raise FleetFailed(f"worker w{index} died {times} times without progress; last: {cause}") from None
+        self._budget[index] -= 1
+        note(f"worker w{index} died ({cause}); starting it again")
+        if self._placement.where(index) is not None:
+            self._launch(index, node)
+        else:
+            self._placement.waiting.append(index)
+
+    def _not_alone(self) -> None:
+        """Raises FleetFailed if the last machine went long ago."""
+        if self._cluster is None or self._placement.machines:
+            self._alone_since = None
+        elif self._alone_since is None:
+            self._alone_since = time.monotonic()
+        elif time.monotonic() - self._alone_since > JOIN_S:
+            raise FleetFailed(f"no machine has been there to work for {JOIN_S:.0f} s; `ray status` says why")
 
     def close(self) -> None:
         """End every worker, and Ray if it was started here."""
-        for host in [host for _, host in self._running.values()] + [self._spare] * (self._spare is not None):
+        for host in [host for _, host, _ in self._running.values()] + [self._spare] * (self._spare is not None):
             with contextlib.suppress(Exception):
                 self._ray.kill(host)
         self._running.clear()

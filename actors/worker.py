@@ -15,7 +15,7 @@ import icrl_dist
 from actors.beliefs import Beliefs
 from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
-from icrl_dist import crashes, jobs
+from icrl_dist import code, crashes, jobs
 from icrl_dist.config import parse
 from icrl_dist.envs import tasks
 from icrl_dist.models.dpt import PretrainedTransformer
@@ -56,7 +56,7 @@ class Worker:
         longer than ``patience_s``.
         """
         self._link.announce(self._keys.alive(self.name))
-        _, hello = self._ask("hello", version=icrl_dist.__version__, pid=os.getpid())
+        _, hello = self._ask("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
         run = parse(hello["run"], "the learner's run")
         policy = LivePolicy(self._link, self._keys, tasks.spec(run), run.model, run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)

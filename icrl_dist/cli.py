@@ -43,8 +43,10 @@ class Train:
     """``ray``: a learner process and Ray workers; ``inline``: all in this process, same results."""
     address: str | None = None
     """Address of a Ray cluster to take workers from; without it Ray starts here."""
-    actors: int = 2
-    """Workers."""
+    actors: int | None = None
+    """Workers: 2 on this machine; on a cluster as many as its machines have cores, and more when more join."""
+    min_actors: int | None = None
+    """On a cluster: begin with so many after a minute, though other machines have not joined."""
     oversubscribe: bool = False
     """Allow more workers than cores: slower, and the same results."""
     out: Path | None = None
@@ -151,12 +153,24 @@ class Bench:
 
     name: tyro.conf.Positional[
         Literal[
-            "env", "stream", "ingest", "broadcast", "recovery", "soak", "fuzz", "incontext", "experts", "disturbance", "monitor"
+            "env",
+            "stream",
+            "ingest",
+            "scale",
+            "broadcast",
+            "recovery",
+            "soak",
+            "fuzz",
+            "incontext",
+            "experts",
+            "disturbance",
+            "monitor",
         ]
     ]
     """``env``: environment steps a second, of simulated problems beside their library's own loop;
     ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
-    ``ingest``: trajectories a second onto the disk, with and without fsync; ``broadcast``: weights
+    ``ingest``: trajectories a second onto the disk, with and without fsync; ``scale``: the same from
+    1 to 256 simulated workers; ``broadcast``: weights
     to eight processes, beside ``ray.put`` and ``get``; ``recovery``: how soon a run is at work again
     after a worker or the learner was killed; ``soak``: does any process of a long run grow;
     ``fuzz``: 100,000 hostile inputs to every reader of bytes; ``incontext``: deployment and
@@ -168,12 +182,17 @@ class Bench:
     """Which environment: one such as ``dmc-cheetah-run`` (env: ``darkroom`` if not given;
     disturbance: every simulated one)."""
     seconds: float | None = None
-    """How long to measure (env, stream, ingest and soak)."""
+    """How long to measure (env, stream, ingest, scale and soak)."""
     quick: bool = False
     """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
     little and 3 episodes instead of 10 (disturbance), 2 pairs of short windows instead of 8 (monitor)."""
+    bite: float | None = None
+    """disturbance: instead, the strength at which that share of the return is lost, as in 0.25; solved once
+    a problem and kept for ``control.strength`` of later runs, as ``bite:0.25``."""
+    steps: int | None = None
+    """Steps of the experts' training (disturbance --bite)."""
     folder: Path = Path("runs")
-    """Whose disk to write to (ingest, recovery), where to put the figure (soak, incontext) or an
+    """Whose disk to write to (ingest, scale, recovery), where to put the figure (soak, incontext) or an
     input that breaks something (fuzz), where to keep finished trainings (incontext)."""
     json: bool = False
     """Print one JSON object on the last line."""
@@ -266,12 +285,47 @@ class Play:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each."""
+    """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each.
 
+    Or, with --cluster, a cluster file before `ray up`, without asking any machine or cloud; run it
+    where `ray up` will be run.  Or, with --address on its head, a cluster that is up: every
+    machine's versions, clock, shared memory, certificates, and the ports between them.
+    """
+
+    cluster: Path | None = None
+    """Cluster file to look through, such as deploy/clusters/aws.yaml."""
+    address: str | None = None
+    """Address of a Ray cluster, such as ``auto``."""
+    certificates: str = ""
+    """With --address: the folder of certificates on its machines."""
     endpoint: str = "tcp/127.0.0.1:0"
     """Where a learner would listen."""
     folder: Path = Path("runs")
     """Where run folders would be made."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run would take on N machines: hours, network, disk, and what holds it up first.
+
+    Times a little of each part of the run on this machine, some tens of seconds while nothing else
+    should run; machines are taken to be like this one.
+    """
+
+    run: tyro.conf.Positional[str]
+    """Name of a packaged run, or path of a run file."""
+    nodes: int = 1
+    """Machines that run workers."""
+    cores: int | None = None
+    """Workers on each; as many as this machine has cores if not given."""
+    gbit: float = 1.0
+    """What the learner's network carries, Gbit/s."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """SECTION.NAME=VALUE, as in adversary.count=16; may be given many times."""
+    rates: Path | None = None
+    """Rates that were measured before, or on another machine: what --json printed there."""
+    json: bool = False
+    """Print one JSON object on the last line, the rates included."""
 
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
@@ -285,6 +339,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "chaos": (Chaos, commands.chaos),
     "play": (Play, commands.play),
     "doctor": (Doctor, commands.doctor),
+    "plan": (Plan, commands.plan),
 }
 
 

@@ -19,16 +19,17 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.types import Identity
 
 if TYPE_CHECKING:
-    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Play, Tap, Train
+    from icrl_dist.cli import Bench, Chaos, Doctor, Evaluate, Explain, Export, Monitor, Plan, Play, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+LOCAL_ACTORS = 2
+"""Workers on one machine, if nobody says how many."""
 
 
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
-    from icrl_dist import heldout, launch
-    from icrl_dist.agent import checkpoint_file
+    from icrl_dist import launch
     from icrl_dist.files import atomic_write, save_checkpoint
     from icrl_dist.terminal import Display
 
@@ -39,10 +40,12 @@ def train(arguments: Train, console: Console) -> int:
     run = override(arguments.config, arguments.set, "--set")
     validate(run, arguments.run or str(arguments.source))
     folder = (arguments.out or Path("runs") / name).absolute()
-    if arguments.actors < 1:
-        raise ConfigError(f"--actors {arguments.actors}: at least 1 worker is needed")
+    for option, value in (("--actors", arguments.actors), ("--min-actors", arguments.min_actors)):
+        if value is not None and value < 1:
+            raise ConfigError(f"{option} {value}: at least 1 worker is needed")
+    actors = LOCAL_ACTORS if arguments.actors is None and arguments.address is None else arguments.actors
     if arguments.engine == "ray" and arguments.address is None and not arguments.oversubscribe:
-        check_cores(arguments.actors)
+        check_cores(actors or LOCAL_ACTORS)
     if arguments.engine == "ray":
         launch.check_security(run, arguments.address)
     launch.prepare(run, folder, arguments.resume, arguments.overwrite, source)
@@ -52,9 +55,11 @@ def train(arguments: Train, console: Console) -> int:
             if arguments.engine == "inline":
                 result = launch.train_inline(run, folder, display.report)
             else:
-                result = launch.train_ray(
-                    run, folder, arguments.actors, arguments.address, display.report, arguments.oversubscribe
-                )
+                options = (arguments.oversubscribe, arguments.min_actors)
+                result = launch.train_ray(run, folder, actors, arguments.address, display.report, *options)
+            from icrl_dist import heldout  # torch with it, which neither the learner nor the workers should wait for
+            from icrl_dist.agent import checkpoint_file
+
             if run.method != "experts":
                 save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
                 results = heldout.online(run, folder, display)
@@ -212,7 +217,21 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
 
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
-    from icrl_dist.bench import broadcast, disturbance, env, experts, fuzz, incontext, ingest, monitor, recovery, soak, stream
+    from icrl_dist.bench import (
+        bite,
+        broadcast,
+        disturbance,
+        env,
+        experts,
+        fuzz,
+        incontext,
+        ingest,
+        monitor,
+        recovery,
+        scale,
+        soak,
+        stream,
+    )
 
     if arguments.seconds is not None and arguments.name in (
         "broadcast",
@@ -224,6 +243,10 @@ def bench(arguments: Bench, console: Console) -> int:
         "recovery",
     ):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
+    if (arguments.name != "disturbance" or arguments.quick) and arguments.bite is not None:
+        raise ConfigError(f"--bite {arguments.bite:g}: it belongs to `bench disturbance`, without --quick")
+    if arguments.bite is None and arguments.steps is not None:
+        raise ConfigError(f"--steps {arguments.steps}: it belongs to `bench disturbance --bite`")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
         case "env":
@@ -232,6 +255,10 @@ def bench(arguments: Bench, console: Console) -> int:
             result, text = (r := stream.run(**timed)), stream.describe(r)
         case "ingest":
             result, text = (r := ingest.run(arguments.folder, **timed)), ingest.describe(r)
+        case "scale":
+            with console.status("scale"):
+                result = scale.run(arguments.folder, **timed)
+            text = scale.describe(result)
         case "broadcast":
             result, text = (r := broadcast.run()), broadcast.describe(r)
         case "recovery":
@@ -253,8 +280,10 @@ def bench(arguments: Bench, console: Console) -> int:
             text = experts.describe(result)
         case "disturbance":
             say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
-            result = disturbance.run(arguments.problem, arguments.quick, say)
-            text = disturbance.describe(result)
+            if arguments.bite is None:
+                text = disturbance.describe(result := disturbance.run(arguments.problem, arguments.quick, say))
+            else:
+                text = bite.describe(result := bite.run(arguments.bite, arguments.problem, arguments.steps, say))
         case "monitor":
             with console.status("monitor"):
                 result = monitor.run(arguments.folder, *((2, 2.0) if arguments.quick else ()))
@@ -319,8 +348,31 @@ def play(arguments: Play, console: Console) -> int:
 
 def doctor(arguments: Doctor, console: Console) -> int:
     """``icrl-dist doctor``: exit code 1 if anything would stop a run."""
-    from icrl_dist.doctor import diagnose, table
+    from icrl_dist.doctor import diagnose, diagnose_cluster, diagnose_file, table
 
-    findings = diagnose(arguments.endpoint, arguments.folder)
+    if arguments.cluster is not None:
+        findings = diagnose_file(arguments.cluster, Path())
+    elif arguments.address is not None:
+        findings = diagnose_cluster(arguments.address, arguments.endpoint, arguments.certificates)
+    else:
+        findings = diagnose(arguments.endpoint, arguments.folder)
     console.print(table(findings), highlight=False, markup=False)
     return FAILED if any(finding.ok is False for finding in findings) else OK
+
+
+def plan(arguments: Plan, console: Console) -> int:
+    """``icrl-dist plan``: an estimate from measured rates."""
+    from icrl_dist import estimate
+    from icrl_dist.bench import rates
+
+    run = override(load(arguments.run), arguments.set, "--set")
+    if arguments.rates is not None:
+        found = estimate.Rates.read(arguments.rates, arguments.run)
+    else:
+        with console.status("plan") as status:
+            found = rates.measure(run, arguments.run, lambda said: status.update(f"timing {said}"))
+    answer = estimate.estimate(found, arguments.nodes, arguments.cores or found.cores, arguments.gbit)
+    console.print(estimate.describe(answer), highlight=False, markup=False)
+    if arguments.json:
+        print(json.dumps({**answer, "rates": found.as_dict()}))
+    return OK

@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from icrl_dist import bites
 from icrl_dist.alerts import AlertsConfig
 from icrl_dist.games import PROBLEMS, ControlConfig, SACConfig
 from icrl_dist.limits import validate
@@ -334,7 +335,10 @@ def _from_tables(tables: dict[str, Any], source: str) -> Run:
     """The run that TOML tables describe.  Raises ConfigError naming ``source`` and the key."""
     run = typing.cast(Run, build(Run, tables, source))
     validate(run, source)
-    return run
+    try:
+        return replace(run, control=bites.resolved(run.control, run.problem))
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
 
 
 def override(run: Run, settings: Sequence[str], source: str) -> Run:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import io
+import logging
 import os
 import re
 import resource
@@ -10,30 +14,22 @@ import socket
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import psutil
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from icrl_dist import clusterfile, endpoints, machines, nodes
 from icrl_dist.config import ConfigError
+from icrl_dist.findings import Finding, table
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
 GIB = 1 << 30
 
-
-@dataclass(frozen=True)
-class Finding:
-    """The answer to one question."""
-
-    name: str
-    ok: bool | None
-    """None is a warning: a run starts, but something may go short."""
-    value: str
-    remedy: str = ""
-    """What to do; empty where there is nothing to do."""
+__all__ = ["Finding", "diagnose", "diagnose_cluster", "diagnose_file", "need_ray_token", "table"]
 
 
 def diagnose(endpoint: str, folder: Path) -> list[Finding]:
@@ -53,14 +49,6 @@ def diagnose(endpoint: str, folder: Path) -> list[Finding]:
         _ray_token(),
         _gpu(),
     ]
-
-
-def table(findings: list[Finding]) -> str:
-    """The findings for people, one line each, the remedy behind an arrow."""
-    mark = {True: "ok  ", None: "warn", False: "FAIL"}
-    width = max((len(f.name) for f in findings), default=0)
-    lines = [f"{mark[f.ok]}  {f.name:<{width}}  {f.value}" + (f"  -> {f.remedy}" if f.remedy else "") for f in findings]
-    return "\n".join(line.replace("\n", " ") for line in lines)
 
 
 def _python() -> Finding:
@@ -212,3 +200,53 @@ def _gpu() -> Finding:
         return Finding("GPU", True, "none seen by torch: the learner fits on the CPU")
     count = torch.cuda.device_count()
     return Finding("GPU", True, f"{count} x {torch.cuda.get_device_name(0)}")
+
+
+def diagnose_file(file: Path, root: Path) -> list[Finding]:
+    """A cluster file, offline: Ray's own opinion of it, then ours.  Raises ConfigError if it is none."""
+    config = clusterfile.load(file)
+    ray = _ray_accepts(config)
+    return [ray, *(clusterfile.findings(config, root) if ray.ok else ())]
+
+
+def _ray_accepts(config: dict[str, Any]) -> Finding:
+    from jsonschema import ValidationError
+    from ray.autoscaler._private.util import prepare_config, validate_config
+
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # Ray warns of mounts that are files, which concerns Docker only
+            validate_config(prepare_config(copy.deepcopy(config)))
+    except ValidationError as error:
+        where = ".".join(map(str, error.absolute_path)) or "the file"
+        return Finding(
+            "Ray's schema", False, f"{where}: {error.message}", "correct it: docs.ray.io, cluster YAML configuration"
+        )
+    except Exception as error:  # Ray raises whatever its providers do, down to AttributeError
+        return Finding(
+            "Ray's schema", False, f"{type(error).__name__}: {error}", "compare it with the files in deploy/clusters/"
+        )
+    return Finding("Ray's schema", True, "accepted")
+
+
+def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Finding]:
+    """A live cluster, asked through Ray: every machine's versions, clock, shared memory, certificates and the ports it needs.
+
+    ``endpoint``: where the learner would listen on this machine, which is taken to be the head.
+    Raises ConfigError if the cluster does not answer.
+    """
+    import ray as module
+
+    ray: Any = module
+    need_ray_token(address)
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+        raise ConfigError(f"--address {address}: {error}; `ray status` there says whether a cluster is up") from None
+    try:
+        where = endpoints.parse(endpoint)
+        with nodes.listening(where.host, where.port) as port:
+            return machines.examine(ray, (where.host, port), certificates)
+    except OSError as error:
+        return [Finding("stream endpoint", False, f"{endpoint}: {error}", "choose an address of the head and a free port")]
+    finally:
+        ray.shutdown()

@@ -53,7 +53,11 @@ def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajec
     a trajectory, of ``stretch`` states, a share ``misled`` of them led by another's expert.  Raises
     RuntimeError for a variation whose simulation keeps breaking down.
     """
-    found = _histories(job, sac_of(job), tell)
+    yield from delivered(job, _histories(job, sac_of(job), tell), worker)
+
+
+def delivered(job: Job, found: Sequence[History], worker: str) -> Iterator[Trajectory]:
+    """``job.trials`` episodes of each variation's history, evenly spaced, with query states and labels."""
     for row, (task, variation) in enumerate(job.rows()):
         history = found[row]
         chosen = np.linspace(0, len(history.rewards) - 1, job.trials).round().astype(int)
@@ -136,16 +140,28 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     rng = Identity(job.stage, job.round, job.task, job.first, 0).rng(job.seed)
     seed, chance = int(rng.integers(2**31)), int(rng.integers(2**31))
     experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seed, progress, state=state)
-    columns = _labelled(recorder.columns(), experts)
-    led = _lead(env, experts, chance)
-    actors = experts.arrays["actor"].cpu().numpy()
+    columns, led = labelled(recorder.columns(), experts), lead(env, experts, chance)
+    made = assembled(job, columns, led, experts.arrays["actor"].cpu().numpy(), tell)
+    if part is not None:
+        part.unlink(missing_ok=True)
+    return made
+
+
+def assembled(
+    job: Job, columns: dict[str, np.ndarray], led: dict[str, np.ndarray], actors: np.ndarray, tell: Tell
+) -> list[History]:
+    """The history of each variation, without the episodes that broke down.
+
+    Raises RuntimeError for a variation of which nothing is left.
+    """
     parts, made = {"": columns, "led_": led}, []
     for row, variation in enumerate(job.variations):
         whole = {prefix: of["whole"][row] for prefix, of in parts.items()}
         lost = sum(int((~one).sum()) for one in whole.values())
         if lost:
             tell(f"{job.label}: {lost} episodes of {variation} broke down, and are left out", note=True)
-        if not all(one.any() for one in whole.values()) or led["wrong"][row][whole["led_"]].all():
+        broken = not all(one.any() for one in whole.values() if len(one))
+        if broken or (led["wrong"].size and led["wrong"][row][whole["led_"]].all()):
             raise RuntimeError(f"{variation}: its simulation breaks down in every episode; leave it out, or push it less")
         taken = {
             prefix + name: column[row][whole[prefix]]
@@ -154,15 +170,14 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
             if name != "whole"
         }
         made.append(History(**taken, actor=actors[row]))
-    if part is not None:
-        part.unlink(missing_ok=True)
     return made
 
 
-def _labelled(columns: dict[str, np.ndarray], experts: SACBatch) -> dict[str, np.ndarray]:
+def labelled(columns: dict[str, np.ndarray], experts: SACBatch | None) -> dict[str, np.ndarray]:
     """Episodes with the right action at each of their states in place of the true states."""
     truths = columns.pop("truths", None)
     if truths is None:
+        assert experts is not None, "a game without a scripted policy"
         seen = columns["observations"][:, :, :-1]
         labels = experts.act(seen.reshape(len(seen), -1, seen.shape[-1]), None, deterministic=True)
     else:
@@ -170,7 +185,7 @@ def _labelled(columns: dict[str, np.ndarray], experts: SACBatch) -> dict[str, np
     return {**columns, "labels": labels.reshape(columns["actions"].shape)}
 
 
-def _lead(env: Batch, experts: SACBatch, seed: int) -> dict[str, np.ndarray]:
+def lead(env: Batch, experts: SACBatch | None, seed: int) -> dict[str, np.ndarray]:
     """``LED`` episodes in which each row's own expert acts, and, if there are several, as many in which the next row's does."""
     count = env.batch
     recorder = Recorder(env, episodes := 2 * LED if count > 1 else LED, episodes)
@@ -182,17 +197,18 @@ def _lead(env: Batch, experts: SACBatch, seed: int) -> dict[str, np.ndarray]:
         for _ in range(env.spec.horizon):
             seen = recorder.step(_led_by(by, seen, getattr(env, "truth", None), experts)).observation
     wrong = np.broadcast_to(np.arange(episodes) >= LED, (count, episodes))
-    columns = _labelled(recorder.columns(), experts)
+    columns = labelled(recorder.columns(), experts)
     del columns["adversary"]  # zeta holds nothing of it
     return {**columns, "wrong": wrong}
 
 
 def _led_by(
-    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, experts: SACBatch
+    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, experts: SACBatch | None
 ) -> Float32[np.ndarray, "B A"]:
     """What the expert ``by[r]`` does in row r; Meta-World's is the scripted policy that is told that row's goal."""
     if truth is not None:
         return scripted(np.concatenate([truth[:, :-3], truth[by, -3:]], axis=1))
+    assert experts is not None, "a game without a scripted policy"
     asked = np.empty_like(seen)
     asked[by] = seen
     return experts.act(asked, None, deterministic=True)[by]

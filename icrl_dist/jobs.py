@@ -18,6 +18,7 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.heads import sample
 from icrl_dist.oracle import Hypotheses, cell_numbers, heuristic_labels, soft_labels
 from icrl_dist.rollout import Episodes, InContextPolicy, deploy_online, episode, in_context
+from icrl_dist.scripted import scripted_context
 from icrl_dist.types import Identity, Job, Spec, Trajectory, Variation
 
 
@@ -44,9 +45,11 @@ def do(job: Job, policies: Policies, worker: str, tell: Tell = unheard, look: Lo
         return random_context(job, worker)
     if job.kind == "train_expert":
         return train_expert(job, worker, tell)
+    if job.kind == "scripted_context":
+        return scripted_context(job, worker, tell)
     if job.kind == "adapt":
         return adapt(job, policies, worker, look)
-    raise ValueError(f"job kind {job.kind!r}: this worker knows random_context, train_expert and adapt")
+    raise ValueError(f"job kind {job.kind!r}: this worker knows random_context, train_expert, scripted_context, adapt")
 
 
 def random_context(job: Job, worker: str) -> Iterator[Trajectory]:

@@ -136,7 +136,13 @@ def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
 
 
 def train_ray(
-    run: Run, folder: Path, actors: int, address: str | None, report: Report, oversubscribe: bool = False
+    run: Run,
+    folder: Path,
+    actors: int | None,
+    address: str | None,
+    report: Report,
+    oversubscribe: bool = False,
+    at_least: int | None = None,
 ) -> dict[str, Any]:
     """The whole run with a learner process and Ray workers; returns the learner's result.
 
@@ -148,11 +154,21 @@ def train_ray(
     interrupted = threading.Event()
     with contextlib.ExitStack() as stack:
         stack.enter_context(_on_signals(interrupted.set))
-        learner = _Learner(folder, run.stream.endpoint, run.learner.restarts)
-        stack.callback(learner.end)
-        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe)
+        if address is None:  # both start at once; on a cluster nothing does before its machines are known to fit
+            learner = stack.enter_context(_learner(run, folder))
+        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least)
         stack.callback(fleet.close)
         stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
+        if address is not None:
+            note = lambda text: report({"event": "note", "text": text})  # noqa: E731
+            try:
+                fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
+                if interrupted.is_set():
+                    raise TrainInterrupted
+            except (ConfigError, TrainInterrupted):
+                _unmake(folder)
+                raise
+            learner = stack.enter_context(_learner(run, folder))
         result: dict[str, Any] | None = None
         started = False
         stored = given_up = 0
@@ -181,6 +197,21 @@ def train_ray(
                     raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
                 if not working:
                     raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
+
+
+def _unmake(folder: Path) -> None:
+    """Remove a run folder in which nothing has happened yet, so that the same command can be given again."""
+    if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
+        shutil.rmtree(folder)
+
+
+@contextlib.contextmanager
+def _learner(run: Run, folder: Path) -> Iterator[_Learner]:
+    learner = _Learner(folder, run.stream.endpoint, run.learner.restarts)
+    try:
+        yield learner
+    finally:
+        learner.end()
 
 
 class _Learner:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from icrl_dist import endpoints
+from icrl_dist import bites, endpoints
 from icrl_dist.games import PROBLEMS
 from icrl_dist.tables import ConfigError, nearest
 
@@ -38,6 +38,13 @@ def validate(run: Run, source: str) -> None:
         need(0 <= p <= 1, "evaluate.p", p, "a probability lies in [0, 1]")
     need(len(run.evaluate.p) > 0, "evaluate.p", run.evaluate.p, "name at least one override probability")
     room_or_game = "Dark Room has exact labels and no experts: use dpt, icag or icaa"
+    if isinstance(run.control.strength, str):
+        try:
+            bites.share(run.control.strength)
+        except ConfigError as error:
+            raise ConfigError(f"{source}: {error}") from None
+        in_rooms = "Dark Room's adversaries override actions, see adversary.p_max: leave it out"
+        need(run.problem != "darkroom", "control.strength", run.control.strength, in_rooms)
     need(run.method != "experts" or run.problem != "darkroom", "method", run.method, room_or_game)
     if run.problem != "darkroom":
         train = run.control.train_tasks
@@ -121,6 +128,14 @@ Need = Callable[[bool, str, object, str], None]
 def _validate_control(run: Run, need: Need) -> None:
     """What a run of a continuous game may be."""
     control, count = run.control, run.control.train_tasks
+    scripted = control.histories == "scripted"
+    need(
+        run.problem.startswith("metaworld") or not scripted,
+        "control.histories",
+        control.histories,
+        "only Meta-World has a scripted policy",
+    )
+    need(run.method != "experts" or not scripted, "control.histories", control.histories, "experts are made for sac")
     if run.problem.startswith("dmc-"):
         need(count in (4, 16, 36), "control.train_tasks", count, "the centre of the grid has 4, 16 or 36 tasks")
         need(
@@ -133,7 +148,10 @@ def _validate_control(run: Run, need: Need) -> None:
         need(control.horizon <= 500, "control.horizon", control.horizon, "Meta-World allows at most 500 steps")
         need(0 <= control.disturbance <= 0.1, "control.disturbance", control.disturbance, "0 to 0.1 metres")
     need(control.horizon >= 0, "control.horizon", control.horizon, "at least 0, which is the problem's own")
-    need(0 <= control.strength < math.inf, "control.strength", control.strength, "must not be negative, and be finite")
+    if isinstance(control.strength, float):
+        need(0 <= control.strength < math.inf, "control.strength", control.strength, "must not be negative, and be finite")
+    elif run.problem.startswith("metaworld"):
+        need(control.disturbance > 0, "control.disturbance", control.disturbance, "a bite needs something to multiply")
     need(
         run.practice.rounds == 0, "practice.rounds", run.practice.rounds, "only Dark Room's labels can be had of new histories"
     )

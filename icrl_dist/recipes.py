@@ -96,14 +96,13 @@ def _labelling(run: Run) -> Params:
     )
 
 
-def _of_experts(run: Run) -> Params:
-    """The same of a job that trains experts."""
+def _of_histories(run: Run) -> Params:
+    """The same in a continuous game."""
     return (
         ("misled", run.pretrain.misled),
         ("queries", run.pretrain.queries),
         ("stretch", run.model.stretch),
         ("stretches", run.pretrain.stretches),
-        *histories.settings(run.sac),
     )
 
 
@@ -111,12 +110,14 @@ def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], t
     """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
 
     All methods and all K share out the same ``pretrain.contexts`` episodes.  In a continuous game
-    contexts are histories of SAC experts.
+    contexts are histories of SAC experts, or of Meta-World's scripted policy.
     """
     if run.problem == "darkroom":
         kind, settings = "random_context", (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
     else:
-        kind, settings = "train_expert", _of_experts(run)
+        kind, settings = "train_expert", (*_of_histories(run), *histories.settings(run.sac))
+        if run.control.histories == "scripted":
+            kind, settings = "scripted_context", _of_histories(run)
     chosen = [variations(i, task) for i, task in enumerate(tasks.split(run).train)]
     trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
     return _jobs(run, phase, kind, chosen, trials, settings)

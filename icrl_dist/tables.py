@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import types
 import typing
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -73,6 +74,13 @@ def _value(hint: Any, value: Any, source: str, where: str) -> Any:
         if not isinstance(value, list):
             raise ConfigError(f"{source}: {where} = {value!r}: expected a list")
         return tuple(_value(typing.get_args(hint)[0], v, source, where) for v in value)
+    if origin is types.UnionType:  # float | str: a whole number is a float
+        kinds = typing.get_args(hint)
+        named = " or ".join(kind.__name__ for kind in kinds)
+        whole = float in kinds and type(value) is int
+        if not whole and type(value) not in kinds:
+            raise ConfigError(f"{source}: {where} = {value!r}: expected {named}, got {type(value).__name__}")
+        return float(value) if whole else value
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not hint:

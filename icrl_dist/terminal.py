@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from icrl_dist.evaluate import EXPERT, ORACLE, SCRIPTED, Result
+if TYPE_CHECKING:
+    from icrl_dist.evaluate import Result
 
 _PERIOD_S = 10.0
 
@@ -55,7 +56,9 @@ class Display:
                 highlight=False,
             )
         elif kind == "listening":
-            self.console.print(f"learner listens at {event['endpoint']}, weights version {event['version']}", highlight=False)
+            where = f"learner on {event['host']} ({event['device']})"
+            told = f"{where} listens at {event['endpoint']}, weights version {event['version']}"
+            self.console.print(told, highlight=False, markup=False)
         elif kind in ("note", "worker", "alert", "crash", "quarantine", "repaired", "interrupted"):
             self.console.print(event["text"], highlight=False, markup=False)
 
@@ -98,6 +101,8 @@ def _info(event: dict[str, Any]) -> str:
 
 def returns_table(results: Sequence[Result], title: str) -> Table:
     """Mean return by online episode, a row an agent and p, the last column beside the optimum."""
+    from icrl_dist.evaluate import EXPERT, ORACLE, SCRIPTED
+
     episodes = results[0].returns.shape[2]
     shown = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes]
     last = min(5, episodes)

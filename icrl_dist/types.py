@@ -250,7 +250,7 @@ class Job:
     """
 
     kind: str
-    """A function of ``jobs.py``: ``random_context``, ``train_expert`` or ``adapt``."""
+    """A function of ``jobs.py``: ``random_context``, ``train_expert``, ``scripted_context`` or ``adapt``."""
     stage: str
     round: int
     task: int

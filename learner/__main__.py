@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -64,7 +65,8 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
         _end_with_parent(service)
         where = folder / "endpoint"
         where.write_text(link.endpoints[0] + "\n")
-        report({"event": "listening", "endpoint": link.endpoints[0], "version": service.version})
+        place = {"endpoint": link.endpoints[0], "host": socket.gethostname(), "device": service.device}
+        report({"event": "listening", **place, "version": service.version})
         try:
             report({"event": "finished", **service.run()})
             service.desk.finish()  # not before: workers that end before the run does would look lost

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import icrl_dist
-from icrl_dist import crashes
+from icrl_dist import code, crashes
 from icrl_dist.config import Run, dumps
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link, Query
@@ -213,6 +213,9 @@ class Desk:
         if kind == "hello":
             if fields["version"] != icrl_dist.__version__:
                 raise ValueError(f"worker {worker} runs icrl-dist {fields['version']}, the learner {icrl_dist.__version__}")
+            if fields["code"] != code.digest():
+                theirs = str(fields["code"])[:8]
+                raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {code.digest()[:8]}")
             return wire.encode_message("hello", run=dumps(self._run))
         if kind == "ask":
             self._hear(fields)

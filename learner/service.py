@@ -107,6 +107,12 @@ class Service:
         self._taking = False
         self._take_up()
 
+    @property
+    def device(self) -> str:
+        """Where fits run, and with what: ``cuda, NVIDIA H100``, ``cpu, 2 threads``."""
+        kind = self.model.low.device
+        return f"cuda, {torch.cuda.get_device_name(kind)}" if kind.type == "cuda" else f"cpu, {self._threads} threads"
+
     # What other threads call.
 
     def stop(self) -> None:

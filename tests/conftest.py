@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import jaxtyping
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for programs that tests start; two threads wait for each other beside others
+
 import pytest
 import torch
 
@@ -16,7 +18,7 @@ pytest.register_assert_rewrite("tests.contracts")
 
 imported = [name for name in sys.modules if name.split(".")[0] == "icrl_dist"]
 assert not imported, f"{imported} were imported before the import hook: their shapes would go unchecked"
-jaxtyping.install_import_hook("icrl_dist", f"{tests.typecheck.__name__}.check")
+tests.typecheck.install("icrl_dist")
 torch.set_num_threads(1)
 
 from icrl_dist.config import (  # noqa: E402
@@ -35,6 +37,19 @@ from icrl_dist.config import (  # noqa: E402
 from icrl_dist.envs import darkroom  # noqa: E402
 from icrl_dist.stream.memory_link import MemoryHub, MemoryLink  # noqa: E402
 from icrl_dist.types import Task  # noqa: E402
+
+FIRST = ("e2e", "learner", "actors")
+"""Folders whose tests wait and run long: begun first, they leave no processor idle at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+
+    def turn(item: pytest.Item) -> int:
+        folder = item.path.relative_to(here).parts[0]
+        return FIRST.index(folder) if folder in FIRST else len(FIRST)
+
+    items.sort(key=turn)
 
 
 @pytest.fixture

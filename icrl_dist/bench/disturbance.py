@@ -25,7 +25,7 @@ from icrl_dist.games import SACConfig
 from icrl_dist.histories import History
 from icrl_dist.rollout import Actor, deploy_online
 from icrl_dist.tables import nearest
-from icrl_dist.types import Job, Task, Variation
+from icrl_dist.types import Adversary, Job, Task, Variation
 
 PROBLEMS = (*problems.PROBLEMS, pick_place.KIND)
 WEAK = 0.02
@@ -202,14 +202,18 @@ def _chance(episode: int, task: int) -> np.random.Generator:
 
 def variations(one: Setting, sizes: Sizes) -> tuple[list[Variation], int]:
     """The null adversary and K of strength 1 in each task, task by task; and how many tasks."""
-    rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_ADVERSARIES,)))
-    pushes = networks(rng, sizes.adversaries + 1, envs.spec(one.task), one.outputs, 1.0)
     tasks: tuple[Task, ...] = (one.task,)
     if one.task.kind == pick_place.KIND:
         from icrl_dist.envs.metaworld import ml1_tasks
 
         tasks = ml1_tasks(sizes.tasks)
-    return [Variation(task, push) for task in tasks for push in pushes], len(tasks)
+    return [Variation(task, push) for task in tasks for push in pushes(one, sizes.adversaries)], len(tasks)
+
+
+def pushes(one: Setting, count: int, strength: float = 1.0) -> tuple[Adversary, ...]:
+    """The null adversary and ``count`` others, at every strength the same ones."""
+    rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_ADVERSARIES,)))
+    return networks(rng, count + 1, envs.spec(one.task), one.outputs, strength)
 
 
 def lost(returns: Float[np.ndarray, "C R"]) -> dict[str, float | None]:

@@ -18,6 +18,8 @@ MOVED = 9
 
 _LOW = {"object": (-0.1, 0.6, 0.02), "goal": (-0.1, 0.8, 0.05)}
 _HIGH = {"object": (0.1, 0.7, 0.02), "goal": (0.1, 0.9, 0.3)}
+GOALS = _LOW["goal"], _HIGH["goal"]
+"""The box that goals lie in, in metres."""
 
 
 def task(object: Sequence[float], goal: Sequence[float], **settings: object) -> Task:

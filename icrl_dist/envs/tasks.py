@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icrl_dist import envs
+from icrl_dist import bites, envs
 from icrl_dist.config import Run
 from icrl_dist.envs import darkroom, pick_place, problems
 from icrl_dist.envs.adversary import adversary_set, sample_dirichlet
@@ -94,7 +94,7 @@ def variations(run: Run, index: int, task: Task, round: int = 0) -> tuple[Variat
     """
     rng = np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_PRIORS, index, round)))
     if run.problem != "darkroom":
-        pushes = networks(rng, run.adversary.count, spec(run), disturbance(run), run.control.strength)
+        pushes = networks(rng, run.adversary.count, spec(run), disturbance(run), bites.strength(run.control, run.problem))
         return tuple(Variation(task, one) for one in pushes)
     adversaries = adversary_set(rng, run.adversary.count, darkroom.ACTIONS, run.adversary.p_max)
     return tuple(Variation(task, a) for a in adversaries)
@@ -112,7 +112,7 @@ def test_adversary(run: Run, index: int, p: float, prior: str) -> Adversary:
     rng = np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_UNSEEN, index)))
     if run.problem != "darkroom":
         seed = int(rng.integers(2**31))
-        return network(seed, spec(run).observation, disturbance(run), p * run.control.strength)
+        return network(seed, spec(run).observation, disturbance(run), p * bites.strength(run.control, run.problem))
     if prior == "uniform":
         return Adversary.of("uniform", p=p)
     return sample_dirichlet(rng, darkroom.ACTIONS, 1.0).replace(p=p)

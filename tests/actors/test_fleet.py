@@ -1,88 +1,251 @@
 """Where and when a fleet launches its workers, against a Ray that only keeps account."""
 
+import socket
 import sys
 from types import SimpleNamespace
 
 import pytest
 
-from actors import fleet
+from actors import cluster, fleet, missing
+from icrl_dist import nodes
 from icrl_dist.config import ConfigError
 
-OURS, HEADS = "tcp/127.0.0.1:7447", "tls/192.0.2.10:7447"
+OURS, HEADS = "tcp/127.0.0.1:0", "tls/localtest:7447"
 
 
 class AccountingRay:
-    """A cluster of machines, each with the cores that ``cores`` says."""
+    """A cluster of machines, each with the cores that ``cores`` says; ``answers`` change what a machine says of itself."""
 
     exceptions = SimpleNamespace(AuthenticationError=PermissionError)
+    util = SimpleNamespace(
+        scheduling_strategies=SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, soft: (node, soft))
+    )
 
     def __init__(self, *cores):
-        self.cores = list(cores)
-        self.placed = []
+        self.cores = dict(enumerate(cores))
+        self.placed, self.ended, self.killed = [], {}, []
+        self.answers = {}
 
     def init(self, address, **options):
         if address == "192.0.2.99:6379":
             raise ConnectionError("nobody there")
 
-    def cluster_resources(self):
-        return {"CPU": float(sum(self.cores))}
-
     def nodes(self):
-        return [{"Alive": True} for _ in self.cores]
+        return [
+            {"NodeID": f"n{i}", "Alive": cores is not None, "NodeManagerAddress": f"10.0.0.{i}", "Resources": {"CPU": cores}}
+            for i, cores in self.cores.items()
+        ]
 
-    def remote(self, **options):
-        def place(host):
-            self.placed.append(options)
-            work = SimpleNamespace(remote=lambda endpoint, run_name, name, *_: name)
+    def remote(self, num_cpus, scheduling_strategy, **options):
+        node, soft = scheduling_strategy
+        assert soft is False
+
+        def made(what):
+            if what is nodes.facts:
+                return SimpleNamespace(remote=lambda certificates, ports: ("facts", node, tuple(ports)))
+            self.placed.append((node, num_cpus))
+            work = SimpleNamespace(remote=lambda endpoint, run_name, name, *_: ("work", node, name))
             return SimpleNamespace(remote=lambda: SimpleNamespace(work=work))
 
-        return place
+        return made
 
-    def wait(self, running, **_):
-        return [], running
+    def wait(self, under_way, **_):
+        return [one for one in under_way if one[0] == "facts" or one in self.ended], []
+
+    def get(self, one):
+        if one[0] == "work":
+            raise self.ended.pop(one)
+        said = {**HERE, "host": one[1], "unreached": [nodes.reach(*p) for p in one[2] if p[1] and nodes.reach(*p)]}
+        changed = self.answers.get(one[1], {})
+        if isinstance(changed, Exception):
+            raise changed
+        return {**said, **changed}
+
+    def kill(self, host):
+        self.killed.append(host)
+
+    def shutdown(self):
+        pass
+
+
+HERE = nodes.facts()
 
 
 @pytest.fixture
 def join(monkeypatch):
-    def joined(ray, actors, endpoint, address="auto"):
+    monkeypatch.setattr(fleet, "_SETTINGS", {})  # this process goes on to other tests
+    monkeypatch.setattr(fleet, "_PAUSE_S", 0.001)
+    monkeypatch.setattr(cluster, "LOOK_S", 0.0)
+    promised = missing.Expected()
+    monkeypatch.setattr(cluster.missing, "expected", lambda: promised)
+    for name, value in (("NOTE_S", -1.0), ("SHORT_S", 1e9), ("JOIN_S", 1e9)):
+        monkeypatch.setattr(fleet, name, value)
+
+    def joined(ray, actors, address="auto", **options):
+        nonlocal promised
+        promised = missing.Expected(*options.pop("promised", ((), 0)))
         monkeypatch.setitem(sys.modules, "ray", ray)
-        monkeypatch.setattr(fleet, "_SETTINGS", {})  # this process goes on to other tests
-        made = fleet.Fleet(actors, restarts=1, address=address)
-        made.start(endpoint, "run")
-        return made
+        return fleet.Fleet(actors, restarts=1, address=address, **options)
 
     return joined
 
 
-def test_workers_are_launched_when_the_cluster_has_a_core_for_each_and_spread(join):
+@pytest.fixture
+def local_name(monkeypatch):
+    """A name of this machine that is not its loopback's."""
+    real = socket.getaddrinfo
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda host, *a, **k: real("127.0.0.1" if host == "localtest" else host, *a, **k)
+    )
+    monkeypatch.setattr(nodes.socket, "create_server", _server(nodes.socket.create_server))
+
+
+def _server(real):
+    return lambda address, **options: real(("127.0.0.1" if address[0] == "localtest" else address[0], 0), **options)
+
+
+def gather(made, notes, endpoint="tls/localtest:0", turns=None):
+    left = [turns]
+
+    def stopped():
+        if left[0] is not None:
+            left[0] -= 1
+            return left[0] < 0
+        return False
+
+    made.gather(endpoint, "", "", notes.append, stopped)
+    made.start(endpoint, "run")
+
+
+def names(ray):
+    return [node for node, _ in ray.placed]
+
+
+def test_workers_are_launched_when_there_is_a_core_for_each_and_spread(join, local_name):
     ray, notes = AccountingRay(0, 1), []
-    made = join(ray, 2, HEADS)
-    assert [made.watch(notes.append, 0) for _ in range(3)] == [2, 2, 2] and not ray.placed
+    made = join(ray, 2)
+    gather(made, notes, turns=5)
     assert notes == ["the cluster at auto has 1 cores for 2 workers so far: waiting for more machines to join"]
-    ray.cores.append(4)
-    assert [made.watch(notes.append, 0) for _ in range(3)] == [2, 2, 2] and len(notes) == 1
-    assert [(options["num_cpus"], options["scheduling_strategy"]) for options in ray.placed] == [(1, "SPREAD")] * 2
+    ray.cores[2] = 4
+    gather(made, notes)
+    assert [made.watch(notes.append, 0) for _ in range(3)] == [2, 2, 2]
+    assert sorted(names(ray)) == ["n1", "n2"] and {cpus for _, cpus in ray.placed} == {1}
+    assert notes[-1] == "workers: n1 (10.0.0.1): w0; n2 (10.0.0.2): w1"
 
 
-def test_a_cluster_that_stays_too_small_is_named(join, monkeypatch):
-    monkeypatch.setattr(fleet, "JOIN_S", -1.0)
-    ray = AccountingRay(0, 1)
+def test_without_a_number_a_fleet_is_as_large_as_the_cluster_and_grows_with_it(join, local_name):
+    ray, notes = AccountingRay(0, 2, 2), []
+    made = join(ray, None, promised=(("10.0.0.1", "10.0.0.2"), 2))
+    gather(made, notes)
+    assert made.watch(notes.append, 0) == 4 and sorted(names(ray)) == ["n1", "n1", "n2", "n2"]
+    ray.cores[3] = 1
+    made.watch(notes.append, 0)
+    assert made.watch(notes.append, 0) == 5 and names(ray)[-1] == "n3"
+
+
+def test_workers_of_a_machine_that_left_go_elsewhere_and_cost_nobody_a_life(join, local_name):
+    ray, notes = AccountingRay(0, 1, 1), []
+    made = join(ray, 2)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    ray.cores[1] = None
+    assert made.watch(notes.append, 0) == 2 and made.deaths == 0 and len(ray.placed) == 2
+    assert "machine n1 (10.0.0.1) is gone; its 1 workers go where there is room" in notes[-1]
+    ray.cores[3] = 1
+    made.watch(notes.append, 0)
+    made.watch(notes.append, 0)
+    assert names(ray)[-1] == "n3" and notes[-1].endswith("n3 (10.0.0.3): w0-1")
+
+
+def test_a_worker_that_dies_by_itself_counts_and_stays_where_it_was(join, local_name):
+    ray, notes = AccountingRay(0, 1), []
+    made = join(ray, 1)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    for life in ("w0", "w0-1"):
+        ray.ended["work", "n1", life] = RuntimeError("the last\nof its words")
+        if life == "w0":
+            assert made.watch(notes.append, 0) == 1 and notes[-1] == "worker w0 died (of its words); starting it again"
+    with pytest.raises(fleet.FleetFailed, match="w0 died 2 times without progress; last: of its words"):
+        made.watch(notes.append, 0)
+    assert made.deaths == 2 and names(ray) == ["n1", "n1"]
+
+
+def test_death_and_departure_at_once_are_a_departure(join, local_name, monkeypatch):
+    ray, notes = AccountingRay(0, 1), []
+    made = join(ray, 1)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    monkeypatch.setattr(cluster, "LOOK_S", 1e9)  # the fleet hears of its worker first
+    ray.ended["work", "n1", "w0"] = RuntimeError("its node has died")
+    ray.cores[1] = None
+    assert made.watch(notes.append, 0) == 1 and made.deaths == 0 and "n1 (10.0.0.1) is gone" in notes[-1]
+
+
+def test_missing_machines_are_named_and_it_begins_with_what_there_is_if_that_is_enough(join, local_name, monkeypatch):
+    monkeypatch.setattr(fleet, "SHORT_S", 0.01)
+    ray, notes = AccountingRay(0, 2), []
+    made = join(ray, 6, at_least=2, promised=(("10.0.0.1", "10.0.0.7"), 2))
+    gather(made, notes)
+    assert [n for n in notes if n.startswith("10.0.0.7 has not joined")] and "beginning with 2 workers" in notes[-1]
+    assert made.watch(notes.append, 0) == 6 and len(ray.placed) == 2  # four wait for a place
+
+
+def test_a_cluster_that_stays_too_small_is_named(join, local_name, monkeypatch):
+    monkeypatch.setattr(fleet, "SHORT_S", -1.0)
+    monkeypatch.setattr(fleet, "JOIN_S", 0.01)
+    ray, notes = AccountingRay(0, 1), []
     with pytest.raises(ConfigError, match=r"the cluster at auto has 1 cores for 2 workers .*--actors"):
-        join(ray, 2, HEADS).watch(print, 0)
-    assert not ray.placed
+        gather(join(ray, 2, promised=(("10.0.0.1", "10.0.0.9"), 2)), notes)
+    assert not ray.placed and [n for n in notes if n.startswith("10.0.0.9 has not joined")]
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ({"version": "0.0.9"}, r"n1 \(10.0.0.1\): icrl-dist 0.0.9 there, .* here: run `ray up` again"),
+        ({"code": "f" * 64}, r"icrl-dist's code ffffffff there"),
+        ({"versions": {**HERE["versions"], "torch": "1.0"}}, r"torch 1.0 there, .* here"),
+        ({"python": "3.9.1"}, r"Python 3.9.1 there"),
+        ({"certificates": "/c/worker.key: cannot be read"}, r"n1 \(10.0.0.1\): /c/worker.key"),
+        ({"unreached": ["10.0.0.9:7447: timed out"]}, r"cannot reach the learner's port, 10.0.0.9:7447: timed out"),
+        (ModuleNotFoundError("No module named 'icrl_dist'"), r"10.0.0.1: No module named 'icrl_dist'; run `ray up` again"),
+    ],
+)
+def test_a_machine_that_does_not_fit_is_refused_before_anything_starts(join, local_name, answer, message):
+    ray = AccountingRay(0, 2, 2)
+    ray.answers["n1"] = answer
+    with pytest.raises(ConfigError, match=message) as error:
+        gather(join(ray, 2), [])
+    assert not ray.placed and "\n" not in str(error.value)
+
+
+def test_one_that_joins_later_and_does_not_fit_is_left_out(join, local_name):
+    ray, notes = AccountingRay(0, 1), []
+    made = join(ray, None)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    ray.cores[2], ray.answers["n2"] = 4, {"code": "0" * 64}
+    assert [made.watch(notes.append, 0) for _ in range(3)] == [1, 1, 1]
+    assert len([n for n in notes if n.endswith("no worker is placed there")]) == 1
 
 
 def test_other_machines_are_not_sent_to_a_learner_that_only_this_one_reaches(join):
     ray = AccountingRay(0, 1, 1)
-    with pytest.raises(
-        ConfigError, match=r"stream.endpoint = 'tcp/127.0.0.1:7447': other machines cannot reach it.*tls/HEAD_IP"
-    ):
-        join(ray, 2, OURS).watch(print, 0)
+    with pytest.raises(ConfigError, match=r"stream.endpoint = 'tcp/127.0.0.1:0': other machines cannot reach it.*tls/HEAD_IP"):
+        gather(join(ray, 2), [], OURS)
     assert not ray.placed
     alone = AccountingRay(2)
-    assert join(alone, 2, OURS).watch(print, 0) == 2 and len(alone.placed) == 2
+    made = join(alone, 2)
+    gather(made, [], OURS)
+    assert made.watch(print, 0) == 2 and len(alone.placed) == 2
+
+
+def test_a_port_that_is_taken_is_named(join):
+    with socket.create_server(("127.0.0.1", 0)) as server, pytest.raises(ConfigError, match="cannot be listened on"):
+        gather(join(AccountingRay(2), 2), [], f"tcp/127.0.0.1:{server.getsockname()[1]}")
 
 
 def test_a_cluster_that_does_not_answer_is_named(join):
     with pytest.raises(ConfigError, match=r"--address 192.0.2.99:6379: nobody there; `ray status`"):
-        join(AccountingRay(), 1, HEADS, address="192.0.2.99:6379")
+        join(AccountingRay(), 1, address="192.0.2.99:6379")

@@ -21,6 +21,8 @@ ROOT = Path(__file__).parents[2]
 HOME = "/run/home"
 """A host's home folder, on the host."""
 PATH = f"{sys.prefix}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+CODE = f"PYTHONPATH={ROOT}"
+"""What makes every host run this checkout, wherever the environment's own copy lies."""
 NEEDED = ("openssl", "ip", "unshare", "nsenter", "ssh", "ssh-keygen", "/usr/sbin/sshd", "rsync")
 
 INIT = """
@@ -83,7 +85,7 @@ class Host:
     def command(self, *arguments: object) -> list[str]:
         """The command that runs ``arguments`` on the host, as root with the tests' environment first on PATH."""
         enter = ["nsenter", "-t", str(self.init.pid), "-m", "-p", "-u", "-i", "-n"]
-        return [*enter, "env", "-i", f"HOME={HOME}", "USER=root", f"PATH={PATH}", *map(str, arguments)]
+        return [*enter, "env", "-i", f"HOME={HOME}", "USER=root", f"PATH={PATH}", CODE, *map(str, arguments)]
 
     def run(self, *arguments: object, timeout: float = 90) -> str:
         """What the command printed; raises AssertionError with that if it fails."""

@@ -4,6 +4,8 @@ import json
 import os
 import re
 import socket
+import subprocess
+import sys
 from importlib import metadata
 
 import pytest
@@ -138,6 +140,23 @@ def test_bench_env_ends_with_one_json_object(capsys):
     assert cli.main(["bench", "env", "--seconds", "0.1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["steps_per_s"] > 0
     assert cli.main(["bench", "env", "--problem", "darkrom"]) == 2
+
+
+def test_nobody_waits_for_what_only_the_evaluation_needs(tmp_path):
+    """Until both programs have ended, ``train`` has imported no torch."""
+    script = """
+import sys
+from icrl_dist import cli, launch
+
+def interrupted(*_):
+    print(*(name for name in ("torch", "scipy", "matplotlib", "mujoco") if name in sys.modules))
+    raise launch.TrainInterrupted
+
+launch.train_ray = interrupted
+sys.exit(cli.main(["train", "smoke", "--actors", "1", "--out", sys.argv[1]]))
+"""
+    ran = subprocess.run([sys.executable, "-c", script, tmp_path / "run"], capture_output=True, text=True)
+    assert ran.returncode == 130 and ran.stdout.splitlines()[0] == "", ran.stdout + ran.stderr
 
 
 def test_our_packages_are_the_ones_imported():

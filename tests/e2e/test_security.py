@@ -3,8 +3,6 @@
 import contextlib
 import json
 import shutil
-import subprocess
-import sys
 import time
 
 import pytest
@@ -16,6 +14,7 @@ from icrl_dist.stream.link import Keys, LinkError, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
 from tests.contracts.link_battery import eventually
+from tests.e2e.training import SMOKE, endpoint_of, equal, finish, result_of, start
 
 KEYS = Keys("run")
 TLS = "transport/link/tls/"
@@ -319,40 +318,19 @@ def test_a_tap_without_its_certificates_is_told_what_it_needs(capsys, ours):
     assert "none/ca.pem: cannot be read" in capsys.readouterr().err
 
 
-def test_a_whole_run_by_tls_ends_with_the_same_digests(ours, tmp_path):
-    def start(*arguments):
-        command = [sys.executable, "-m", "icrl_dist.cli", *map(str, arguments)]
-        return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-
-    short = [
-        "train",
-        "smoke",
-        "--pretrain.steps",
-        "20",
-        "--icaa.steps",
-        "10",
-        "--evaluate.episodes",
-        "1",
-        "--evaluate.seeds",
-        "1",
-    ]
+def test_a_whole_run_of_one_worker_by_tls_ends_with_the_bytes_of_none(ours, reference, tmp_path):
+    folder = tmp_path / "secure"
     tls = ["--actors", "1", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", ours]
-    folders = secure, plain = tmp_path / "secure", tmp_path / "plain"
     with contextlib.ExitStack() as stack:
-        runs = [stack.enter_context(start(*short, *tls, "--out", secure))]
-        stack.callback(runs[0].terminate)
-        eventually((secure / "endpoint").exists, 60.0)
-        assert (secure / "endpoint").read_text().startswith("tls/")
-        tap = stack.enter_context(start("tap", secure, "--count", "1"))
+        run = stack.enter_context(start("train", *SMOKE, *tls, "--out", folder))
+        stack.callback(run.terminate)
+        assert endpoint_of(folder).startswith("tls/")
+        tap = stack.enter_context(start("tap", folder, "--count", "1"))
         stack.callback(tap.terminate)
-        runs.append(stack.enter_context(start(*short, "--engine", "inline", "--out", plain)))
-        stack.callback(runs[1].terminate)
-        for run in runs:
-            output, _ = run.communicate(timeout=100)
-            assert run.returncode == 0, output
+        output = finish(run)
+        assert run.returncode == 0, output
         tap.terminate()  # the run is over: what it has not heard by now it never will
-        line, _ = tap.communicate(timeout=20)
+        line = finish(tap, timeout=20)
         assert json.loads(line)["identity"], "the tap shows the run's own certificates, those of a monitor"
-    one, other = (json.loads((folder / "result.json").read_text()) for folder in folders)
-    for name in ("dataset_digest", "weights_digest", "trajectories"):
-        assert one[name] == other[name]
+    assert equal(result_of(folder), reference)
+    assert result_of(folder)["lag"].keys() == {"0"}

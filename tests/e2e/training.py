@@ -14,7 +14,7 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
 # The whole training of smoke, hardly an evaluation.
-SMOKE = ["smoke", "--evaluate.episodes", "1", "--evaluate.seeds", "1"]
+SMOKE = ["smoke", "--evaluate.episodes", "1", "--evaluate.seeds", "1", "--evaluate.p", "0"]
 
 
 def start(*arguments, **options):
@@ -46,13 +46,13 @@ def endpoint_of(folder):
 
 
 @contextlib.contextmanager
-def on_first_adapt_trajectory(folder, act):
-    """Calls ``act`` once, when a trajectory of round 0 shows on the monitor plane."""
+def on_first_adapt_trajectory(folder, act, round_=0):
+    """Calls ``act`` once, when a trajectory of the round shows on the monitor plane."""
     acted = threading.Event()
 
     def hear(key, payload):
         _, fields = wire.decode_message(payload)
-        if fields["identity"].startswith("adapt/0") and not acted.is_set():
+        if fields["identity"].startswith(f"adapt/{round_}") and not acted.is_set():
             acted.set()
             act()
 

@@ -8,7 +8,7 @@ import time
 import pytest
 
 import icrl_dist
-from icrl_dist import crashes
+from icrl_dist import code, crashes
 from icrl_dist.config import parse
 from icrl_dist.recipes import METHODS
 from icrl_dist.stream import wire
@@ -82,10 +82,12 @@ def records(office):
 
 
 def test_hello_gives_the_run_and_refuses_another_version(office):
-    _, fields = office.say("hello", "w0", version=icrl_dist.__version__, pid=1)
+    _, fields = office.say("hello", "w0", version=icrl_dist.__version__, code=code.digest(), pid=1)
     assert parse(fields["run"], "test") == office.run
     with pytest.raises(Refused, match=r"w0 runs icrl-dist 0\.0, the learner"):
-        office.say("hello", "w0", version="0.0", pid=1)
+        office.say("hello", "w0", version="0.0", code=code.digest(), pid=1)
+    with pytest.raises(Refused, match="runs icrl-dist's code ffffffff, the learner"):
+        office.say("hello", "w0", version=icrl_dist.__version__, code="f" * 64, pid=1)
 
 
 def test_nonsense_is_refused_and_the_next_question_answered(office):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 
@@ -12,29 +13,14 @@ from icrl_dist.lineage import parse_source
 from icrl_dist.store import Store
 from icrl_dist.types import Identity
 from learner import herald, service
-from tests.learner.test_service import METRICS, run_inline, same
+from tests.learner.test_service import no_tensorboard, parent, run_inline, same
 
-
-@pytest.fixture(autouse=True)
-def no_tensorboard(monkeypatch):
-    monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
-
-
-@pytest.fixture(scope="module")
-def parent(tmp_path_factory, request):
-    """An undisturbed run that nobody changes: its folder and its result."""
-    run = request.getfixturevalue("module_run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
-        folder = tmp_path_factory.mktemp("runs") / "parent"
-        return folder, run_inline(run, folder), run
+__all__ = ["no_tensorboard", "parent"]
 
 
 def copy_of(parent, folder):
-    """The run once more, by itself, to be damaged."""
-    _, result, run = parent
-    assert same(run_inline(run, folder), result)
-    return sorted((folder / "dataset").glob("segment-*"))
+    """The run once more, to be damaged."""
+    return sorted((shutil.copytree(parent[0], folder) / "dataset").glob("segment-*"))
 
 
 def flip(path, at):

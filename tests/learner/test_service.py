@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -19,17 +20,26 @@ def run_inline(run, folder, report=lambda event: None, **options):
     return launch.train_inline(run, folder, report)
 
 
-@pytest.fixture(autouse=True)
-def no_tensorboard(monkeypatch):
-    monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
-
-
 METRICS = service.Metrics
 
 
-@pytest.fixture
-def undisturbed(small_run, tmp_path):
-    return run_inline(small_run, tmp_path / "undisturbed")
+@pytest.fixture(autouse=True, scope="module")
+def no_tensorboard():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        yield
+
+
+@pytest.fixture(scope="module")
+def parent(module_run, no_tensorboard, tmp_path_factory):
+    """An undisturbed run that nobody changes: its folder, its result and its numbers."""
+    folder = tmp_path_factory.mktemp("runs") / "undisturbed"
+    return folder, run_inline(module_run, folder), module_run
+
+
+@pytest.fixture(scope="module")
+def undisturbed(parent):
+    return parent[1]
 
 
 def same(result, other):
@@ -37,9 +47,9 @@ def same(result, other):
     return [result[n] for n in names] == [other[n] for n in names]
 
 
-def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small_run, tmp_path, undisturbed):
-    folder = tmp_path / "undisturbed"
-    store = Store(folder / "dataset")
+def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small_run, parent):
+    folder, undisturbed, _ = parent
+    store = Store(folder / "dataset", readonly=True)
     versions = [checkpoints.read_manifest(version_file(folder, v)) for v in range(3)]
     for identity in [row.identity for row in store.ledger]:
         t = store.read(identity)
@@ -85,8 +95,9 @@ def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, u
     assert same(run_inline(small_run, folder, resume=True), undisturbed)
 
 
-def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(small_run, tmp_path, undisturbed):
-    agent = load_agent(tmp_path / "undisturbed", seed=0)
+def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(parent):
+    folder, undisturbed, _ = parent
+    agent = load_agent(folder, seed=0)
     manifest = agent.manifest
     assert manifest["weights_digest"] == undisturbed["weights_digest"]
     assert (manifest["size"], manifest["horizon"], manifest["version"]) == (3, 8, 2)
@@ -96,8 +107,8 @@ def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(small_run, tmp_pa
     assert agent.act(np.zeros((2, 2))).shape == (2,)
 
 
-def test_a_folder_in_use_and_other_numbers_are_refused(small_run, tmp_path, undisturbed):
-    folder = tmp_path / "undisturbed"
+def test_a_folder_in_use_and_other_numbers_are_refused(small_run, tmp_path, parent):
+    folder = shutil.copytree(parent[0], tmp_path / "undisturbed")
     with pytest.raises(ConfigError, match="exists: use --resume"):
         launch.prepare(small_run, folder, resume=False, overwrite=False)
     with pytest.raises(ConfigError, match="other numbers"):

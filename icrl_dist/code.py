@@ -1,0 +1,34 @@
+"""Which code this is: one digest over every module of the package, installed or in a wheel."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+
+PACKAGES = ("icrl_dist", "actors", "learner")
+_KINDS = (".py", ".toml")
+
+
+@functools.cache
+def digest() -> str:
+    """SHA-256 of the code that this process imports, hex."""
+    above = Path(__file__).parents[1]
+    files = [file for package in PACKAGES for kind in _KINDS for file in (above / package).rglob(f"*{kind}")]
+    return _digest((file.relative_to(above).as_posix(), file.read_bytes()) for file in files)
+
+
+def digest_of_wheel(wheel: Path) -> str:
+    """SHA-256 of the code in a wheel, hex.  Raises OSError or zipfile.BadZipFile if it cannot be read."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = [n for n in archive.namelist() if n.split("/")[0] in PACKAGES and n.endswith(_KINDS)]
+        return _digest((name, archive.read(name)) for name in names)
+
+
+def _digest(files: Iterable[tuple[str, bytes]]) -> str:
+    whole = hashlib.sha256()
+    for name, content in sorted(files):
+        whole.update(f"{name}\0{len(content)}\0".encode() + content)
+    return whole.hexdigest()

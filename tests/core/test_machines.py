@@ -1,0 +1,81 @@
+"""The doctor's questions to a live cluster, against machines that answer badly."""
+
+import re
+from types import SimpleNamespace
+
+import pytest
+
+from icrl_dist import machines, nodes
+from icrl_dist.findings import table
+
+HERE = nodes.facts()
+
+
+class Answering:
+    """Two machines, a and b; what b says of itself is changed by ``answer``."""
+
+    util = SimpleNamespace(
+        scheduling_strategies=SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, soft: (node, soft))
+    )
+
+    def __init__(self, answer):
+        self.answer, self.asked = answer, {}
+
+    def nodes(self):
+        ports = {"NodeManagerPort": 1, "ObjectManagerPort": 2}
+        some = {"Alive": True, "Resources": {"CPU": 1}, **ports}
+        return [{**some, "NodeID": n, "NodeManagerAddress": f"10.0.0.{n}"} for n in "ab"] + [{"Alive": False}]
+
+    def get_runtime_context(self):
+        return SimpleNamespace(gcs_address="10.0.0.a:6379")
+
+    def remote(self, scheduling_strategy, **options):
+        node, _ = scheduling_strategy
+
+        def ask(certificates="", ports=()):
+            self.asked[node] = ports
+            return node
+
+        return lambda function: SimpleNamespace(remote=ask)
+
+    def get(self, node, timeout):
+        changed = self.answer if node == "b" else {}
+        if isinstance(changed, Exception):
+            raise changed
+        return {**HERE, "time": machines.time.time(), "host": node, "unreached": (), "certificates": "", **changed}
+
+
+def found(answer, certificates="folder"):
+    ray = Answering(answer)
+    findings = machines.examine(ray, ("10.0.0.a", 7447), certificates)
+    assert ray.asked["a"] == [("10.0.0.a", 7447), ("10.0.0.a", 6379), ("10.0.0.b", 1), ("10.0.0.b", 2)]
+    return findings
+
+
+def test_machines_that_are_fit_have_nothing_to_mend():
+    findings = found({})
+    assert len(findings) == 12 and all(finding.ok is not False and " (10.0.0." in finding.name for finding in findings)
+
+
+@pytest.mark.parametrize(
+    ("answer", "ok", "message"),
+    [
+        ({"code": "0" * 64}, False, r"b \(10.0.0.b\) versions .*icrl-dist's code 00000000 there.*-> run `ray up`"),
+        ({"time": 0.0}, False, r"clock .*s off  -> run ntpd"),
+        ({"time": machines.time.time() + 30}, None, r"clock .*s off  -> run ntpd"),
+        ({"shared_memory": 64 << 20}, None, r"shared memory +0.1 GiB free  -> mount"),
+        ({"open_files": 1024}, None, "open files .*1024"),
+        ({"certificates": "/c/worker.pem: expired"}, False, "/c/worker.pem: expired"),
+        (
+            {"unreached": ("10.0.0.a:7447: timed out", "10.0.0.a:1: refused")},
+            False,
+            "ports +10.0.0.a:7447: timed out  -> open it",
+        ),
+        (RuntimeError("one\nNo module named 'icrl_dist'"), False, "10.0.0.b +does not answer: No module named 'icrl_dist'"),
+    ],
+)
+def test_what_ails_a_machine_is_one_line_with_its_remedy(answer, ok, message):
+    findings = found(answer)
+    (line, *_) = [table([f]) for f in findings if re.search(message, table([f]))]
+    assert "\n" not in line and any(f.ok is ok and table([f]) == line for f in findings)
+    assert all(f.ok is not False for f in findings if "10.0.0.a" in f.name)

@@ -1,0 +1,52 @@
+"""What Ray says of the on-premises file, and that it sends what the package is made of."""
+
+import tomllib
+
+import click
+import jsonschema
+import pytest
+
+from tests.e2e import hosts
+from tests.e2e.cluster.files import accepted, shipped
+
+
+def test_ray_accepts_the_shipped_file_and_wants_every_worker():
+    whole = accepted(shipped())
+    (kind,) = whole["available_node_types"].values()
+    assert kind["min_workers"] == kind["max_workers"] == len(shipped()["provider"]["worker_ips"])
+
+
+@pytest.mark.parametrize(
+    ("where", "key", "value"),
+    [
+        ((), "setup_comands", []),
+        ((), "worker_start_ray_commands", "ray start"),
+        ((), "idle_timeout_minutes", "five"),
+        (("auth",), "ssh_usr", "ubuntu"),
+        (("auth",), "ssh_private_key", 7),
+    ],
+)
+def test_ray_refuses_a_file_with_a_slip(where, key, value):
+    config = shipped()
+    table = config
+    for name in where:
+        table = table[name]
+    table[key] = value
+    with pytest.raises(jsonschema.ValidationError, match=key if key not in shipped() else str(value)):
+        accepted(config)
+
+
+def test_ray_refuses_a_file_without_workers():
+    config = shipped()
+    del config["provider"]["worker_ips"]
+    with pytest.raises(click.ClickException):
+        accepted(config)
+
+
+def test_what_the_package_is_made_of_is_sent_to_the_hosts():
+    project = tomllib.loads((hosts.ROOT / "pyproject.toml").read_text())
+    sources = {source for source in shipped()["file_mounts"].values() if not source.startswith("~")}
+    assert sources == {"pyproject.toml", "constraints.txt", project["project"]["readme"]} | {
+        package.split(".")[0] for package in project["tool"]["setuptools"]["packages"]
+    }
+    assert all((hosts.ROOT / source).exists() for source in sources)
