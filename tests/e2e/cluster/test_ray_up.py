@@ -26,6 +26,8 @@ SMALL = "--pretrain.contexts 28 --pretrain.steps 4 --icaa.steps 4 --evaluate.epi
 TRAIN = ["train", "smoke", *SMALL.split(), "--icaa.trials", "60"]
 CUT_S = 20.0
 
+pytestmark = pytest.mark.timeout(600)  # five hosts on two cores, beside other tests
+
 
 @dataclass(frozen=True)
 class Cluster:
