@@ -183,11 +183,12 @@ def test_a_run_that_was_submitted_from_outside_is_the_same(cluster, inline, tmp_
     forward = cluster.desk.command(*cluster.ray("dashboard", cluster.FILE))
     with subprocess.Popen(forward, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as tunnel:
         try:
-            connected = [*cluster.ray("job", "list", "--address", "http://127.0.0.1:8265")]
+            with_token = ("env", "RAY_AUTH_MODE=token")
+            connected = [*with_token, *cluster.ray("job", "list", "--address", "http://127.0.0.1:8265")]
             ask = lambda: subprocess.run(cluster.desk.command(*connected), capture_output=True).returncode == 0  # noqa: E731
             wait_until(ask, "the tunnel to the head")
             submit = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "bash", "-lc", cluster.train("submitted")]
-            printed = cluster.desk.run(*cluster.ray(*submit), timeout=150)
+            printed = cluster.desk.run(*with_token, *cluster.ray(*submit), timeout=150)
         finally:
             for process in [*psutil.Process(tunnel.pid).children(recursive=True), tunnel]:
                 with contextlib.suppress(psutil.NoSuchProcess):
