@@ -187,7 +187,7 @@ def test_a_run_that_was_submitted_from_outside_is_the_same(cluster, inline, tmp_
             connected = [*with_token, *cluster.ray("job", "list", "--address", "http://127.0.0.1:8265")]
             ask = lambda: subprocess.run(cluster.desk.command(*connected), capture_output=True).returncode == 0  # noqa: E731
             wait_until(ask, "the tunnel to the head")
-            submit = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "bash", "-lc", cluster.train("submitted")]
+            submit = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", *cluster.train("submitted").split()]
             printed = cluster.desk.run(*with_token, *cluster.ray(*submit), timeout=150)
         finally:
             for process in [*psutil.Process(tunnel.pid).children(recursive=True), tunnel]:
