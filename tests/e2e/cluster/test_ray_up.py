@@ -26,6 +26,8 @@ SMALL = "--pretrain.contexts 28 --pretrain.steps 4 --icaa.steps 4 --evaluate.epi
 TRAIN = ["train", "smoke", *SMALL.split(), "--icaa.trials", "60"]
 CUT_S = 20.0
 
+pytestmark = pytest.mark.timeout(600)  # five hosts on two cores, beside other tests
+
 
 @dataclass(frozen=True)
 class Cluster:
@@ -181,11 +183,12 @@ def test_a_run_that_was_submitted_from_outside_is_the_same(cluster, inline, tmp_
     forward = cluster.desk.command(*cluster.ray("dashboard", cluster.FILE))
     with subprocess.Popen(forward, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as tunnel:
         try:
-            connected = [*cluster.ray("job", "list", "--address", "http://127.0.0.1:8265")]
+            with_token = ("env", "RAY_AUTH_MODE=token")
+            connected = [*with_token, *cluster.ray("job", "list", "--address", "http://127.0.0.1:8265")]
             ask = lambda: subprocess.run(cluster.desk.command(*connected), capture_output=True).returncode == 0  # noqa: E731
             wait_until(ask, "the tunnel to the head")
-            submit = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "bash", "-lc", cluster.train("submitted")]
-            printed = cluster.desk.run(*cluster.ray(*submit), timeout=150)
+            submit = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", *cluster.train("submitted").split()]
+            printed = cluster.desk.run(*with_token, *cluster.ray(*submit), timeout=150)
         finally:
             for process in [*psutil.Process(tunnel.pid).children(recursive=True), tunnel]:
                 with contextlib.suppress(psutil.NoSuchProcess):
