@@ -400,11 +400,11 @@ def test_the_same_code_learns_and_deploys_a_game_of_continuous_actions():
     spec = Valley([0]).spec
     torch.manual_seed(0)
     model = PretrainedTransformer(spec, ModelConfig(2, 1, 32, stretch=LENGTH))
-    optim = OptimConfig(learning_rate=4e-3, batch=16, queries=16, stretches=4, episodes=3, beta2=0.98, warmup=20)
+    optim = OptimConfig(learning_rate=8e-3, muon=5.0, batch=16, queries=32, stretches=8, episodes=2, beta2=0.98, warmup=20)
     pool = Pool(1.0, [lived(goal, rng, 30) for goal in range(4)], optim.episodes)
     opt = pretrain.Optimiser(model, optim)
     pretrain.fit(
-        model, opt, optim, 4e-3, 600, lambda step: context.draw(np.random.default_rng(step), [pool], 16, 16, stretches=4)
+        model, opt, optim, 8e-3, 150, lambda step: context.draw(np.random.default_rng(step), [pool], 16, 32, stretches=8)
     )
     goals, names = [0, 1, 2, 3] * 8, ("observations", "actions", "rewards")
 
