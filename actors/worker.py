@@ -43,6 +43,7 @@ class Worker:
         self._stop = threading.Event()
         self._episodes = self._steps = 0
         self._job = self._doing = ""
+        self._weights = -1
         self._samples = Samples()
 
     def stop(self) -> None:
@@ -84,7 +85,7 @@ class Worker:
         drain_s: float,
     ) -> None:
         """Do a job, each trajectory within ``deadline_s``; waiting for others does not count."""
-        self._job = job.label
+        self._job, self._weights = job.label, job.weights
         made: set[Identity] = set()
         try:
             work = jobs.do(job, _Waiting(policy, watchdog), self.name, self._tell, beliefs)
@@ -151,7 +152,13 @@ class Worker:
             key = self._keys.monitor(f"worker/{self.name}")
             while True:
                 fields = {**self._count(sender), **crashes.memory()}
-                now = {"job": self._job, "doing": self._doing, "pid": os.getpid(), "time": time.time()}
+                now = {
+                    "job": self._job,
+                    "doing": self._doing,
+                    "weights": self._weights,
+                    "pid": os.getpid(),
+                    "time": time.time(),
+                }
                 message = wire.encode_message("worker", worker=self.name, **now, **fields)
                 try:
                     self._link.publish(key, message, droppable=True)

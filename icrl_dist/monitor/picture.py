@@ -196,7 +196,7 @@ class Picture:
                 "since": since,
                 "time": now,
                 "run": run,
-                "workers": self._staff.rows(now, run["state"] in _OVER),
+                "workers": self._staff.rows(now, run["state"] in _OVER, run["version"]),
                 "variations": changed,
                 "variation_count": len(self._curves),
                 "variations_left_out": left_out,

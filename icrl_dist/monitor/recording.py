@@ -140,7 +140,7 @@ class Recording:
     def _beat(self, now: float, row: Row, episodes: int, steps: int) -> Message:
         job = "/".join(map(str, row.identity[:3]))
         counts = {"episodes": episodes, "trajectories": episodes, "steps": steps, "resent": 0, "pid": 0}
-        said = {"worker": row.worker, "job": job, "doing": "", "memory_mb": 0.0, "peak_mb": 0.0}
+        said = {"worker": row.worker, "job": job, "doing": "", "weights": row.weights, "memory_mb": 0.0, "peak_mb": 0.0}
         return self._said(now, f"worker/{_part(row.worker)}", "worker", **said, **counts)
 
     def _said(self, now: float, topic: str, kind: str, **fields: Any) -> Message:

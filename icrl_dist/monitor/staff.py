@@ -28,7 +28,7 @@ class _Row:
     """When it had done how many steps and episodes."""
 
 
-_NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0}
+_NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0, "weights": -1}
 
 
 class Staff:
@@ -44,6 +44,7 @@ class Staff:
         said: dict[str, Any] = {name: plain.integer(message.get(name), 0) for name in _COUNTS}
         said |= {name: plain.text(message.get(name)) for name in ("job", "doing")}
         said |= {name: plain.number(message.get(name)) for name in ("memory_mb", "peak_mb")}
+        said["weights"] = plain.integer(message.get("weights", -1), -1)
         row = self._row(plain.text(message.get("worker")), now)
         if row.said["pid"] not in (0, said["pid"]):
             row.restarts += 1
@@ -77,9 +78,16 @@ class Staff:
             while len(row.marks) > 2 and now - row.marks[1][0] >= _SPAN_S:
                 row.marks.popleft()
 
-    def rows(self, now: float, over: bool = False) -> list[dict[str, Any]]:
-        """A row a worker, by name; ``state`` is gone, silent, waiting or working, and done once the run is ``over``."""
-        return [_told(name, row, now, over, self._beats) for name, row in sorted(self._rows.items())]
+    def rows(self, now: float, over: bool = False, version: int = -1) -> list[dict[str, Any]]:
+        """A row a worker, by name; ``state`` is gone, silent, waiting or working, and done once the run is ``over``.
+
+        ``version``: the newest of the weights; ``lag`` says how many versions older those are that
+        act in a worker's job, 0 if none do.
+        """
+        rows = [_told(name, row, now, over, self._beats) for name, row in sorted(self._rows.items())]
+        for row in rows:
+            row["lag"] = max(0, version - row["weights"]) if row["weights"] >= 0 and row["job"] else 0
+        return rows
 
 
 def _told(name: str, row: _Row, now: float, over: bool, beats: bool) -> dict[str, Any]:

@@ -197,7 +197,7 @@ def _draw_worker(row: Row, column: str, width: int) -> Part:
         return number(row["steps_per_s"], 0), style
     if column == "memory_mb":
         return (f"{row['memory_mb']:,.0f} MB" if row["memory_mb"] else "-"), style
-    if column in ("unstored", "resent", "restarts"):
+    if column in ("unstored", "lag", "resent", "restarts"):
         return f"{row[column]:,}", WARNING if row[column] and column != "unstored" else style
     if column == "episodes":
         return f"{row['episodes']:,}", style
@@ -210,13 +210,14 @@ WORKERS = Kind(
         Column("state", "state", 11),
         Column("name", "worker", 12, stretch=1),
         Column("job", "job", 11, rank=1),
-        Column("doing", "doing", 10, rank=7, stretch=3),
+        Column("doing", "doing", 10, rank=8, stretch=3),
         Column("episodes", "episodes", 9, rank=2, right=True),
         Column("steps_per_s", "steps/s", 8, right=True),
         Column("unstored", "unstored", 8, rank=3, right=True),
-        Column("resent", "resent", 6, rank=5, right=True),
+        Column("lag", "lag", 4, rank=5, right=True),
+        Column("resent", "resent", 6, rank=6, right=True),
         Column("restarts", "restarts", 8, rank=4, right=True),
-        Column("memory_mb", "memory", 8, rank=6, right=True),
+        Column("memory_mb", "memory", 8, rank=7, right=True),
     ),
     orders={
         "trouble": lambda row: (_TROUBLE.index(row["state"]), -row["restarts"], row["name"]),

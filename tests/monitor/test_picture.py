@@ -128,6 +128,19 @@ def test_the_next_life_of_a_worker_takes_its_row():
     assert rows == {name: ("working", 2 if name == "w1-2" else 0) for name in ("host-1", "host-2", "w0", "w1-2")}
 
 
+def test_a_workers_lag_is_that_of_the_weights_that_act_in_its_job():
+    picture = Picture()
+    hear(picture, "learner", progress(version=3))
+    for worker, said in {
+        "w0": {"weights": 1},
+        "w1": {"weights": 3},
+        "w2": {"weights": -1},
+        "w3": {"weights": 1, "job": ""},
+    }.items():
+        hear(picture, f"worker/{worker}", beat(worker, **said))
+    assert [row["lag"] for row in picture.snapshot(0.0)["workers"]] == [2, 0, 0, 0]
+
+
 def test_the_run_goes_through_its_states():
     picture = Picture()
     assert picture.snapshot(0.0)["run"]["state"] == "waiting"

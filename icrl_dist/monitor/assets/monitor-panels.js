@@ -110,6 +110,7 @@ const COLUMNS = [
   { name: "job", title: "Job", value: (row) => row.job, fill: (cell, row) => (say(cell, row.job || "–"), (cell.title = row.doing)) },
   count("steps_per_s", "Steps/s", "Environment steps a second"),
   count("unstored", "Unstored", "Episodes finished and not yet acknowledged by the learner"),
+  count("lag", "Lag", "Versions by which the weights that act in its job are older than the newest"),
   count("restarts", "Restarts", "Times it came back as another process"),
   { ...count("memory_mb", "MB", "Resident memory, megabytes"), text: (row) => (row.memory_mb ? number(row.memory_mb) : "–") },
 ];
