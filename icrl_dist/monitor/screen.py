@@ -124,8 +124,8 @@ class Screen(App[None]):
 
     def _fill(self) -> None:
         """Everything in sight as it is now."""
-        if not self.screen.query(Keys):
-            return  # a page that is not composed yet, or is being left
+        if not self.screen_stack or not self.screen.query(Keys):
+            return  # a page that is not composed yet, or is being left, or the end
         replay = self._feed.replay()
         self.screen.query_one(Header).fill(self._seen, replay, self._frozen, not self._roomy())
         self.screen.query_one(Keys).fill(self._keys(replay))
