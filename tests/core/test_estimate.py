@@ -106,7 +106,7 @@ def test_the_demo_takes_what_its_plan_says(tmp_path):
     def planned():
         given = [sys.executable, "-c", MEASURE, *settings]  # not in this process, where every call's shapes are checked
         found = json.loads(subprocess.run(given, check=True, capture_output=True, text=True).stdout)
-        assert len(found["phases"]) == 3 and found["phases"][1]["trajectories"] == 39 * 8 * 4
+        assert len(found["phases"]) == 3 and found["phases"][1]["trajectories"] == 39 * 8 * 6
         rates = Rates(**{**found, "phases": tuple(PhaseRates(**phase) for phase in found["phases"])})
         return 3600 * estimate(rates, nodes=1, cores=1, gbit_per_s=1.0)["hours"]
 

@@ -42,7 +42,8 @@ class Answering:
         changed = self.answer if node == "b" else {}
         if isinstance(changed, Exception):
             raise changed
-        return {**HERE, "time": machines.time.time(), "host": node, "unreached": (), "certificates": "", **changed}
+        now = machines.time.time() + changed.get("ahead_s", 0.0)
+        return {**HERE, "time": now, "host": node, "unreached": (), "certificates": "", **changed}
 
 
 def found(answer, certificates="folder"):
@@ -62,7 +63,7 @@ def test_machines_that_are_fit_have_nothing_to_mend():
     [
         ({"code": "0" * 64}, False, r"b \(10.0.0.b\) versions .*icrl-dist's code 00000000 there.*-> run `ray up`"),
         ({"time": 0.0}, False, r"clock .*s off  -> run ntpd"),
-        ({"time": machines.time.time() + 30}, None, r"clock .*s off  -> run ntpd"),
+        ({"ahead_s": 30.0}, None, r"clock .*s off  -> run ntpd"),
         ({"shared_memory": 64 << 20}, None, r"shared memory +0.1 GiB free  -> mount"),
         ({"open_files": 1024}, None, "open files .*1024"),
         ({"certificates": "/c/worker.pem: expired"}, False, "/c/worker.pem: expired"),
