@@ -6,6 +6,7 @@ viewer, follow each other in one run, so that what else the machine does meets b
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pty
@@ -17,7 +18,7 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -231,7 +232,7 @@ def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
         assert process.stdout is not None
         url = next(word for line in process.stdout for word in line.split() if word.startswith("http://"))
         with urllib.request.urlopen(url.rstrip("/") + "/events", timeout=30) as events:
-            threading.Thread(target=lambda: [None for _ in events], daemon=True).start()
+            threading.Thread(target=_drain, args=(events,), daemon=True).start()
             time.sleep(3.0)
             heard, first, cores = _heard(url), sent[0], _cores(process.pid, seconds)
             heard, said = _heard(url) - heard, sent[0] - first
@@ -243,6 +244,12 @@ def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(20)
+
+
+def _drain(events: Iterable[bytes]) -> None:
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # http.client's own, when it is closed meanwhile
+        for _ in events:
+            pass
 
 
 def _heard(url: str) -> int:
