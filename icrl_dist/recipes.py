@@ -11,7 +11,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -282,3 +282,16 @@ METHODS: dict[str, Method] = {
     "icag": Method(_then_practice, _icag_ask, _pretrain_learn, tasks.variations),
     "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn, tasks.variations),
 }
+
+
+def about(run: Run, phases: Sequence[Phase], jobs: Sequence[Job]) -> dict[str, Any]:
+    """What a run is about, as monitors are told (docs/tap.md); ``jobs``: those of all its phases."""
+    places = {row for job in jobs for row in job.rows()}
+    return {
+        "method": run.method,
+        "problem": run.problem,
+        "phases": [[phase.stage, phase.round, phase.steps] for phase in phases],
+        "rounds": sum(phase.stage == "adapt" for phase in phases),
+        "tasks": len({task for task, _ in places}),
+        "variations": len(places),
+    }

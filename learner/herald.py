@@ -13,7 +13,7 @@ from typing import Any
 from icrl_dist.alerts import Alerts
 from icrl_dist.config import Run
 from icrl_dist.metrics import Metrics
-from icrl_dist.recipes import Phase
+from icrl_dist.recipes import Phase, about
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link, LinkError
 from icrl_dist.types import Job, Trajectory
@@ -60,16 +60,7 @@ class Herald:
 
     def about(self, phases: Sequence[Phase], jobs: Sequence[Job]) -> None:
         """What the run is about: told again from time to time."""
-        places = {row for job in jobs for row in job.rows()}
-        self._about = {
-            "method": self._run.method,
-            "problem": self._run.problem,
-            "phases": [[phase.stage, phase.round, phase.steps] for phase in phases],
-            "rounds": sum(phase.stage == "adapt" for phase in phases),
-            "tasks": len({task for task, _ in places}),
-            "variations": len(places),
-            "began": self._began,
-        }
+        self._about = {**about(self._run, phases, jobs), "began": self._began}
         self._told["about"] = float("-inf")
 
     def began(self) -> None:

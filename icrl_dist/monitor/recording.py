@@ -18,7 +18,7 @@ from typing import Any
 
 from icrl_dist.config import ConfigError, load
 from icrl_dist.ledger import Row
-from icrl_dist.recipes import METHODS
+from icrl_dist.recipes import METHODS, about
 from icrl_dist.store import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys
@@ -77,17 +77,10 @@ class Recording:
     def _from_metrics(self) -> Iterator[Message]:
         method = METHODS[self._run.method]
         phases = method.phases(self._run)
-        places = {row for phase in phases for job in method.ask(self._run, phase) for row in job.rows()}
-        about: dict[str, Any] = {
-            "method": self._run.method,
-            "problem": self._run.problem,
-            "phases": [[phase.stage, phase.round, phase.steps] for phase in phases],
-            "rounds": sum(phase.stage == "adapt" for phase in phases),
-            "tasks": len({task for task, _ in places}),
-            "variations": len(places),
-            "began": self.begin,
-        }
-        yield self._said(self.begin, "run", "run", **about)
+        asked = {phase.produces: method.ask(self._run, phase) for phase in phases}
+        expected = {version: sum(job.trials * len(job.variations) for job in jobs) for version, jobs in asked.items()}
+        told_of = about(self._run, phases, [job for jobs in asked.values() for job in jobs])
+        yield self._said(self.begin, "run", "run", **told_of, began=self.begin)
         version, stored = -1, 0
         of = {phase.produces: phase for phase in phases}
         for row in self._rows:
@@ -104,7 +97,7 @@ class Recording:
                 where = {
                     "stage": "collect",
                     "step": row["arrived"],
-                    "steps": self._expected(of[step]),
+                    "steps": expected[step],
                     "workers": row["workers"],
                 }
                 yield self._progress(now, of[step], version, stored, **where, lag=row["lag"], drops=drops)
@@ -112,9 +105,6 @@ class Recording:
                 phase = of[int(stage[4:])]
                 where = {"stage": "fit", "step": step, "steps": phase.steps, "loss": row["loss"], "workers": 0}
                 yield self._progress(now, phase, version, stored, **where, lag=0, drops={})
-
-    def _expected(self, phase: Any) -> int:
-        return sum(job.trials * len(job.variations) for job in METHODS[self._run.method].ask(self._run, phase))
 
     def _progress(self, now: float, phase: Any, version: int, stored: int, **values: Any) -> Message:
         common = {"phase": phase.stage, "round": phase.round, "version": version, "trajectories": stored, "doing": []}
