@@ -9,7 +9,6 @@ import time
 
 import msgpack
 import numpy as np
-import psutil
 import pytest
 
 from icrl_dist.monitor import curves
@@ -17,7 +16,7 @@ from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.monitor.page import showing
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
-from tests.e2e.training import SMOKE, endpoint_of, finish, start, wait_for, workers_of
+from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
 from tests.monitor.test_page import Run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -282,14 +281,4 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
             page.goto("about:blank")  # before the server goes, which the page would say
             view.send_signal(signal.SIGINT)
             assert finish(view) is not None and view.returncode == 0
-        end(training)
-
-
-def end(process):
-    """SIGKILL to a run and all that it started: what it would still compute is of no interest."""
-    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-    for member in family:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            member.kill()
-    finish(process)
-    psutil.wait_procs(family, timeout=15)
+        kill_the_tree(training)

@@ -1,6 +1,5 @@
 """Everything killed at once, again and again, and any number of workers: the same bytes."""
 
-import contextlib
 import os
 import re
 import signal
@@ -11,18 +10,7 @@ import pytest
 
 from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
-from tests.e2e.training import SMOKE, endpoint_of, equal, finish, result_of, start
-
-
-def kill_the_tree(process):
-    """SIGKILL to the command and to everything that it started, Ray's own processes included."""
-    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-    for member in family:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            member.kill()
-    finish(process)
-    _, alive = psutil.wait_procs(family, timeout=15)
-    assert not alive
+from tests.e2e.training import SMOKE, endpoint_of, equal, finish, kill_the_tree, result_of, start
 
 
 def act_when(folder, reached, act):

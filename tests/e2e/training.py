@@ -68,3 +68,14 @@ def workers_of(process):
 
 def equal(result, other):
     return all(result[name] == other[name] for name in ("dataset_digest", "weights_digest", "trajectories"))
+
+
+def kill_the_tree(process):
+    """SIGKILL to the command and to everything that it started, Ray's own processes included."""
+    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    for member in family:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            member.kill()
+    finish(process)
+    _, alive = psutil.wait_procs(family, timeout=15)
+    assert not alive
