@@ -14,6 +14,7 @@ from typing import Any
 import icrl_dist
 from actors.beliefs import Beliefs
 from actors.policy import LivePolicy
+from actors.showing import Showing
 from actors.watchdog import Watchdog
 from icrl_dist import code, crashes, jobs
 from icrl_dist.config import parse
@@ -44,7 +45,7 @@ class Worker:
         self._episodes = self._steps = 0
         self._job = self._doing = ""
         self._weights = -1
-        self._samples = Samples()
+        self._showing = Showing(link, self._keys, name)
 
     def stop(self) -> None:
         """End after the job at hand."""
@@ -94,7 +95,8 @@ class Worker:
                 self._episodes += 1
                 self._steps += len(trajectory.actions)
                 sender.send(wire.encode_trajectory(trajectory))
-                self._show(trajectory)
+                self._showing.show(trajectory)
+            self._showing.flush()
             sender.drain(timeout_s=drain_s)
         except Unanswered as error:
             _log.warning("job %s given back: %s", job.label, error)
@@ -128,13 +130,6 @@ class Worker:
         reply = patiently(lambda: self._link.request(self._keys.work, payload, timeout_s=5.0), self._patience_s)
         return wire.decode_message(reply)
 
-    def _show(self, trajectory: Trajectory) -> None:
-        message = wire.monitor_trajectory(trajectory, time.time())
-        self._link.publish(self._keys.monitor(f"trajectory/{self.name}"), message, droppable=True)
-        if self._samples.take(trajectory.identity, time.monotonic()):
-            message = wire.monitor_episode(trajectory, time.time())
-            self._link.publish(self._keys.monitor(f"episode/{self.name}"), message, droppable=True)
-
     def _count(self, sender: CreditSender) -> dict[str, int]:
         return {
             "episodes": self._episodes,
@@ -162,6 +157,7 @@ class Worker:
                 message = wire.encode_message("worker", worker=self.name, **now, **fields)
                 try:
                     self._link.publish(key, message, droppable=True)
+                    self._showing.flush()
                 except LinkError as error:
                     _log.warning("a heartbeat is lost: %s", error)
                 if ended.wait(HEARTBEAT_S):
@@ -174,33 +170,6 @@ class Worker:
         finally:
             ended.set()
             thread.join(5.0)
-
-
-class Samples:
-    """Which episodes are shown whole: some a second, of every variation in turn."""
-
-    def __init__(self, per_s: float = 4.0, burst: int = 8, again_s: float = 2.0) -> None:
-        """At most ``burst`` at once; a new turn begins once none has waited for its own for ``again_s`` seconds."""
-        self._per_s, self._burst, self._again_s = per_s, burst, again_s
-        self._left, self._since = float(burst), float("-inf")
-        self._shown: set[tuple[int, int]] = set()
-        self._waited = float("-inf")
-
-    def take(self, identity: Identity, now: float) -> bool:
-        """Whether this one is shown."""
-        self._left = min(self._burst, self._left + (now - self._since) * self._per_s)
-        self._since = now
-        place = identity.task, identity.variation
-        if place in self._shown:
-            if now - self._waited < self._again_s:
-                return False
-            self._shown.clear()
-        self._waited = now
-        if self._left < 1:
-            return False
-        self._left -= 1
-        self._shown.add(place)
-        return True
 
 
 class _Waiting:

@@ -193,7 +193,7 @@ def tap(arguments: Tap, console: Console) -> int:
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: over.set())
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
-        link.subscribe("icrl/*/mon/trajectory/**", tapped)
+        link.subscribe("icrl/*/mon/trajectories/**", tapped)
         over.wait()
     return OK
 

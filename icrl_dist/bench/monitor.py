@@ -70,7 +70,7 @@ def describe(result: dict[str, Any]) -> str:
         f"  {r['contexts_ratio_live']:.3f} and {r['contexts_ratio_stopped']:.3f} where it is cheapest "
         f"(random contexts, {r['contexts_ms']:.2f} ms)\n"
         f"{STREAMS} streams at {PER_S:g}/s: page {r['page_cores']:.2f} cores (below {PAGE_CORES}), of "
-        f"{r['sent_per_s']:,.0f} messages/s it heard {r['page_heard_per_s']:,.0f}; terminal {r['terminal_cores']:.2f} cores "
+        f"{r['sent_per_s']:,.0f} episodes/s it heard {r['page_heard_per_s']:,.0f}; terminal {r['terminal_cores']:.2f} cores "
         f"(below {TERMINAL_CORES:g})\n"
         f"{'within the bounds' if r['ok'] else 'OUT OF BOUNDS'}; load average before: {r['load']}"
     )
@@ -234,11 +234,11 @@ def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
         with urllib.request.urlopen(url.rstrip("/") + "/events", timeout=30) as events:
             threading.Thread(target=_drain, args=(events,), daemon=True).start()
             time.sleep(3.0)
-            heard, first, cores = _heard(url), sent[0], _cores(process.pid, seconds)
-            heard, said = _heard(url) - heard, sent[0] - first
+            first, cores = sent[0], _cores(process.pid, seconds)
+            heard, said = _heard_per_s(url, int(seconds)), sent[0] - first
         return {
             "page_cores": round(cores, 3),
-            "page_heard_per_s": round(heard / seconds, 1),
+            "page_heard_per_s": round(heard, 1),
             "sent_per_s": round(said / seconds, 1),
         }
     finally:
@@ -252,11 +252,12 @@ def _drain(events: Iterable[bytes]) -> None:
             pass
 
 
-def _heard(url: str) -> int:
+def _heard_per_s(url: str, points: int) -> float:
+    """Episodes a second that the page knows of, over its last points, one a second."""
     with urllib.request.urlopen(url.rstrip("/") + "/events", timeout=30) as events:
         for line in events:
             if line.startswith(b"data:"):
-                return int(json.loads(line[5:])["heard"])
+                return statistics.mean(json.loads(line[5:])["series"]["episodes_per_s"][-points:])
     raise RuntimeError("the page told nothing")
 
 

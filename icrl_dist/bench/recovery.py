@@ -94,8 +94,9 @@ class _Heard:
         with self._changed:
             if kind == "learner":
                 self._stored = fields["trajectories"]
-            elif kind == "trajectory":
-                self._sent.append((time.monotonic(), fields["worker"], Identity.parse(fields["identity"])))
+            elif kind == "trajectories":
+                now = time.monotonic()
+                self._sent += [(now, one["worker"], Identity.parse(one["identity"])) for one in wire.monitored(fields)]
             self._changed.notify_all()
 
     def _read(self) -> None:

@@ -3,7 +3,7 @@
 ``python -m icrl_dist.bench.viewer view ENDPOINT``: ``on`` on standard input subscribes and keeps a
 picture, as a view does; ``off`` lets go of it and answers how many messages it took in.
 ``python -m icrl_dist.bench.viewer crowd STREAMS PER_S``: a learner's endpoint, with so many
-variations that each end ``PER_S`` episodes a second; prints where it listens.
+variations that each end ``PER_S`` episodes a second, of 16 workers; prints where it listens.
 """
 
 from __future__ import annotations
@@ -13,14 +13,18 @@ import sys
 import threading
 import time
 
-from icrl_dist.monitor.feed import PERIOD_S, LiveFeed
+import numpy as np
+
+from actors.showing import PERIOD_S
+from icrl_dist.monitor.feed import PERIOD_S as LOOK_S
+from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 
 _WORKERS = 16
 _TRIALS = 40
-_SLICE_S = 0.02
 
 
 def view(endpoint: str) -> None:
@@ -33,7 +37,7 @@ def view(endpoint: str) -> None:
 
             def look(feed: LiveFeed = feed, ended: threading.Event = ended) -> None:
                 since = -1
-                while not ended.wait(PERIOD_S):
+                while not ended.wait(LOOK_S):
                     shown = feed.picture.snapshot(feed.now(), since)
                     since = shown["seq"]
                     json.dumps(shown)
@@ -59,32 +63,49 @@ def crowd(streams: int, per_s: float) -> None:
             ended.set()
 
         threading.Thread(target=wait, daemon=True).start()
-        messages = [[_episode(stream, trial) for trial in range(_TRIALS)] for stream in range(streams)]
-        topics = [keys.monitor(f"trajectory/w{worker}") for worker in range(_WORKERS)]
+        rows = [_episodes(worker, streams) for worker in range(_WORKERS)]
+        topics = [keys.monitor(f"trajectories/w{worker}") for worker in range(_WORKERS)]
         sent, began = 0, time.monotonic()
-        while not ended.wait(_SLICE_S):
-            due = int((time.monotonic() - began) * per_s * streams)
-            for number in range(sent, due):
-                stream, trial = number % streams, number // streams % _TRIALS
-                link.publish(topics[stream % _WORKERS], messages[stream][trial], droppable=True)
+        while not ended.wait(PERIOD_S):
+            due = int((time.monotonic() - began) * per_s)  # episodes of each stream
+            trials = range(sent, due)[-_TRIALS:]
+            if trials:
+                for topic, told in zip(topics, rows, strict=True):
+                    link.publish(topic, _message(told, trials), droppable=True)
             sent = due
-            print(sent, flush=True)
+            print(sent * streams, flush=True)
 
 
-def _episode(stream: int, trial: int) -> bytes:
-    return wire.encode_message(
-        "trajectory",
-        identity=f"adapt/0/{stream // 8}/{stream % 8}/{trial}",
-        problem="darkroom",
-        task={"goal": [3, 4], "size": 10, "horizon": 100, "start": [0, 0]},
-        adversary={"kind": "dirichlet", "p": 0.1, "alpha": [0.5, 1.0, 0.5, 1.5, 0.7]},
-        episode_return=float(trial),
-        steps=100,
-        weights=0,
-        digest="0" * 64,
-        worker=f"w{stream % _WORKERS}",
-        time=time.time(),
-    )
+def _episodes(worker: int, streams: int) -> list[list[Trajectory]]:
+    """Of each of a worker's streams, all of its trials."""
+    task = Task.of("darkroom", goal=(3, 4), size=10, horizon=100, start=(0, 0))
+    adversary = Adversary.of("dirichlet", p=0.1, alpha=(0.5, 1.0, 0.5, 1.5, 0.7))
+    return [
+        [
+            Trajectory(
+                identity=Identity("adapt", 0, stream // 8, stream % 8, trial),
+                variation=Variation(task, adversary),
+                weights=0,
+                digest="0" * 64,
+                worker=f"w{worker}",
+                observations=np.zeros((101, 2), np.float32),
+                actions=np.zeros(100, np.int16),
+                rewards=np.full(100, trial / 100, np.float32),
+                adversary=np.zeros(100, np.int16),
+                queries=np.zeros((0, 2), np.float32),
+                labels=np.zeros((0, 5), np.float32),
+                taken=np.zeros(0, np.int16),
+                gained=np.zeros(0, np.float32),
+                origin="none",
+            )
+            for trial in range(_TRIALS)
+        ]
+        for stream in range(worker, streams, _WORKERS)
+    ]
+
+
+def _message(told: list[list[Trajectory]], trials: range) -> bytes:
+    return wire.monitor_trajectories((one[trial % _TRIALS] for one in told for trial in trials), time.time())
 
 
 if __name__ == "__main__":

@@ -190,10 +190,11 @@ class _Ear:
     def hear(self, key: str, payload: bytes) -> None:
         """One message of the monitor plane."""
         kind, fields = wire.decode_message(payload)
-        if kind == "trajectory":
-            name = "/".join(fields["identity"].split("/")[:2])
-            self._heard[name] += 1
-            self._note(name, False, self._heard[name])
+        if kind == "trajectories":
+            for one in wire.monitored(fields):
+                name = "/".join(one["identity"].split("/")[:2])
+                self._heard[name] += 1
+                self._note(name, False, self._heard[name])
         elif kind == "learner" and fields["stage"] == "fit":
             self._note(f"{fields['phase']}/{fields['round']}", True, fields["step"])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import OrderedDict, deque
 from typing import Any
 
@@ -16,6 +17,8 @@ _EPISODES = 256
 _PHASES = 3
 """Phases kept of a variation, the newest."""
 _LINEAGE = 32
+_TOGETHER = 4096
+"""Episodes of a variation that a message tells of, at most."""
 _DRAWN = 48
 """Episodes kept to be drawn."""
 _OPTIMA = 4
@@ -32,7 +35,7 @@ class Curve:
     def __init__(self, message: dict[str, Any]) -> None:
         self.describe(message)
         self.phases: OrderedDict[str, dict[int, float]] = OrderedDict()
-        self.lineage: deque[dict[str, Any]] = deque(maxlen=_LINEAGE)
+        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_LINEAGE)
         self.optimum: float | None = None
         self.quarantine = ""
         self.changed = 0
@@ -60,8 +63,12 @@ class Curves:
         """Variations that were heard of."""
         return len(self._curves) + len(self._left_out)
 
-    def returned(self, identity: Identity, message: dict[str, Any]) -> None:
-        """An episode ended."""
+    def returned(self, told: dict[str, Any], worker: str, time: float) -> int:
+        """Episodes of a variation ended: as in an entry of ``variations`` in docs/tap.md; how many."""
+        identity = _of_variation(plain.text(told.get("identity"), 120))
+        trials, returns = (plain.listed(told.get(name), _TOGETHER) for name in ("trials", "returns"))
+        if len(trials) != len(returns):
+            raise Odd("schema")
         place = identity.task, identity.variation
         curve = self._curves.get(place)
         if curve is None:
@@ -69,29 +76,24 @@ class Curves:
                 if len(self._left_out) < 16 * VARIATIONS:
                     self._left_out.add(place)
                 raise Odd("too many variations")
-            curve = self._curves[place] = Curve(message)
-        earned = plain.number(message.get("episode_return"))
-        lineage = {
-            "identity": "/".join(map(str, identity)),
-            "episode_return": earned,
-            "weights": plain.integer(message.get("weights"), -1),
-            "digest": plain.text(message.get("digest"), 64),
-            "worker": plain.text(message.get("worker")),
-            "time": plain.number(message.get("time")),
-        }
+            curve = self._curves[place] = Curve(told)
+        weights, digest = plain.integer(told.get("weights"), -1), plain.text(told.get("digest"), 64)
         name = f"{identity.stage}/{identity.round}"
-        returns = curve.phases.get(name)
-        if returns is None:
-            curve.describe(message)
+        known = curve.phases.get(name)
+        if known is None:
+            curve.describe(told)
             self._unsolved.append(curve)
-            returns = curve.phases[name] = {}
+            known = curve.phases[name] = {}
             if len(curve.phases) > _PHASES:
                 curve.phases.popitem(last=False)
-        returns[identity.trial] = earned
-        if len(returns) > _EPISODES:
-            del returns[min(returns)]
-        curve.lineage.append(lineage)
+        for trial, earned in zip(trials, returns, strict=True):
+            number = plain.integer(trial, 0)
+            known[number] = plain.number(earned)
+            curve.lineage.append((name, number, known[number], weights, digest, worker, time))
+        for _ in range(len(known) - _EPISODES):
+            del known[min(known)]
         self._touch(curve)
+        return len(trials)
 
     def _touch(self, curve: Curve) -> None:
         if not curve.dirty:
@@ -152,7 +154,27 @@ class Curves:
         curve = self._curves.get(place)
         if curve is None:
             return None
-        return {**_told(place, curve), "lineage": list(curve.lineage), "episode": self._episodes.get(place)}
+        return {
+            **_told(place, curve),
+            "lineage": [_origin(place, *one) for one in curve.lineage],
+            "episode": self._episodes.get(place),
+        }
+
+
+@functools.lru_cache(maxsize=VARIATIONS)
+def _of_variation(name: str) -> Identity:
+    """``STAGE/ROUND/TASK/VARIATION`` as the identity of its first trial.  Raises Odd for anything else."""
+    try:
+        return Identity.parse(f"{name}/0")
+    except ValueError:
+        raise Odd("schema") from None
+
+
+def _origin(
+    place: tuple[int, int], phase: str, trial: int, earned: float, weights: int, digest: str, worker: str, time: float
+) -> dict[str, Any]:
+    said = {"weights": weights, "digest": digest, "worker": worker, "time": time}
+    return {"identity": f"{phase}/{place[0]}/{place[1]}/{trial}", "episode_return": earned, **said}
 
 
 def _told(place: tuple[int, int], curve: Curve) -> dict[str, Any]:

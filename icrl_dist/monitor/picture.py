@@ -25,6 +25,8 @@ _EVENTS = 200
 _SILENT_S = 3.0
 """A learner that says nothing for so long is called silent."""
 _BELIEFS = 16
+_VARIATIONS = 4096
+"""Of which a message tells, at most."""
 _OVER = ("finished", "interrupted", "failed")
 
 
@@ -79,9 +81,8 @@ class Picture:
             self.ignored[str(error)] += 1
 
     def _take(self, kind: str, message: dict[str, Any], now: float) -> None:
-        if kind == "trajectory":
-            self._curves.returned(_identity(message), message)
-            self._pace.produced(1)
+        if kind == "trajectories":
+            self._returned(message)
         elif kind == "episode":
             self._curves.drawn(_identity(message), message)
         elif kind == "worker":
@@ -96,6 +97,16 @@ class Picture:
             self._belief(message)
         else:
             raise Odd("unknown kind")
+
+    def _returned(self, message: dict[str, Any]) -> None:
+        worker, time, odd = plain.text(message.get("worker")), plain.number(message.get("time")), None
+        for told in plain.listed(message.get("variations"), _VARIATIONS):
+            try:
+                self._pace.produced(self._curves.returned(plain.mapped(told), worker, time))
+            except Odd as error:  # the others are none the worse for it
+                odd = error
+        if odd:
+            raise odd
 
     def _progress(self, message: dict[str, Any], now: float) -> None:
         run = self._run

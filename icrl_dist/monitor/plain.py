@@ -39,6 +39,13 @@ def listed(value: object, longest: int) -> list[Any]:
     return value
 
 
+def mapped(value: object) -> dict[str, Any]:
+    """A map.  Raises Odd for anything else."""
+    if type(value) is not dict:
+        raise Odd("schema")
+    return value
+
+
 def numbers(value: object, longest: int) -> list[float]:
     """A list of at most so many finite numbers.  Raises Odd for anything else."""
     return [number(one) for one in listed(value, longest)]

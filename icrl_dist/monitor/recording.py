@@ -117,7 +117,7 @@ class Recording:
         drawn: dict[str, float] = {}
         for now, row in zip(self._when, self._ordered, strict=True):
             trajectory, worker = self._store.read(row.identity), row.worker
-            yield now, self._keys.monitor(f"trajectory/{_part(worker)}"), wire.monitor_trajectory(trajectory, now)
+            yield now, self._keys.monitor(f"trajectories/{_part(worker)}"), wire.monitor_trajectories([trajectory], now)
             done[worker] += 1
             steps[worker] += len(trajectory.actions)
             if now - drawn.get(worker, 0.0) >= _EPISODES_S:

@@ -36,19 +36,22 @@ class Tapped:
     def __call__(self, key: str, payload: bytes) -> None:
         """One message of the monitor plane."""
         try:
-            _, fields = wire.decode_message(payload)
-            wanted = self._passes(fields)
+            kind, fields = wire.decode_message(payload)
+            told = [one for one in wire.monitored(fields) if self._passes(one)] if kind == "trajectories" else []
         except (wire.WireError, ValueError):
             return
-        if self._over or not wanted:
-            return
+        for one in told:
+            if not self._over:
+                self._take(one)
+
+    def _take(self, one: dict[str, Any]) -> None:
         self._passed += 1
         if (self._passed - 1) % self._every:
             return
         if self._format == "msgpack":
-            sys.stdout.buffer.write(payload)
+            sys.stdout.buffer.write(wire.encode_message("trajectory", **one))
         else:
-            sys.stdout.write(json.dumps(fields) + "\n")
+            sys.stdout.write(json.dumps(one) + "\n")
         sys.stdout.flush()
         self._left -= 1
         if self._left == 0:

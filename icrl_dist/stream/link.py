@@ -60,7 +60,7 @@ class Keys:
         return f"icrl/{self.run}/alive/*"
 
     def monitor(self, topic: str) -> str:
-        """One topic of the monitor plane, such as ``trajectory/w0``."""
+        """One topic of the monitor plane, such as ``trajectories/w0``."""
         for part in topic.split("/"):
             _part(part)
         return f"icrl/{self.run}/mon/{topic}"

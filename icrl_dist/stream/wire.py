@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping, Set
 from typing import Any
 
 import msgpack
@@ -198,21 +198,42 @@ def decode_message(data: bytes, limit: int = SMALL) -> tuple[str, dict[str, Any]
     return text(message.pop("kind", None), "kind"), message
 
 
-def monitor_trajectory(trajectory: Trajectory, time: float) -> bytes:
-    """What the monitor plane says of a trajectory: docs/tap.md.  ``time`` in Unix seconds."""
-    return encode_message(
-        "trajectory",
-        identity=str(trajectory.identity),
-        problem=trajectory.variation.task.kind,
-        task=_plain(trajectory.variation.task.params),
-        adversary={**_plain(trajectory.variation.adversary.params), "kind": trajectory.variation.adversary.kind},
-        episode_return=trajectory.episode_return,
-        steps=len(trajectory.actions),
-        weights=trajectory.weights,
-        digest=trajectory.digest,
-        worker=trajectory.worker,
-        time=float(time),
-    )
+def monitor_trajectories(trajectories: Iterable[Trajectory], time: float) -> bytes:
+    """What the monitor plane says of some trajectories of one worker: docs/tap.md.  ``time`` in Unix seconds."""
+    told: dict[tuple[object, ...], dict[str, Any]] = {}
+    worker = ""
+    for one in trajectories:
+        worker = one.worker
+        of = (*one.identity[:4], one.weights, one.digest)
+        if of not in told:
+            told[of] = {
+                "identity": "/".join(map(str, one.identity[:4])),
+                "problem": one.variation.task.kind,
+                "task": _plain(one.variation.task.params),
+                "adversary": {**_plain(one.variation.adversary.params), "kind": one.variation.adversary.kind},
+                "weights": one.weights,
+                "digest": one.digest,
+                **{name: [] for name in _COLUMNS},
+            }
+        for name, value in zip(_COLUMNS, (one.identity.trial, one.episode_return, len(one.actions)), strict=True):
+            told[of][name].append(value)
+    return encode_message("trajectories", worker=worker, time=float(time), variations=list(told.values()))
+
+
+def monitored(fields: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Each trajectory that a message of that kind tells of, as a map of its own: what ``icrl-dist tap`` prints.
+
+    Raises WireError for fields that are none of such a message.
+    """
+    for told in as_list(fields.get("variations"), "variations"):
+        of = dict(as_map(told, "variations"))
+        identity = text(of.pop("identity", None), "identity")
+        columns = [as_list(of.pop(name, None), name) for name in _COLUMNS]
+        if len({len(column) for column in columns}) != 1:
+            raise WireError("shape", f"{_COLUMNS} have {[len(column) for column in columns]} entries, expected as many of each")
+        for trial, earned, steps in zip(*columns, strict=True):
+            one = {"identity": f"{identity}/{trial}", **of, "episode_return": earned, "steps": steps}
+            yield {**one, "worker": fields.get("worker"), "time": fields.get("time")}
 
 
 def monitor_episode(trajectory: Trajectory, time: float) -> bytes:
@@ -235,6 +256,7 @@ def monitor_episode(trajectory: Trajectory, time: float) -> bytes:
     )
 
 
+_COLUMNS = ("trials", "returns", "steps")
 _ALWAYS = {"v", "kind"}
 _TRAJECTORY = _ALWAYS | {"identity", "variation", "weights", "digest", "worker", "origin", "arrays"}
 _WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}

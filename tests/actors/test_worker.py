@@ -13,7 +13,7 @@ from actors import beliefs
 from actors import worker as worker_module
 from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
-from actors.worker import Samples, Worker
+from actors.worker import Worker
 from icrl_dist import jobs
 from icrl_dist.belief import Room
 from icrl_dist.config import dumps
@@ -23,7 +23,7 @@ from icrl_dist.recipes import METHODS
 from icrl_dist.stream import batch, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
-from icrl_dist.types import Identity, Weights
+from icrl_dist.types import Weights
 
 KEYS = Keys("test")
 
@@ -81,8 +81,8 @@ def test_a_worker_does_its_job_says_who_it_is_and_stops(hub, small_run):
     assert {t.worker for t in learner.stored} == {"w7"}
     assert learner.asked[0][1]["version"] == icrl_dist.__version__
     assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
-    monitored = [fields["identity"] for kind, fields in seen if kind == "trajectory"]
-    assert monitored == [str(i) for i in job.identities()][: len(monitored)] and monitored
+    monitored = [one["identity"] for kind, fields in seen if kind == "trajectories" for one in wire.monitored(fields)]
+    assert monitored == [str(i) for i in job.identities()]
 
 
 def test_a_job_that_raises_is_reported_and_the_worker_goes_on(hub, small_run):
@@ -276,13 +276,3 @@ def test_the_policy_does_not_wait_for_ever(hub, small_run):
     policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
     with pytest.raises(Unanswered, match=r"version 3 did not come within 0.3 s"):
         policy.at(3)
-
-
-def test_shown_episodes_are_few_and_every_variation_has_its_turn():
-    samples, shown = Samples(per_s=4.0, burst=8, again_s=2.0), []
-    for trial in range(60):  # 30 variations end an episode together, four times a second
-        now = 0.25 * trial
-        shown += [v for v in range(30) if samples.take(Identity("adapt", 0, 0, v, trial), now)]
-    assert len(shown) <= 8 + 4 * 15
-    assert sorted(shown[:30]) == list(range(30))
-    assert len(shown) > 38, "and then the next turn"

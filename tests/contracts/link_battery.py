@@ -184,7 +184,7 @@ class LinkBattery:
     def test_a_publisher_knows_whether_anybody_listens(self, links: Links) -> None:
         belief, other = KEYS.monitor("belief/w0"), KEYS.monitor("belief/w1")
         tap, worker = links.worker(), links.worker()
-        tap.subscribe(KEYS.monitor("trajectory/w0"), lambda key, payload: None)
+        tap.subscribe(KEYS.monitor("trajectories/w0"), lambda key, payload: None)
         links.settle()
         assert not worker.watched(belief)
         links.settle()
@@ -225,7 +225,7 @@ class LinkBattery:
         start, slowest = time.monotonic(), 0.0
         for _ in range(3000):
             before = time.monotonic()
-            worker.publish(KEYS.monitor("trajectory/w0"), bytes(500), droppable=True)
+            worker.publish(KEYS.monitor("trajectories/w0"), bytes(500), droppable=True)
             slowest = max(slowest, time.monotonic() - before)
         assert slowest < 0.5
         for _ in range(50):

@@ -258,14 +258,12 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
             reader.start()
             end = time.monotonic() + 15
             while not lines and time.monotonic() < end:
-                learner.publish(KEYS.monitor("trajectory/w0"), wire.monitor_trajectory(episode, 5.0), droppable=True)
+                learner.publish(KEYS.monitor("trajectories/w0"), wire.monitor_trajectories([episode], 5.0), droppable=True)
                 time.sleep(0.05)
         finally:
             tap.kill()
             tap.communicate(timeout=10)
     assert json.loads(lines[0]) == {
-        "v": 1,
-        "kind": "trajectory",
         "identity": "adapt/0/3/1/7",
         "problem": "darkroom",
         "task": {"goal": [3, 4], "size": 10},

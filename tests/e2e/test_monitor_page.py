@@ -80,9 +80,9 @@ class Plane:
     def told(self, variation, trial, earned, kind="uniform", problem="darkroom", **fields):
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
         adversary = {"kind": kind} if kind == "null" else {"kind": kind, "p": 0.25}
-        about = {"problem": problem, "task": room, "adversary": adversary, "weights": 0, "digest": "ab" * 32, "steps": 8}
-        said = {"identity": f"adapt/0/{variation}/{trial}", "episode_return": earned, "worker": "w0", "time": time.time()}
-        return wire.encode_message("trajectory", **{**said, **about, **fields})
+        about = {"problem": problem, "task": room, "adversary": adversary, "weights": 0, "digest": "ab" * 32}
+        told = {"identity": f"adapt/0/{variation}", **about, "trials": [trial], "returns": [earned], "steps": [8]}
+        return wire.encode_message("trajectories", **{"worker": "w0", "time": time.time(), "variations": [told], **fields})
 
     def close(self):
         self.feed.close()
@@ -181,7 +181,7 @@ def test_hostile_messages_are_text_or_nothing(page):
         run.say("run", **about)
         run.put(b"\xff" * 100)
         run.put(msgpack.packb({"v": 1, "kind": "event", "text": "x" * (2 << 20)}))
-        run.put(msgpack.packb({"v": 1, "kind": "trajectory", "episode_return": float("nan")}))
+        run.put(msgpack.packb({"v": 1, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
         run.put(wire.encode_message("event", time=1.0, what="x", text="x"), run="another")
         page.goto(url)
         page.locator("#worker-table").get_by_text(MARKUP).first.wait_for()
@@ -204,7 +204,7 @@ def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkey
         run.progress()
         for number in range(1000):  # at once: a link would drop some
             payload = run.told(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
-            run.feed.picture.hear("icrl/a-run/mon/trajectory/w0", payload, time.time())
+            run.feed.picture.hear("icrl/a-run/mon/trajectories/w0", payload, time.time())
         with showing(run.feed, "127.0.0.1", 0) as url:
             page.goto(url)
             until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")

@@ -38,8 +38,8 @@ def collecting(phase, count):
     seen = set()
 
     def reached(kind, fields):
-        if kind == "trajectory" and fields["identity"].startswith(phase):
-            seen.add(fields["identity"])
+        if kind == "trajectories":
+            seen.update(one["identity"] for one in wire.monitored(fields) if one["identity"].startswith(phase))
         return len(seen) >= count
 
     return reached

@@ -110,17 +110,17 @@ def test_a_worker_and_a_monitor_do_their_work(ours):
         eventually(
             lambda: answered(worker, KEYS.data, b"trajectory") == b"stored trajectory", OPEN_S
         )  # asked before it was served
-        worker.publish(KEYS.monitor("trajectory/w0"), b"nobody listens", droppable=True)
+        worker.publish(KEYS.monitor("trajectories/w0"), b"nobody listens", droppable=True)
         monitor = stack.enter_context(ZenohLink.connect(*connect, security.client(ours, "monitor")))
-        monitor.subscribe("icrl/*/mon/trajectory/**", lambda key, payload: heard.append((key, payload)))
-        for link, topic in ((worker, "trajectory/w0"), (learner, "trajectory/learner")):
+        monitor.subscribe("icrl/*/mon/trajectories/**", lambda key, payload: heard.append((key, payload)))
+        for link, topic in ((worker, "trajectories/w0"), (learner, "trajectories/learner")):
             eventually(lambda link=link, topic=topic: published(link, KEYS.monitor(topic), b"look", heard), OPEN_S)
-        assert worker.watched(KEYS.monitor("trajectory/w0")) and not worker.watched(KEYS.monitor("belief/w0"))
+        assert worker.watched(KEYS.monitor("trajectories/w0")) and not worker.watched(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
         eventually(lambda: worker.watched(KEYS.monitor("belief/w0")), OPEN_S)
         eventually(lambda: published(learner, KEYS.weights, b"T^1", weights), OPEN_S)
         eventually(lambda: alive == [("w0", True)], OPEN_S)
-        assert (KEYS.monitor("trajectory/w0"), b"look") in heard and b"T^1" in weights
+        assert (KEYS.monitor("trajectories/w0"), b"look") in heard and b"T^1" in weights
         worker.close()
         eventually(lambda: alive == [("w0", True), ("w0", False)], OPEN_S)
 

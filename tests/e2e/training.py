@@ -52,12 +52,13 @@ def on_first_adapt_trajectory(folder, act, round_=0):
 
     def hear(key, payload):
         _, fields = wire.decode_message(payload)
-        if fields["identity"].startswith(f"adapt/{round_}") and not acted.is_set():
+        heard = any(one["identity"].startswith(f"adapt/{round_}") for one in wire.monitored(fields))
+        if heard and not acted.is_set():
             acted.set()
             act()
 
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
-        link.subscribe(f"icrl/{folder.name}/mon/trajectory/**", hear)
+        link.subscribe(f"icrl/{folder.name}/mon/trajectories/**", hear)
         acted.link = link
         yield acted
 

@@ -42,7 +42,7 @@ def said(small_run, tmp_path, monkeypatch):
 def test_monitors_are_told_all_that_docs_say(said):
     heard, rows, _ = said()
     of = {kind: [fields for _, found, fields in heard if found == kind] for _, kind, _ in heard}
-    assert of.keys() == {"trajectory", "episode", "worker", "learner", "run", "event"}
+    assert of.keys() == {"trajectories", "episode", "worker", "learner", "run", "event"}
     (about, *_) = of["run"]
     assert (about["method"], about["problem"], about["rounds"]) == ("icaa", "darkroom", 2)
     assert (about["tasks"], about["variations"]) == (7, 21)
@@ -51,8 +51,10 @@ def test_monitors_are_told_all_that_docs_say(said):
     assert of["event"][-1]["what"] in ("finished", "worker")
     assert {row["stage"].partition("/")[0] for row in rows} <= {*NAMES, *TEXTS}
     stored = [row["trajectories"] for row in rows if row["stage"] == "ingest"]
-    assert stored == sorted(stored) and stored[-1] == len(of["trajectory"])
-    assert len(of["episode"]) < len(of["trajectory"]), "only some are shown whole"
+    told = [one["identity"] for fields in of["trajectories"] for one in wire.monitored(fields)]
+    assert stored == sorted(stored) and stored[-1] == len(told) == len(set(told))
+    assert len(of["episode"]) < len(told), "only some are shown whole"
+    assert len(of["trajectories"]) < len(told) / 2, "a message tells of many"
 
 
 def test_an_alert_reaches_terminal_monitors_and_metrics(said):

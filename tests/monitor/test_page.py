@@ -43,8 +43,9 @@ class Run:
 
     def returned(self, variation, trial, earned):
         named = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
-        weights = {"weights": 0, "digest": "d" * 64, "steps": 8, "episode_return": earned}
-        self.said("trajectory", identity=f"adapt/0/{variation}/{trial}", problem="darkroom", **named, **weights)
+        columns = {"trials": [trial], "returns": [earned], "steps": [8], "weights": 0, "digest": "d" * 64}
+        told = {"identity": f"adapt/0/{variation}", "problem": "darkroom", **named, **columns}
+        self.said("trajectories", variations=[told])
 
     def tick(self):
         self.time += 0.25

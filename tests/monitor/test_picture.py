@@ -1,5 +1,6 @@
 """The picture of a run: what it shows, what it bounds, what it leaves out."""
 
+import contextlib
 import json
 
 import msgpack
@@ -18,7 +19,7 @@ from tests.monitor.messages import PUSHY, ROOM, about, beat, event, hear, progre
 
 def watch(picture, *trajectories, now=0.0):
     for one in trajectories:
-        hear(picture, f"trajectory/{one.worker}", wire.monitor_trajectory(one, now), now)
+        hear(picture, f"trajectories/{one.worker}", wire.monitor_trajectories([one], now), now)
         hear(picture, f"episode/{one.worker}", wire.monitor_episode(one, now), now)
 
 
@@ -234,7 +235,7 @@ def test_one_run_is_shown_and_another_at_the_same_place_left_out():
 
 
 MESSAGES = {
-    "trajectory": wire.monitor_trajectory(trajectory(), 0.0),
+    "trajectories": wire.monitor_trajectories([trajectory()], 0.0),
     "episode": wire.monitor_episode(trajectory(), 0.0),
     "worker": beat(),
     "learner": progress(),
@@ -272,6 +273,11 @@ def test_no_field_of_any_message_can_break_it(kind):
             except OverflowError:
                 continue
             hear(picture, "x", message)
+    for name in wire.decode_message(MESSAGES["trajectories"])[1]["variations"][0] if kind == "trajectories" else ():
+        for odd in ODD:
+            broken = dict(whole["variations"][0]) | {name: odd}
+            with contextlib.suppress(OverflowError):
+                hear(picture, "x", msgpack.packb(whole | {"variations": [broken]}))
     picture.tick(1.0)
     text = json.dumps(picture.snapshot(1.0), allow_nan=False)
     assert "\\u001b" not in text and sum(picture.ignored.values()) > len(ODD)

@@ -76,7 +76,7 @@ def test_its_messages_are_in_order_of_time_and_within_the_run(watched):
     times = [now for now, _, _ in recording.messages()]
     assert times == sorted(times) and recording.begin <= times[0] and times[-1] <= recording.end
     store = Store(folder / "dataset", readonly=True)
-    assert sum("/mon/trajectory/" in key for _, key, _ in recording.messages()) == len(store)
+    assert sum("/mon/trajectories/" in key for _, key, _ in recording.messages()) == len(store)
     store.close()
     recording.close()
 

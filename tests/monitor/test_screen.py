@@ -208,7 +208,7 @@ def test_names_from_the_network_are_only_ever_text(size):
     feed.say("event", what="alert", alert="[/]", active=True, text=HOSTILE)
     feed.say("event", what="quarantine", identity="adapt/0/0/0", text=HOSTILE)
     bad = episode(0, 1, 6)
-    feed.picture.hear("icrl/demo/mon/trajectory/x", b"\x81\xa1v\x01", feed.time)
+    feed.picture.hear("icrl/demo/mon/trajectories/x", b"\x81\xa1v\x01", feed.time)
     feed.picture.hear("icrl/other/mon/learner", b"", feed.time)
     object.__setattr__(bad, "worker", HOSTILE)
     feed.store(bad)
@@ -368,7 +368,7 @@ def test_durations(seconds, told):
 def test_what_was_rolled_out_by_new_weights_is_played_after_they_were_fitted(tmp_path):
     recording = Recording(run_folder(tmp_path / "run"))
     try:
-        said = [(then - BEGAN, payload) for then, key, payload in recording.messages() if "/trajectory/" in key]
+        said = [(then - BEGAN, payload) for then, key, payload in recording.messages() if "/trajectories/" in key]
     finally:
         recording.close()
     assert len(said) == 72

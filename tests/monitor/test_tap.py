@@ -20,17 +20,19 @@ class Out(io.TextIOWrapper):
 
 
 def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0):
-    """What is written of 24 trajectories and three messages that are none."""
-    out, ended = Out(), []
+    """What is written of 24 trajectories and some messages that are none."""
+    out, ended, made = Out(), [], []
     monkeypatch.setattr(sys, "stdout", out)
     tap = Tapped(tasks, adversaries, every, form, count, lambda: ended.append(True))
     for task in range(3):
         for variation in range(2):
             for trial in range(4):
                 law = {"adversary": NULL} if variation == 0 else {}
-                one = trajectory(f"adapt/0/{task}/{variation}/{trial}", **law)
-                tap("key", wire.monitor_trajectory(one, 0.0))
-    for odd in (progress(), b"garbage", wire.encode_message("trajectory", identity="x")):
+                made.append(trajectory(f"adapt/0/{task}/{variation}/{trial}", **law))
+    for first in range(0, len(made), 7):
+        tap("key", wire.monitor_trajectories(made[first : first + 7], 0.0))
+    broken = [{"identity": "x"}, {"identity": "adapt/0/0/0", "trials": [1], "returns": [], "steps": []}, 7]
+    for odd in (progress(), b"garbage", *(wire.encode_message("trajectories", variations=[one]) for one in broken)):
         tap("key", odd)
     return out.buffer.getvalue(), len(ended)
 
@@ -55,7 +57,7 @@ def test_every_so_manyth_of_those_and_no_more_than_asked(monkeypatch):
     assert identities(written) == ["adapt/0/1/0/0", "adapt/0/1/0/3"] and ended == 1
 
 
-def test_as_the_messages_came(monkeypatch):
+def test_as_messages_of_their_own(monkeypatch):
     written, _ = tapped(monkeypatch, tasks=(1,), form="msgpack")
     found = list(msgpack.Unpacker(io.BytesIO(written)))
     assert len(found) == 8 and found[0]["identity"] == "adapt/0/1/0/0" and found[0]["v"] == 1

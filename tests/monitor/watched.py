@@ -95,7 +95,7 @@ class Watched:
         self.say("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
 
     def store(self, trajectory):
-        self.picture.hear("icrl/demo/mon/trajectory/w0", wire.monitor_trajectory(trajectory, self.time), self.time)
+        self.picture.hear("icrl/demo/mon/trajectories/w0", wire.monitor_trajectories([trajectory], self.time), self.time)
 
     def draw(self, trajectory):
         self.picture.hear("icrl/demo/mon/episode/w0", wire.monitor_episode(trajectory, self.time), self.time)
