@@ -15,7 +15,9 @@ from icrl_dist.types import NULL, Identity, Variation
 _log = logging.getLogger(__name__)
 
 PERIOD_S = 1.0
-"""At most so often."""
+"""At most so often, and"""
+SHARE = 1 / 200
+"""never more than this share of the worker's time."""
 
 
 class Beliefs:
@@ -36,12 +38,13 @@ class Beliefs:
         now = time.monotonic()
         if now < self._at or variation.task.kind != "darkroom":
             return
-        self._at = now + PERIOD_S
+        spent = time.thread_time()
         try:
             if self._link.watched(self._key):
                 self._link.publish(self._key, self._message(policy, row, identity, variation), droppable=True)
         except Exception as error:
             _log.warning("a belief is lost: %s", error)
+        self._at = now + max(PERIOD_S, (time.thread_time() - spent) / SHARE)
 
     def _message(self, policy: InContextPolicy, row: int, identity: Identity, variation: Variation) -> bytes:
         room, task = self._run.darkroom, variation.task

@@ -11,6 +11,7 @@ import torch
 import icrl_dist
 from actors import beliefs
 from actors import worker as worker_module
+from actors.beliefs import Beliefs
 from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
 from actors.worker import Worker
@@ -185,9 +186,15 @@ def committed_run(small_run):
     return dataclasses.replace(small_run, **parts)
 
 
+def always(monkeypatch):
+    """Let every belief be read."""
+    monkeypatch.setattr(beliefs, "PERIOD_S", 0.0)
+    monkeypatch.setattr(beliefs, "SHARE", float("inf"))
+
+
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
 def test_whoever_looks_on_sees_beliefs_and_changes_no_byte(committed_run, deploy, monkeypatch):
-    monkeypatch.setattr(beliefs, "PERIOD_S", 0.0)
+    always(monkeypatch)
     round_0 = METHODS["icaa"].phases(committed_run)[1]
     job = METHODS["icaa"].ask(committed_run, round_0)[0]
     settings = {**dict(job.settings), "deploy": deploy, "context_max": 20}
@@ -225,8 +232,38 @@ def test_whoever_looks_on_sees_beliefs_and_changes_no_byte(committed_run, deploy
     assert (kept[1] == 1) == (deploy == "committed"), "Algorithm 1 lets an episode in when it has ended"
 
 
+def test_beliefs_take_a_share_of_the_time_and_no_more(hub, small_run, monkeypatch):
+    link, watching, clock, cost = hub(), hub(), [100.0, 0.0], 0.02
+    watching.subscribe(KEYS.monitor("belief/w0"), lambda key, payload: None)
+    monkeypatch.setattr(beliefs.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(beliefs.time, "thread_time", lambda: clock[1])
+    told = Beliefs(link, KEYS.monitor("belief/w0"), "w0", small_run)
+    read = []
+
+    def message(*asked):
+        read.append(clock[0])
+        clock[1] += cost
+        return b""
+
+    monkeypatch.setattr(told, "_message", message)
+    job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
+    identity = next(iter(job.identities()))
+
+    def look(seconds):
+        read.clear()
+        for _ in range(seconds * 10):
+            clock[0] += 0.1
+            told(None, 0, identity, job.variation(identity))
+        return len(read)
+
+    assert look(80) * cost <= 80 / 200 + cost and read[-1] - read[-2] >= 4.0
+    cost = 0.001
+    look(5)
+    assert look(20) == pytest.approx(20, abs=2), "once a second is enough"
+
+
 def test_a_belief_that_fails_is_lost_and_the_job_is_not(hub, small_run, monkeypatch, caplog):
-    monkeypatch.setattr(beliefs, "PERIOD_S", 0.0)
+    always(monkeypatch)
     monkeypatch.setattr(Room, "read", lambda *asked: 1 / 0)
     job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
     learner = Learner(hub(), small_run, [job_message(job), STOP])
