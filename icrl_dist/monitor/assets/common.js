@@ -53,6 +53,20 @@ function remember(name, value) {
   }
 }
 
+/** A canvas's context, cleared and as sharp as the screen, in CSS pixels; its width and height in them. */
+export function canvas(element) {
+  const [width, height] = [element.clientWidth, element.clientHeight];
+  const ratio = window.devicePixelRatio || 1;
+  if (element.width !== Math.round(width * ratio) || element.height !== Math.round(height * ratio)) {
+    element.width = Math.round(width * ratio);
+    element.height = Math.round(height * ratio);
+  }
+  const pen = element.getContext("2d");
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  return { pen, width, height };
+}
+
 const probe = document.createElement("span");
 probe.hidden = true;
 

@@ -1,6 +1,6 @@
 // Episodes on canvases.  A drawing is drawn at a moment `at`, in frames, up to `frames(drawing)`.
 
-import { number } from "./common.js";
+import { canvas, number } from "./common.js";
 import { faint, ink } from "./monitor-charts.js";
 
 const CELLS_PER_S = 10; // Dark Room has no clock of its own
@@ -34,17 +34,9 @@ export function words(drawing) {
 }
 
 /** Draw on a canvas, as sharp as the screen, at frame `at`; whole if `still`. */
-export function draw(canvas, drawing, at, still = false) {
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+export function draw(element, drawing, at, still = false) {
+  const { pen: ctx, width, height } = canvas(element);
   if (!width) return;
-  const scale = devicePixelRatio || 1;
-  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
-    canvas.width = Math.round(width * scale);
-    canvas.height = Math.round(height * scale);
-  }
-  const ctx = canvas.getContext("2d");
-  ctx.setTransform(scale, 0, 0, scale, 0, 0);
-  ctx.clearRect(0, 0, width, height);
   ctx.lineCap = ctx.lineJoin = "round";
   const moment = Math.min(frames(drawing) - 1, Math.max(0, at));
   if (drawing.kind === "room") room(ctx, width, height, drawing, still ? frames(drawing) - 1 : moment);

@@ -1,6 +1,6 @@
 // The page of `icrl-dist play`: shows what the server tells, sends what the person does.
 
-import { colour, command, listen, number, onTheme, themeButton } from "/assets/common.js";
+import { canvas, colour, command, listen, number, onTheme, themeButton } from "/assets/common.js";
 
 const $ = (id) => document.getElementById(id);
 let room = null;
@@ -12,20 +12,6 @@ async function send(fields) {
 }
 
 // The room.
-
-/** A canvas's context, in CSS pixels, cleared; its width and height there. */
-function canvas(element) {
-  const { width, height } = element.getBoundingClientRect();
-  const ratio = window.devicePixelRatio || 1;
-  if (element.width !== Math.round(width * ratio) || element.height !== Math.round(height * ratio)) {
-    element.width = Math.round(width * ratio);
-    element.height = Math.round(height * ratio);
-  }
-  const pen = element.getContext("2d");
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  pen.clearRect(0, 0, width, height);
-  return { pen, width, height };
-}
 
 const xy = (cell) => [Math.floor(cell / room.size), cell % room.size];
 const named = (cell) => `(${xy(cell).join(", ")})`;
