@@ -27,7 +27,7 @@ from icrl_dist.histories import KEPT, LED, History, file, keep, kept, key, sac_o
 from icrl_dist.types import Identity, Job, Spec, Trajectory
 
 if TYPE_CHECKING:
-    from icrl_dist.algos.sac_batch import SACBatch
+    from icrl_dist.algos.sac_batch import By, SACBatch
 
 _log = logging.getLogger(__name__)
 
@@ -117,6 +117,13 @@ def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     return made
 
 
+def trained_by(experts: int) -> By:
+    """stable-baselines3, the reference, trains an expert that is alone; several train in lockstep, and so does one on a GPU."""
+    from icrl_dist.algos.sac_batch import pick
+
+    return "stable-baselines3" if experts == 1 and pick("auto").type == "cpu" else "lockstep"
+
+
 def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     from icrl_dist.algos.sac_batch import train
 
@@ -139,7 +146,9 @@ def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
 
     rng = Identity(job.stage, job.round, job.task, job.first, 0).rng(job.seed)
     seed, chance = int(rng.integers(2**31)), int(rng.integers(2**31))
-    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seed, progress, state=state)
+    experts = train(
+        recorder, config, recorder.episodes * recorder.spec.horizon, seed, progress, state=state, by=trained_by(env.batch)
+    )
     columns, led = labelled(recorder.columns(), experts), lead(env, experts, chance)
     made = assembled(job, columns, led, experts.arrays["actor"].cpu().numpy(), tell)
     if part is not None:

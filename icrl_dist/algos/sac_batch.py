@@ -18,6 +18,7 @@ from torch import Tensor
 
 from icrl_dist.algos import sb3
 from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
+from icrl_dist.algos.reference import Reference
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.stacked import Shape, outputs
 from icrl_dist.envs import Batch
@@ -25,6 +26,8 @@ from icrl_dist.games import SACConfig
 from icrl_dist.types import Spec, Step
 
 Products = Literal["float32", "bfloat16"]
+By = Literal["lockstep", "stable-baselines3"]
+"""What makes the updates."""
 
 
 def pick(device: str) -> torch.device:
@@ -48,10 +51,12 @@ class SACBatch:
         device: str = "auto",
         products: Products = "float32",
         capacity: int | None = None,
+        by: By = "lockstep",
     ) -> None:
         """``seed`` draws the first parameters, the same on every device; ``products`` are of float32 or
         bfloat16 numbers, parameters and Adam of float32; ``capacity`` of the replay is ``config.replay``
-        if not given.  Raises ValueError for discrete actions or no expert.
+        if not given.  ``by`` stable-baselines3 is one expert's, float32 on the CPU.  Raises ValueError
+        for discrete actions, no expert, or what stable-baselines3 has not.
         """
         if spec.discrete or experts < 1:
             raise ValueError(f"SAC: {experts} experts, discrete = {spec.discrete}: at least 1, and actions in [-1, 1]^A")
@@ -75,7 +80,14 @@ class SACBatch:
         self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        self._lockstep = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
+        self._updater: Lockstep | Reference
+        if by == "lockstep":
+            self._updater = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
+        elif (experts, products, self.device.type) == (1, "float32", "cpu"):
+            self._updater = Reference(self.arrays, (self.actor_shape, self.critic_shape), spec, config)
+        else:
+            what = f"{experts} experts, {products} products, {self.device}"
+            raise ValueError(f"stable-baselines3: {what}: it has one expert, float32, here on the CPU; take lockstep")
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
 
     @torch.no_grad()
@@ -102,7 +114,7 @@ class SACBatch:
 
         ``noise`` is standard normal: the actions' at the observations, then at the following ones.
         """
-        self._lockstep.update(batch, noise)
+        self._updater.update(batch, noise)
         self.updates += 1
 
     def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
@@ -159,7 +171,7 @@ class SACBatch:
         for name, array in self.arrays.items():
             array.copy_(arrays[name])
         self.updates = updates
-        self._lockstep.refresh(updates)
+        self._updater.refresh(updates)
 
 
 def train(
@@ -171,6 +183,7 @@ def train(
     device: str = "auto",
     products: Products = "float32",
     state: Mapping[str, np.ndarray] | None = None,
+    by: By = "lockstep",
 ) -> SACBatch:
     """An expert for each of the N environments of ``env``, after ``steps`` steps in it.
 
@@ -180,7 +193,7 @@ def train(
     state within an episode, FloatingPointError if an expert's weights stop being numbers.
     """
     horizon = env.spec.horizon
-    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps))
+    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps), by)
     if state is not None:
         experts.load(state)
     if experts.steps % horizon:

@@ -45,8 +45,9 @@ def save(path: Path, spec: Spec, config: SACConfig, shapes: Shapes, arrays: Mapp
             for parameter in optimiser.param_groups[0]["params"]:
                 moments = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
                 optimiser.state[parameter] = {"step": torch.tensor(float(updates)), **moments}
-    for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
-        theirs.copy_(ours)
+    with torch.no_grad():
+        for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
+            theirs.copy_(ours)
     model._n_updates = updates
     model.save(path)
 
@@ -67,9 +68,28 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
     arrays["target"] = torch.zeros_like(arrays["critic"])
     state = _optimiser(model, "actor").state
     updates = int(next(iter(state.values()))["step"]) if state else 0
-    for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
-        ours.copy_(theirs)
+    with torch.no_grad():
+        for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
+            ours.copy_(theirs)
     return arrays, updates
+
+
+def share(model: Expert, shapes: Shapes, arrays: Mapping[str, Tensor]) -> None:
+    """From now on ``model`` trains one expert's ``arrays``: its parameters and Adam's moments become views of them."""
+    for name in TRAINED:
+        optimiser = _optimiser(model, name)
+        for parameter in optimiser.param_groups[0]["params"]:
+            moments = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
+            optimiser.state[parameter] = {"step": torch.zeros(()), **moments}
+    for ours, theirs in _pairs(model, shapes, arrays, moments=True):
+        theirs.data = ours
+
+
+def count(model: Expert, updates: int) -> None:
+    """Adam has made so many steps."""
+    for name in TRAINED:
+        for state in _optimiser(model, name).state.values():
+            state["step"].fill_(updates)
 
 
 def _pairs(
@@ -104,7 +124,7 @@ def _linear(layers: Any) -> list[list[nn.Linear]]:
 
 def _of(model: stable_baselines3.SAC, name: str, parameter: Tensor, moment: str | None) -> Tensor:
     """A parameter's numbers, or a moment of it; torch keeps weights as (out, in)."""
-    return parameter.data if moment is None else _optimiser(model, name).state[parameter][moment]
+    return parameter if moment is None else _optimiser(model, name).state[parameter][moment]
 
 
 def _optimiser(model: stable_baselines3.SAC, name: str) -> torch.optim.Optimizer:

@@ -154,6 +154,7 @@ def _continued(spent: np.ndarray, count: int, longest: int) -> float:
 def _training(job: Job, budget_s: float) -> float:
     """Seconds of a job's SAC trainings, by episodes in which the experts learn."""
     from icrl_dist.algos.sac_batch import train
+    from icrl_dist.experts import trained_by
 
     config, env = sac_of(job), envs.batch(job.variations)
     horizon = env.spec.horizon
@@ -166,7 +167,7 @@ def _training(job: Job, budget_s: float) -> float:
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        train(env, short, 20 * horizon, 0, progress)
+        train(env, short, 20 * horizon, 0, progress, by=trained_by(env.batch))
     return float(np.median(np.diff(times))) * config.steps / horizon  # the first episode is over before they learn
 
 
