@@ -53,11 +53,19 @@ class Lockstep:
     """G experts that are updated together; their parameters and moments stay where they are."""
 
     def __init__(
-        self, arrays: Mapping[str, Tensor], actor: Shape, critic: Shape, config: SACConfig, dtype: torch.dtype
+        self,
+        arrays: Mapping[str, Tensor],
+        actor: Shape,
+        critic: Shape,
+        config: SACConfig,
+        dtype: torch.dtype,
+        graph: bool = False,
     ) -> None:
-        """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place."""
+        """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place; with ``graph``
+        a CUDA graph can hold an update.
+        """
         experts, device = len(arrays["actor"]), arrays["actor"].device
-        self._config, self._arrays = config, arrays
+        self._config, self._arrays, self._graph = config, arrays, graph
         both = {name: arrays[name].view(2 * experts, -1) for name in ("critic", "target")}
         self._actor = Perceptrons(actor, arrays["actor"], dtype)
         self._critic = Perceptrons(critic, both["critic"], dtype)
@@ -76,13 +84,19 @@ class Lockstep:
 
     def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> torch.optim.Adam:
         """Fused Adam of parameters (name, numbers, gradient, learning rate), on the moments that the arrays hold."""
-        made = torch.optim.Adam([{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts], fused=True)
+        groups = [{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts]
+        made = torch.optim.Adam(groups, fused=True, capturable=self._graph)
         for name, numbers, gradient, _ in parts:
             numbers.grad = gradient
             self._counts.append(torch.zeros((), device=numbers.device))
             moments = {moment: self._arrays[f"{name}/{moment}"].view_as(numbers) for moment in MOMENTS}
             made.state[numbers] = {"step": self._counts[-1], **moments}
         return made
+
+    def changed(self) -> list[Tensor]:
+        """All that one update hands on to the next."""
+        copies = [copy for part in (self._actor, self._critic, self._target) for copy in part.copies()]
+        return [*self._arrays.values(), *self._counts, *copies]
 
     def refresh(self, updates: int) -> None:
         """Take up parameters and moments that somebody else has changed, after so many updates."""

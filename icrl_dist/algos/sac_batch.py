@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from icrl_dist.algos import sb3
+from icrl_dist.algos.graphed import Graphed
 from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.stacked import Shape, outputs
@@ -48,10 +49,12 @@ class SACBatch:
         device: str = "auto",
         products: Products = "float32",
         capacity: int | None = None,
+        graph: bool = True,
     ) -> None:
         """``seed`` draws the first parameters, the same on every device; ``products`` are of float32 or
         bfloat16 numbers, parameters and Adam of float32; ``capacity`` of the replay is ``config.replay``
-        if not given.  Raises ValueError for discrete actions or no expert.
+        if not given; on a GPU an update is a CUDA graph, unless ``graph`` is false.  Raises
+        ValueError for discrete actions or no expert.
         """
         if spec.discrete or experts < 1:
             raise ValueError(f"SAC: {experts} experts, discrete = {spec.discrete}: at least 1, and actions in [-1, 1]^A")
@@ -75,7 +78,15 @@ class SACBatch:
         self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        self._lockstep = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
+        graph = graph and self.device.type == "cuda"
+        shapes = self.actor_shape, self.critic_shape
+        self._lockstep = Lockstep(self.arrays, *shapes, config, getattr(torch, products), graph)
+        update = self._lockstep.update
+
+        def step(*given: Tensor) -> None:
+            update(Transitions(*given[:-1]), given[-1])
+
+        self._step = Graphed(step, self._lockstep.changed()) if graph else step
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
 
     @torch.no_grad()
@@ -102,13 +113,13 @@ class SACBatch:
 
         ``noise`` is standard normal: the actions' at the observations, then at the following ones.
         """
-        self._lockstep.update(batch, noise)
+        self._step(*batch, noise)
         self.updates += 1
 
     def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
         """One step of every expert's environment, for its replay; a simulation that has broken down teaches nothing."""
         columns = (observations, actions, step.reward, step.observation, *(() if step.diverged is None else (step.diverged,)))
-        self.replay.add(*(torch.from_numpy(np.array(column)).to(self.device) for column in columns))
+        self.replay.add(*(torch.from_numpy(np.array(column)) for column in columns))
         self.steps += 1
 
     def learn(self, generator: torch.Generator) -> None:
