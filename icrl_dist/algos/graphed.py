@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 
 import torch
@@ -50,8 +49,7 @@ def warm(work: Callable[[], None], times: int) -> None:
     """Do the work on a stream of its own: what libraries set up at their first calls must not be recorded."""
     aside = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     aside.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(aside), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "This instance was constructed with capturable=True")  # Adam's, outside a graph
+    with torch.cuda.stream(aside):
         for _ in range(times):
             work()
     torch.cuda.current_stream().wait_stream(aside)

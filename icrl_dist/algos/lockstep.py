@@ -53,19 +53,11 @@ class Lockstep:
     """G experts that are updated together; their parameters and moments stay where they are."""
 
     def __init__(
-        self,
-        arrays: Mapping[str, Tensor],
-        actor: Shape,
-        critic: Shape,
-        config: SACConfig,
-        dtype: torch.dtype,
-        graph: bool = False,
+        self, arrays: Mapping[str, Tensor], actor: Shape, critic: Shape, config: SACConfig, dtype: torch.dtype
     ) -> None:
-        """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place; with ``graph``
-        a CUDA graph can hold an update.
-        """
+        """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place."""
         experts, device = len(arrays["actor"]), arrays["actor"].device
-        self._config, self._arrays, self._graph = config, arrays, graph
+        self._config, self._arrays = config, arrays
         both = {name: arrays[name].view(2 * experts, -1) for name in ("critic", "target")}
         self._actor = Perceptrons(actor, arrays["actor"], dtype)
         self._critic = Perceptrons(critic, both["critic"], dtype)
@@ -85,7 +77,7 @@ class Lockstep:
     def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> torch.optim.Adam:
         """Fused Adam of parameters (name, numbers, gradient, learning rate), on the moments that the arrays hold."""
         groups = [{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts]
-        made = torch.optim.Adam(groups, fused=True, capturable=self._graph)
+        made = torch.optim.Adam(groups, fused=True, capturable=parts[0][1].is_cuda)
         for name, numbers, gradient, _ in parts:
             numbers.grad = gradient
             self._counts.append(torch.zeros((), device=numbers.device))

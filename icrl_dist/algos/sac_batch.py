@@ -78,15 +78,13 @@ class SACBatch:
         self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        graph = graph and self.device.type == "cuda"
-        shapes = self.actor_shape, self.critic_shape
-        self._lockstep = Lockstep(self.arrays, *shapes, config, getattr(torch, products), graph)
+        self._lockstep = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
         update = self._lockstep.update
 
         def step(*given: Tensor) -> None:
             update(Transitions(*given[:-1]), given[-1])
 
-        self._step = Graphed(step, self._lockstep.changed()) if graph else step
+        self._step = Graphed(step, self._lockstep.changed()) if graph and self.device.type == "cuda" else step
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
 
     @torch.no_grad()
