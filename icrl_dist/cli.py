@@ -190,7 +190,10 @@ class Bench:
     """disturbance: instead, the strength at which that share of the return is lost, as in 0.25; solved once
     a problem and kept for ``control.strength`` of later runs, as ``bite:0.25``."""
     steps: int | None = None
-    """Steps of the experts' training (disturbance --bite)."""
+    """Steps of the experts' training (disturbance --bite), or those of it with updates (experts --device cuda)."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """experts: ``cuda`` measures 160 experts on a GPU beside stable-baselines3 on one core, and trains an
+    expert set of the paper for a while to tell how long it takes; ``auto``: on a GPU if there is one."""
     folder: Path = Path("runs")
     """Whose disk to write to (ingest, scale, recovery), where to put the figure (soak, incontext) or an
     input that breaks something (fuzz), where to keep finished trainings (incontext)."""

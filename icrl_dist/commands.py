@@ -223,6 +223,7 @@ def bench(arguments: Bench, console: Console) -> int:
         disturbance,
         env,
         experts,
+        experts_gpu,
         fuzz,
         incontext,
         ingest,
@@ -245,8 +246,14 @@ def bench(arguments: Bench, console: Console) -> int:
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
     if (arguments.name != "disturbance" or arguments.quick) and arguments.bite is not None:
         raise ConfigError(f"--bite {arguments.bite:g}: it belongs to `bench disturbance`, without --quick")
-    if arguments.bite is None and arguments.steps is not None:
-        raise ConfigError(f"--steps {arguments.steps}: it belongs to `bench disturbance --bite`")
+    if arguments.name != "experts" and arguments.device != "cpu":
+        raise ConfigError(f"--device {arguments.device}: it belongs to `bench experts`")
+    if arguments.bite is None and arguments.device == "cpu" and arguments.steps is not None:
+        raise ConfigError(
+            f"--steps {arguments.steps}: it belongs to `bench disturbance --bite` and `bench experts --device cuda`"
+        )
+    if arguments.device != "cpu" and arguments.steps is not None and arguments.steps < 1:
+        raise ConfigError(f"--steps {arguments.steps}: must be above 0")
     timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
         case "env":
@@ -276,8 +283,9 @@ def bench(arguments: Bench, console: Console) -> int:
             text = incontext.describe(result)
         case "experts":
             with console.status("experts"):
-                result = experts.run(arguments.quick)
-            text = experts.describe(result)
+                on_gpu = arguments.device == "cuda" or (arguments.device == "auto" and experts_gpu.present())
+                result = experts_gpu.run(arguments.quick, arguments.steps) if on_gpu else experts.run(arguments.quick)
+            text = (experts_gpu if on_gpu else experts).describe(result)
         case "disturbance":
             say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
             if arguments.bite is None:

@@ -76,13 +76,19 @@ class Lockstep:
 
     def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> torch.optim.Adam:
         """Fused Adam of parameters (name, numbers, gradient, learning rate), on the moments that the arrays hold."""
-        made = torch.optim.Adam([{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts], fused=True)
+        groups = [{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts]
+        made = torch.optim.Adam(groups, fused=True, capturable=parts[0][1].is_cuda)
         for name, numbers, gradient, _ in parts:
             numbers.grad = gradient
             self._counts.append(torch.zeros((), device=numbers.device))
             moments = {moment: self._arrays[f"{name}/{moment}"].view_as(numbers) for moment in MOMENTS}
             made.state[numbers] = {"step": self._counts[-1], **moments}
         return made
+
+    def changed(self) -> list[Tensor]:
+        """All that one update hands on to the next."""
+        copies = [copy for part in (self._actor, self._critic, self._target) for copy in part.copies()]
+        return [*self._arrays.values(), *self._counts, *copies]
 
     def refresh(self, updates: int) -> None:
         """Take up parameters and moments that somebody else has changed, after so many updates."""

@@ -44,16 +44,16 @@ class Replay:
         following: Float[Tensor, "N S"],
         lost: Bool[Tensor, " N"] | None = None,
     ) -> None:
-        """One transition of each expert, in the oldest's place if there is no other.
+        """One transition of each expert, in the oldest's place if there is no other; it goes to the device in one copy.
 
         Nothing may be learned from those that are ``lost``: the expert's transition before stands in
         their place once more (zeros, if it is the first).
         """
-        row = torch.cat([observations, actions, rewards.unsqueeze(1), following], dim=1)
+        row = torch.cat([observations, actions, rewards.unsqueeze(1), following], dim=1).to(self._rows.device)
         capacity = self._rows.shape[1]
-        if lost is not None:
+        if lost is not None and lost.any():
             before = self._rows[:, (self.added - 1) % capacity] if self.added else torch.zeros_like(row)
-            row = torch.where(lost.unsqueeze(1), before, row)
+            row = torch.where(lost.unsqueeze(1).to(row.device), before, row)
         self._rows[:, self.added % capacity] = row
         self.added += 1
 

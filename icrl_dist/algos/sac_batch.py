@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from icrl_dist.algos import sb3
+from icrl_dist.algos.graphed import Graphed
 from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
 from icrl_dist.algos.reference import Reference
 from icrl_dist.algos.replay import Replay, Transitions
@@ -51,12 +52,14 @@ class SACBatch:
         device: str = "auto",
         products: Products = "float32",
         capacity: int | None = None,
+        graph: bool = True,
         by: By = "lockstep",
     ) -> None:
         """``seed`` draws the first parameters, the same on every device; ``products`` are of float32 or
         bfloat16 numbers, parameters and Adam of float32; ``capacity`` of the replay is ``config.replay``
-        if not given.  ``by`` stable-baselines3 is one expert's, float32 on the CPU.  Raises ValueError
-        for discrete actions, no expert, or what stable-baselines3 has not.
+        if not given; on a GPU an update is a CUDA graph, unless ``graph`` is false.  ``by``
+        stable-baselines3 is one expert's, float32 on the CPU.  Raises ValueError for discrete
+        actions, no expert, or what stable-baselines3 has not.
         """
         if spec.discrete or experts < 1:
             raise ValueError(f"SAC: {experts} experts, discrete = {spec.discrete}: at least 1, and actions in [-1, 1]^A")
@@ -80,15 +83,24 @@ class SACBatch:
         self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        self._updater: Lockstep | Reference
-        if by == "lockstep":
-            self._updater = Lockstep(self.arrays, self.actor_shape, self.critic_shape, config, getattr(torch, products))
-        elif (experts, products, self.device.type) == (1, "float32", "cpu"):
-            self._updater = Reference(self.arrays, (self.actor_shape, self.critic_shape), spec, config)
-        else:
-            what = f"{experts} experts, {products} products, {self.device}"
-            raise ValueError(f"stable-baselines3: {what}: it has one expert, float32, here on the CPU; take lockstep")
+        self._updater = updater = self._made_by(by, products)
+
+        def step(*given: Tensor) -> None:
+            updater.update(Transitions(*given[:-1]), given[-1])
+
+        self._step: Callable[..., None] = step
+        if graph and isinstance(updater, Lockstep) and self.device.type == "cuda":
+            self._step = Graphed(step, updater.changed())
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
+
+    def _made_by(self, by: By, products: Products) -> Lockstep | Reference:
+        shapes = self.actor_shape, self.critic_shape
+        if by == "lockstep":
+            return Lockstep(self.arrays, *shapes, self.config, getattr(torch, products))
+        if (self.experts, products, self.device.type) == (1, "float32", "cpu"):
+            return Reference(self.arrays, shapes, self.spec, self.config)
+        what = f"{self.experts} experts, {products} products, {self.device}"
+        raise ValueError(f"stable-baselines3: {what}: it has one expert, float32, here on the CPU; take lockstep")
 
     @torch.no_grad()
     def act(
@@ -114,13 +126,13 @@ class SACBatch:
 
         ``noise`` is standard normal: the actions' at the observations, then at the following ones.
         """
-        self._updater.update(batch, noise)
+        self._step(*batch, noise)
         self.updates += 1
 
     def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
         """One step of every expert's environment, for its replay; a simulation that has broken down teaches nothing."""
         columns = (observations, actions, step.reward, step.observation, *(() if step.diverged is None else (step.diverged,)))
-        self.replay.add(*(torch.from_numpy(np.array(column)).to(self.device) for column in columns))
+        self.replay.add(*(torch.from_numpy(np.array(column)) for column in columns))
         self.steps += 1
 
     def learn(self, generator: torch.Generator) -> None:
@@ -193,7 +205,7 @@ def train(
     state within an episode, FloatingPointError if an expert's weights stop being numbers.
     """
     horizon = env.spec.horizon
-    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps), by)
+    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps), by=by)
     if state is not None:
         experts.load(state)
     if experts.steps % horizon:

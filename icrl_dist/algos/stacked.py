@@ -75,6 +75,10 @@ class Perceptrons:
         self._layers, self._gradients = shape.layers(self._low), shape.layers(self._low_gradient)
         self._last, self._last_gradient = shape.layers(flat)[-1], shape.layers(self.gradient)[-1]
 
+    def copies(self) -> list[Tensor]:
+        """Parameters as ``dtype``, if they are kept beside the others."""
+        return [] if self._low is self.flat else [self._low]
+
     def refresh(self) -> None:
         """Take up parameters that have changed: to be called before ``forward`` after every change."""
         if self._low is not self.flat:

@@ -89,14 +89,14 @@ def _seconds(update: Callable[[int], None], count: int) -> float:
     return time.process_time() - began
 
 
-def lockstep(sizes: Sizes, products: Products) -> Callable[[int], None]:
+def lockstep(sizes: Sizes, products: Products, device: str = "cpu", graph: bool = True) -> Callable[[int], None]:
     """So many updates of our experts."""
     config = sizes.config
-    experts = SACBatch(sizes.experts, SPEC, config, 0, "cpu", products)
+    experts = SACBatch(sizes.experts, SPEC, config, 0, device, products, None, graph)
     remembered = [_remembered(np.random.default_rng((0, index)), config.replay) for index in range(sizes.experts)]
     rows = np.stack([np.concatenate(columns, axis=1) for columns in remembered])
     experts.replay.load({"rows": rows, "added": np.array(config.replay)})
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator(experts.device).manual_seed(0)
 
     def update(count: int) -> None:
         for _ in range(count):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist import cli
-from icrl_dist.bench import experts
+from icrl_dist import cli, config
+from icrl_dist.bench import experts, experts_gpu
 from icrl_dist.bench.experts import Sizes
+from icrl_dist.envs import tasks
 from icrl_dist.games import SACConfig
+from icrl_dist.types import Spec, Step
 
 TINY = Sizes(2, SACConfig(hidden=(8, 8), batch=4, replay=50), 3, 2)
 
@@ -78,3 +80,120 @@ def test_what_the_processor_says_of_itself_is_read(tmp_path):
 def test_it_cannot_be_given_a_time(capsys):
     assert cli.main(["bench", "experts", "--seconds", "3"]) == 2
     assert "it takes as long as it takes" in capsys.readouterr().err
+
+
+class Still:
+    """Two environments of which nothing is asked."""
+
+    spec, batch = Spec((-1.0,) * 3, (1.0,) * 3, 2, 10, discrete=False), 2
+
+    def reset(self, rngs):
+        return np.zeros((2, 3), np.float32)
+
+    def step(self, actions):
+        return Step(np.zeros((2, 3), np.float32), np.ones(2, np.float32), False, np.zeros((2, 1), np.float32))
+
+
+STILL = SACConfig(hidden=(8,), batch=4, random_steps=5, warmup=20, update_every=2, steps=1000)
+
+
+def test_on_a_gpu_all_kinds_and_an_expert_set_are_measured(monkeypatch):
+    """On the CPU in its place: everything but the graph."""
+    monkeypatch.setattr(experts_gpu, "paper_env", lambda: (Still(), STILL))
+    monkeypatch.setattr(experts_gpu, "LEAST", 1e-3)
+    threads = torch.get_num_threads()
+    result = experts_gpu.run(True, 40, "cpu", TINY)
+    assert torch.get_num_threads() == threads
+    assert result["ok"] and json.loads(json.dumps(result)) == result
+    for kind in ("fp32", "bf16"):
+        rate, plain = result[f"updates_per_s_{kind}"], result[f"updates_per_s_{kind}_no_graph"]
+        assert rate > 0 and plain > 0 and result[f"graph_gain_{kind}"] == pytest.approx(rate / plain, abs=0.02)
+        assert result[f"gpu_ratio_{kind}"] == pytest.approx(rate / result["sb3_updates_per_s"], abs=0.1)
+    paper = result["paper_set"]
+    assert (paper["experts"], paper["steps"], paper["updates"]) == (2, 20 + 40 + 10, (40 - 20) // 2 + 20 // 2 + 5)
+    assert paper["bound"] in paper["ms_a_step"] and result["paper_set_hours"] == paper["hours"]
+    assert "1,000 steps take" in experts_gpu.describe(result)
+
+
+def test_hours_are_the_warm_ups_steps_at_their_pace_and_the_rest_at_that_of_updates(monkeypatch):
+    now = [0.0]
+
+    def made(env, config, steps, seed, progress, device):
+        trained = experts.SACBatch(2, env.spec, config, seed, device)
+        for trained.steps in range(10, steps + 1, 10):
+            now[0] += 1.0 if trained.steps <= 20 else 9.0 if trained.steps == 30 else 5.0
+            progress(trained, np.zeros(2))
+        return trained
+
+    monkeypatch.setattr(experts_gpu, "train", made)
+    monkeypatch.setattr(experts_gpu, "_parts", lambda *_: {"environment": 0.3, "update": 0.2})
+    monkeypatch.setattr(experts_gpu.time, "perf_counter", lambda: now[0])
+    found = experts_gpu.expert_set(Still(), STILL, 1, torch.device("cpu"))
+    assert found["steps"] == 50, "three episodes at least"
+    assert found["hours"] == pytest.approx((20 * 0.1 + 980 * 0.5) / 3600, abs=1e-3)
+    assert (found["steps_per_s"], found["warmup_steps_per_s"], found["bound"]) == (2.0, 10.0, "environment")
+
+
+def test_what_cannot_be_measured_is_said_and_loses_nothing_else(monkeypatch):
+    real = experts_gpu.lockstep
+
+    def lockstep(sizes, products, device, graph):
+        if graph:
+            raise RuntimeError("CUDA error: operation not permitted when stream is capturing\nand more")
+        return real(sizes, products, device, graph)
+
+    def missing():
+        raise ModuleNotFoundError("No module named 'dm_control'")
+
+    monkeypatch.setattr(experts_gpu, "lockstep", lockstep)
+    monkeypatch.setattr(experts_gpu, "paper_env", missing)
+    result = experts_gpu.run(True, 40, "cpu", TINY)
+    assert not result["ok"] and result["paper_set"] is None and result["paper_set_hours"] is None
+    assert result["gpu_ratio_fp32"] is None and result["updates_per_s_fp32_no_graph"] > 0
+    assert "fp32: RuntimeError: CUDA error: operation not permitted when stream is capturing" in result["reasons"]
+    assert "no expert set: ModuleNotFoundError: No module named 'dm_control'" in result["reasons"]
+    assert "No module named" in experts_gpu.describe(result)
+
+
+def test_a_gpu_that_gives_too_little_fails_it(monkeypatch):
+    monkeypatch.setattr(experts_gpu, "paper_env", lambda: (Still(), STILL))
+    assert experts_gpu.LEAST == 300
+    monkeypatch.setattr(experts_gpu, "LEAST", 1e9)
+    result = experts_gpu.run(True, 40, "cpu", TINY)
+    assert not result["ok"] and len(result["reasons"]) == 2
+    assert result["reasons"][0] == f"gpu_ratio_fp32 is {result['gpu_ratio_fp32']}, below 1e+09"
+
+
+def test_the_expert_set_is_the_papers():
+    assert experts_gpu.SIZES.experts == 160 and experts_gpu.SIZES.config.hidden == (256, 256, 256)
+    given = config.load(experts_gpu.PAPER)
+    assert len(tasks.split(given).train) * given.adversary.count == 160
+    assert (given.sac.steps, given.sac.update_every, given.sac.warmup, given.sac.hidden) == (200_000, 3, 5_000, (256,) * 3)
+
+
+def test_where_to_measure_is_asked_for(monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(experts, "compare", rates(2.0, 3.0, 5.0))
+    monkeypatch.setattr(experts_gpu, "run", lambda *given: asked.append(given) or {"ok": True})
+    monkeypatch.setattr(experts_gpu, "describe", lambda result: "a table")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert cli.main(["bench", "experts", "--device", "auto", "--steps", "7", "--quick"]) == 0
+    assert cli.main(["bench", "experts", "--device", "cuda"]) == 0
+    assert asked == [(True, 7), (False, None)]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert cli.main(["bench", "experts", "--device", "auto"]) == 0 and cli.main(["bench", "experts"]) == 0
+    assert len(asked) == 2
+    capsys.readouterr()
+    for given, said in (
+        (["experts", "--steps", "3"], "bench experts --device cuda"),
+        (["experts", "--device", "cuda", "--steps", "0"], "must be above 0"),
+        (["env", "--device", "cuda"], "it belongs to `bench experts`"),
+    ):
+        assert cli.main(["bench", *given]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_without_a_gpu_it_says_so(monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert cli.main(["bench", "experts", "--device", "cuda"]) == 2
+    assert "torch finds no GPU here" in " ".join(capsys.readouterr().err.split())

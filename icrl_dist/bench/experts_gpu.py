@@ -1,0 +1,203 @@
+"""Updates of 160 experts in lockstep on a GPU, beside stable-baselines3 on one core; and one expert set of the paper.
+
+The GPU's time is by the clock, with nothing left to do before and after; stable-baselines3's is
+CPU-seconds of one thread.  Both take turns, batches drawn from a full replay and noise included.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+from icrl_dist import envs
+from icrl_dist.algos.sac_batch import Products, SACBatch, pick, train
+from icrl_dist.bench.experts import REMEMBERED, Sizes, alone, lockstep
+from icrl_dist.config import ConfigError, load
+from icrl_dist.envs import Batch, tasks
+from icrl_dist.games import SACConfig
+
+SIZES = Sizes(160, SACConfig(replay=REMEMBERED), 20, 12)
+LEAST = 300.0
+"""Aggregate updates a second over stable-baselines3's on one core, below which the benchmark fails."""
+PAPER = "dmc-cartpole-balance"
+"""The run whose m x K experts are trained."""
+STEPS = 1_500
+"""Steps of that training in which the experts learn."""
+_KINDS: dict[str, tuple[Products, bool]] = {
+    "fp32_no_graph": ("float32", False),
+    "bf16_no_graph": ("bfloat16", False),
+    "fp32": ("float32", True),
+    "bf16": ("bfloat16", True),
+}
+
+
+def present() -> bool:
+    """Whether there is a GPU to measure."""
+    return torch.cuda.is_available()
+
+
+def run(quick: bool = False, steps: int | None = None, device: str = "cuda", sizes: Sizes = SIZES) -> dict[str, Any]:
+    """Ratios, the gain of CUDA graphs, and the hours of an expert set; ``quick`` takes fewer turns and steps.
+
+    ``ok`` is false, and ``reasons`` says why, if a ratio is below ``LEAST`` or something could not be
+    measured; that is None.  Raises ConfigError if there is no GPU.
+    """
+    try:
+        on = pick(device)
+    except ValueError as error:
+        raise ConfigError(f"bench experts: {error}") from None
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        result, reasons = updates(sizes, 3 if quick else 15, on)
+        try:
+            env, config = paper_env()
+            paper = expert_set(env, config, steps or (STEPS // 2 if quick else STEPS), on)
+        except (ImportError, RuntimeError) as error:
+            paper = None
+            reasons.append(f"no expert set: {_line(error)}")
+    finally:
+        torch.set_num_threads(threads)
+    name = torch.cuda.get_device_name(on) if on.type == "cuda" else "cpu"
+    head = {"quick": quick, "device": name, "torch": torch.__version__, "experts": sizes.experts}
+    hours = paper and paper["hours"]
+    return head | result | {"paper_set": paper, "paper_set_hours": hours, "ok": not reasons, "reasons": reasons}
+
+
+def updates(sizes: Sizes, turns: int, device: torch.device) -> tuple[dict[str, Any], list[str]]:
+    """Aggregate updates/s of each kind and stable-baselines3's, medians over ``turns``; and what is wrong with them."""
+    theirs, other, rates, reasons = alone(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
+    theirs(sizes.theirs)  # finds cold caches
+    for kind, (numbers, graph) in _KINDS.items():
+        try:
+            ours, found = lockstep(sizes, numbers, str(device), graph), []
+            _elapsed(ours, sizes.ours, device)  # loads kernels and records the graph
+            for _ in range(turns):
+                began = time.process_time()
+                theirs(sizes.theirs)
+                other.append(sizes.theirs / (time.process_time() - began))
+                found.append(sizes.experts * sizes.ours / _elapsed(ours, sizes.ours, device))
+            rates[kind] = statistics.median(found)
+        except RuntimeError as error:  # out of memory, or a graph that cannot be recorded
+            reasons.append(f"{kind}: {_line(error)}")
+    alone_rate = statistics.median(other) if other else 0.0
+    result: dict[str, Any] = {"sb3_updates_per_s": round(alone_rate, 2), "gpu_least": LEAST}
+    result |= {f"updates_per_s_{kind}": round(rate, 1) if rate else None for kind, rate in rates.items()}
+    for products in ("fp32", "bf16"):
+        rate, plain = rates[products], rates[f"{products}_no_graph"]
+        ratio = result[f"gpu_ratio_{products}"] = round(rate / alone_rate, 1) if rate else None
+        result[f"graph_gain_{products}"] = round(rate / plain, 2) if rate and plain else None
+        if ratio is not None and ratio < LEAST:
+            reasons.append(f"gpu_ratio_{products} is {ratio}, below {LEAST:g}")
+    if device.type == "cuda":
+        result["gpu_gib"] = round(torch.cuda.max_memory_allocated(device) / 2**30, 2)
+    return result, reasons
+
+
+def paper_env() -> tuple[Batch, SACConfig]:
+    """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the numbers of its SAC."""
+    given = load(PAPER)
+    rows = [row for index, task in enumerate(tasks.split(given).train) for row in tasks.variations(given, index, task)]
+    return envs.batch(rows), given.sac
+
+
+def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) -> dict[str, Any]:
+    """A training through its whole warm-up and ``steps`` more, three episodes at least: how long ``config.steps`` take.
+
+    ``hours``: the warm-up's steps at their pace, the others at that of the episodes after the first
+    with updates.  ``ms_a_step``: what each part of a step takes with nothing beside it, updates
+    shared out over the steps between them; ``bound`` is the largest.
+    """
+    began, marks, horizon = time.perf_counter(), [], env.spec.horizon
+
+    def progress(experts: SACBatch, returns: np.ndarray) -> None:
+        _wait(device)
+        marks.append((experts.steps, time.perf_counter()))
+
+    experts = train(env, config, config.warmup + max(steps, 3 * horizon), 0, progress, str(device))
+    warm, warm_end = next(mark for mark in marks if mark[0] >= config.warmup)
+    first, first_end = next(mark for mark in marks if mark[0] >= config.warmup + horizon)
+    last, last_end = marks[-1]
+    warming, learning = (warm_end - began) / warm, (last_end - first_end) / (last - first)
+    parts = _parts(env, experts, config, device)
+    return {
+        "problem": PAPER,
+        "experts": experts.experts,
+        "steps": experts.steps,
+        "updates": experts.updates,
+        "steps_per_s": round(1 / learning, 2),
+        "warmup_steps_per_s": round(1 / warming, 2),
+        "ms_a_step": {part: round(1000 * seconds, 3) for part, seconds in parts.items()},
+        "bound": max(parts, key=lambda part: parts[part]),
+        "hours": round((warming * config.warmup + learning * (config.steps - config.warmup)) / 3600, 3),
+        "hours_of_steps": config.steps,
+    }
+
+
+def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.device) -> dict[str, float]:
+    """Seconds a step of each part of one more episode, the device idle before and after each."""
+    rng, generator = np.random.default_rng(0), torch.Generator(device).manual_seed(0)
+    spent = dict.fromkeys(("environment", "act", "remember", "update"), 0.0)
+
+    @contextlib.contextmanager
+    def timed(part: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        _wait(device)
+        spent[part] += time.perf_counter() - began
+
+    seen = np.asarray(env.reset([np.random.default_rng((0, row)) for row in range(env.batch)]), np.float32)
+    for number in range(env.spec.horizon):
+        with timed("act"):
+            action = experts.act(seen, rng)
+        with timed("environment"):
+            step = env.step(action)
+        with timed("remember"):
+            experts.remember(seen, action, step)
+        if number % config.update_every == 0:
+            with timed("update"):
+                experts.learn(generator)
+        seen = step.observation
+    return {part: seconds / env.spec.horizon for part, seconds in spent.items()}
+
+
+def _elapsed(update: Callable[[int], None], count: int, device: torch.device) -> float:
+    _wait(device)
+    began = time.perf_counter()
+    update(count)
+    _wait(device)
+    return time.perf_counter() - began
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"
+
+
+def describe(result: dict[str, Any]) -> str:
+    """The result as a small table."""
+    named = {"fp32": "float32", "bf16": "products of bfloat16"}
+    said = f"{result['experts']} experts of 3x256, batch 256, {result['device']}"
+    rows = [f"{said:<58}{'updates/s':>11}{'no graph':>11}{'over SB3':>10}"]
+    for kind, what in named.items():
+        figures = (result[name] for name in (f"updates_per_s_{kind}", f"updates_per_s_{kind}_no_graph", f"gpu_ratio_{kind}"))
+        with_graph, without, ratio = ("-" if figure is None else f"{figure:,.1f}" for figure in figures)
+        rows.append(f"{what:<58}{with_graph:>11}{without:>11}{ratio:>10}")
+    rows.append(f"{'stable-baselines3, one expert, one core':<58}{result['sb3_updates_per_s']:>11,.1f}")
+    if paper := result["paper_set"]:
+        parts = ", ".join(f"{part} {ms:g}" for part, ms in paper["ms_a_step"].items())
+        rows.append(
+            f"{paper['experts']} experts of {paper['problem']}: {paper['steps_per_s']:g} steps/s (ms a step alone: {parts})"
+        )
+        rows.append(f"{paper['hours_of_steps']:,} steps take {paper['hours']:g} h; most of it: {paper['bound']}")
+    return "\n".join([*rows, *result["reasons"]])
