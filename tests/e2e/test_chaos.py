@@ -12,7 +12,7 @@ import socket
 import psutil
 import pytest
 
-from icrl_dist import cli
+from icrl_dist import arguments, cli
 from icrl_dist.chaos import campaign, disk, proxy, schedule
 from icrl_dist.chaos.faults import FAULTS, Struck
 from icrl_dist.chaos.outcome import Outcome, verdict
@@ -166,7 +166,7 @@ def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device", "runs/smoke/report/adaptation.png")
 
-    monkeypatch.setitem(cli.COMMANDS, "doctor", (cli.Doctor, full))
+    monkeypatch.setitem(cli.COMMANDS, "doctor", (arguments.Doctor, full))
     assert cli.main(["doctor"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "adaptation.png: could not be written" in line and "free space, then use --resume" in line
