@@ -136,11 +136,12 @@ def objections(here: dict[str, Any], there: dict[str, Any]) -> str:
     wrong = nodes.differences(here, there)
     if wrong:
         return f"{', '.join(wrong)}: run `ray up` again, so that all machines have the same"
-    if there["certificates"]:
-        return str(there["certificates"])
+    unfit = [str(there["certificates"])] if there["certificates"] else []
     if there["unreached"]:
-        return f"cannot reach the learner's port, {there['unreached'][0]}: open it in the firewall, or see stream.connect"
-    return ""
+        unfit.append(
+            f"cannot reach the learner's port, {there['unreached'][0]}: open it in the firewall, or see stream.connect"
+        )
+    return "; ".join(unfit)
 
 
 def brief(error: BaseException) -> str:

@@ -40,7 +40,7 @@ class Train:
     oversubscribe: bool = False
     """Allow more workers than cores: slower, and the same results."""
     out: Path | None = None
-    """Run folder; runs/RUN if not given."""
+    """Run folder, ``~`` included where no shell has resolved it; runs/RUN if not given."""
     resume: bool = False
     """Go on with the run in the folder from its last checkpoint."""
     overwrite: bool = False

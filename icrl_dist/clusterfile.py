@@ -199,6 +199,13 @@ def _commands(config: dict[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "Ray's token", False, "no command sets RAY_AUTH_MODE=token", "export it in ~/.bashrc, as in deploy/clusters/"
         )
+    if "--include-dashboard=true" in starts["head"] and "RAY_JOB_STOP_WAIT_TIME_S" not in json.dumps(config):
+        yield Finding(
+            "ray job stop",
+            None,
+            "kills a run after 3 s, whether its checkpoint is written or not",
+            "export RAY_JOB_STOP_WAIT_TIME_S=60 before the head's ray start",
+        )
     if "niceness" not in starts["worker"] and not config.get("docker"):
         yield Finding(
             "niceness", None, "Ray's workers run at nice 15", "export RAY_worker_niceness=0 before the worker's ray start"

@@ -39,7 +39,10 @@ def train(arguments: Train, console: Console) -> int:
     name = Path(arguments.run).stem or f"{source[0].name}-from-{source[1]}" if source else Path(arguments.run).stem
     run = override(arguments.config, arguments.set, "--set")
     validate(run, arguments.run or str(arguments.source))
-    folder = (arguments.out or Path("runs") / name).absolute()
+    try:
+        folder = (arguments.out or Path("runs") / name).expanduser().absolute()
+    except RuntimeError as error:
+        raise ConfigError(f"--out {arguments.out}: {error}") from None
     for option, value in (("--actors", arguments.actors), ("--min-actors", arguments.min_actors)):
         if value is not None and value < 1:
             raise ConfigError(f"{option} {value}: at least 1 worker is needed")

@@ -188,7 +188,7 @@ def train_ray(
                 learner.interrupt(report)
                 raise TrainInterrupted
             if result is not None:
-                return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
+                break
             learner.watch(report)
             if started:
                 try:
@@ -197,6 +197,9 @@ def train_ray(
                     raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
                 if not working:
                     raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
+    if interrupted.is_set():  # while everything was closed
+        raise TrainInterrupted
+    return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
 
 
 def _unmake(folder: Path) -> None:

@@ -209,6 +209,10 @@ def test_a_cluster_that_stays_too_small_is_named(join, local_name, monkeypatch):
         ({"python": "3.9.1"}, r"Python 3.9.1 there"),
         ({"certificates": "/c/worker.key: cannot be read"}, r"n1 \(10.0.0.1\): /c/worker.key"),
         ({"unreached": ["10.0.0.9:7447: timed out"]}, r"cannot reach the learner's port, 10.0.0.9:7447: timed out"),
+        (
+            {"certificates": "no key", "unreached": ["10.0.0.9:7447: refused"]},
+            r"no key; cannot reach .* 10.0.0.9:7447: refused",
+        ),
         (ModuleNotFoundError("No module named 'icrl_dist'"), r"10.0.0.1: No module named 'icrl_dist'; run `ray up` again"),
     ],
 )

@@ -130,6 +130,12 @@ def test_a_slip_is_refused_by_name(asked, name, path, value, message):
         ("aws", ("available_node_types", "head", "node_config", "InstanceMarketOptions"), {"MarketType": "spot"}, "is a spot"),
         ("aws", ("provider", "availability_zone"), "us-west-2a, us-west-2b", "name one"),
         ("onprem", ("worker_start_ray_commands",), ["ray start --address=$RAY_HEAD_IP:6379"], "ulimit"),
+        (
+            "onprem",
+            ("head_start_ray_commands",),
+            ["ulimit -n 9999; ray start --head --num-cpus=0 --include-dashboard=true"],
+            "kills a run after 3 s",
+        ),
     ],
 )
 def test_what_starts_but_goes_short_is_a_warning(asked, name, path, value, message):

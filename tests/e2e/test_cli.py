@@ -94,6 +94,15 @@ def test_an_impossible_setting(capsys, tmp_path, setting, expected):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_run_folder_may_be_in_a_home(capsys, tmp_path, monkeypatch):
+    """`ray job submit` quotes every word, so no shell resolves it."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "notes").touch()
+    assert f"{tmp_path}/runs/mine exists" in refused(capsys, "train", "smoke", "--engine", "inline", "--out", "~/runs/mine")
+    assert "--out ~nobody-here/mine" in refused(capsys, "train", "smoke", "--engine", "inline", "--out", "~nobody-here/mine")
+
+
 def test_what_to_train_must_be_said_and_what_to_go_on_from_must_be_there(capsys, tmp_path):
     assert "name a RUN" in refused(capsys, "train", "--out", tmp_path / "out")
     assert "holds no run" in refused(capsys, "train", "--from", f"{tmp_path}@0", "--out", tmp_path / "out")

@@ -1,7 +1,6 @@
 """The on-premises file that is shipped, as it is and as the tests' hosts need it."""
 
 import copy
-import importlib.util
 import sys
 
 import yaml
@@ -10,8 +9,6 @@ from ray.autoscaler._private.util import prepare_config, validate_config
 from tests.e2e import hosts
 
 FILE = hosts.ROOT / "deploy" / "clusters" / "onprem.yaml"
-JOBS = all(importlib.util.find_spec(name) for name in ("aiohttp", "aiohttp_cors", "opencensus"))
-"""Whether what `ray job submit` needs on the head is installed (the extra ``cluster``)."""
 
 
 def shipped():
@@ -33,8 +30,4 @@ def filled_in(head, workers):
     _make, _install, path = config["setup_commands"]
     config["setup_commands"] = [f"ln -sfn {sys.prefix} ~/icrl-dist/.venv", path.replace("$PATH", f"$PATH {hosts.CODE}")]
     config["worker_start_ray_commands"][-1] += " --num-cpus=1"
-    if not JOBS:
-        words = config["head_start_ray_commands"]
-        assert "--include-dashboard=true" in words[-1]
-        words[-1] = words[-1].replace("--include-dashboard=true", "--include-dashboard=false")
     return yaml.safe_dump(config)
