@@ -13,6 +13,7 @@ from torch import Tensor
 from icrl_dist.algos.replay import Transitions
 from icrl_dist.algos.stacked import Buffers, Perceptrons, Shape
 from icrl_dist.games import SACConfig
+from icrl_dist.optimisers import Adam
 
 TRAINED = ("actor", "critic", "log_temperature")
 """What Adam trains."""
@@ -74,10 +75,10 @@ class Lockstep:
         )
         self._critic_adam = self._adam(("critic", self._critic.flat, self._critic.gradient, config.critic_rate))
 
-    def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> torch.optim.Adam:
+    def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> Adam:
         """Fused Adam of parameters (name, numbers, gradient, learning rate), on the moments that the arrays hold."""
         groups = [{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts]
-        made = torch.optim.Adam(groups, fused=True, capturable=parts[0][1].is_cuda)
+        made = Adam(groups, fused=True, capturable=parts[0][1].is_cuda)
         for name, numbers, gradient, _ in parts:
             numbers.grad = gradient
             self._counts.append(torch.zeros((), device=numbers.device))
