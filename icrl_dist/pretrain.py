@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from icrl_dist import optimisers
 from icrl_dist.config import OptimConfig
 from icrl_dist.context import Batch
 from icrl_dist.models.dpt import PretrainedTransformer, Stretches, Transitions
@@ -41,10 +42,10 @@ class Optimiser:
         matrices = [p for name, p in named if config.muon and name.startswith("trunk.") and p.ndim == 2]
         others = [p for _, p in named if all(p is not matrix for matrix in matrices)]
         betas = (0.9, config.beta2)
-        adamw = torch.optim.AdamW(others, lr=config.learning_rate, weight_decay=config.weight_decay, betas=betas)
+        adamw = optimisers.AdamW(others, lr=config.learning_rate, weight_decay=config.weight_decay, betas=betas)
         self._parts: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
         if matrices:
-            self._parts.append((torch.optim.Muon(matrices, weight_decay=0.0), config.muon))
+            self._parts.append((optimisers.Muon(matrices, weight_decay=0.0), config.muon))
 
     def step(self, learning_rate: float) -> None:
         """Change the weights by their gradients, and forget those."""

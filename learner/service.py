@@ -67,7 +67,7 @@ class Service:
         self._spec = tasks.spec(run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
         torch.manual_seed(run.seed)
-        torch.use_deterministic_algorithms(True)
+        torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
         self._opt = pretrain.Optimiser(self.model, run.optim)
         self.version = files.newest_version(folder)

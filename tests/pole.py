@@ -33,7 +33,7 @@ def main():
                 total += float(reward[0])
         print(total / 10, flush=True)
         if total / 10 >= 190:
-            sys.exit()
+            sys.exit("torch's compiler was imported" if "torch._dynamo" in sys.modules else 0)
 
     train(envs.batch(pole), config, 12_000, 2, look, "cpu")
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from icrl_dist.algos.replay import Transitions
 from icrl_dist.algos.stacked import Buffers, Perceptrons, Shape
 from icrl_dist.games import SACConfig
+from icrl_dist.optimisers import Adam
 
 TRAINED = ("actor", "critic", "log_temperature")
 """What Adam trains."""
@@ -74,9 +75,9 @@ class Lockstep:
         )
         self._critic_adam = self._adam(("critic", self._critic.flat, self._critic.gradient, config.critic_rate))
 
-    def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> torch.optim.Adam:
+    def _adam(self, *parts: tuple[str, Tensor, Tensor, float]) -> Adam:
         """Fused Adam of parameters (name, numbers, gradient, learning rate), on the moments that the arrays hold."""
-        made = torch.optim.Adam([{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts], fused=True)
+        made = Adam([{"params": [numbers], "lr": rate} for _, numbers, _, rate in parts], fused=True)
         for name, numbers, gradient, _ in parts:
             numbers.grad = gradient
             self._counts.append(torch.zeros((), device=numbers.device))

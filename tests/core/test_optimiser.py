@@ -2,12 +2,13 @@
 
 import copy
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-from icrl_dist import context, pretrain
+from icrl_dist import context, optimisers, pretrain
 from icrl_dist.config import ConfigError, OptimConfig
 from icrl_dist.context import Pool
 from icrl_dist.envs import tasks
@@ -57,6 +58,17 @@ def test_matrices_of_the_trunk_go_by_muon_and_the_rest_by_adamw(model, batch, mu
             part.zero_grad()
     for (name, mine), theirs in zip(model.named_parameters(), other.parameters(), strict=True):
         assert torch.equal(mine, theirs), name
+
+
+def test_learning_imports_no_compiler(model, batch, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # whoever imports it now fails
+    opt = Optimiser(model, dataclasses.replace(CONFIG, muon=5.0))
+    pretrain.batch_loss(model, batch(0)).backward()
+    opt.step(1e-3)
+    opt.load(opt.state())
+    optimisers.Adam([torch.zeros(1, requires_grad=True)], fused=True).step()
+    with pytest.raises(ImportError):
+        torch.optim.AdamW(model.parameters()).step()
 
 
 @pytest.mark.parametrize("muon", [0.0, 5.0])

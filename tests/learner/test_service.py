@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -34,7 +35,10 @@ def no_tensorboard():
 def parent(module_run, no_tensorboard, tmp_path_factory):
     """An undisturbed run that nobody changes: its folder, its result and its numbers."""
     folder = tmp_path_factory.mktemp("runs") / "undisturbed"
-    return folder, run_inline(module_run, folder), module_run
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("torch._dynamo", "torch._inductor"):  # a learner that imports torch's compiler starts late
+            patch.setitem(sys.modules, name, None)
+        return folder, run_inline(module_run, folder), module_run
 
 
 @pytest.fixture(scope="module")

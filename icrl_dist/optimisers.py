@@ -1,0 +1,38 @@
+"""torch's optimisers, without torch's compiler.
+
+Methods that the compiler shall leave alone import it to say so, when they are first called:
+as many seconds as the import of torch itself, and 70 MB, in every process that learns.
+"""
+
+from __future__ import annotations
+
+import inspect
+from typing import TypeVar
+
+import torch
+from torch.optim import Optimizer
+
+_Kind = TypeVar("_Kind", bound=Optimizer)
+
+
+def _uncompiled(kind: type[_Kind]) -> type[_Kind]:
+    """The optimiser with those methods that torch wrapped."""
+    for name in ("add_param_group", "state_dict", "load_state_dict", "zero_grad"):
+        setattr(kind, name, inspect.unwrap(getattr(kind, name)))
+    setattr(kind, "step", torch.no_grad()(inspect.unwrap(kind.step)))  # noqa: B010
+    return kind
+
+
+@_uncompiled
+class AdamW(torch.optim.AdamW):
+    """Adam with decoupled weight decay."""
+
+
+@_uncompiled
+class Adam(torch.optim.Adam):
+    """Adam."""
+
+
+@_uncompiled
+class Muon(torch.optim.Muon):
+    """Muon, for matrices."""
