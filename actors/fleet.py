@@ -193,7 +193,7 @@ class Fleet:
             for line in self._cluster.refresh(note):
                 note(f"{line}; no worker is placed there")
             self._forget_those_that_went_with_their_machine()
-        elif progress and self._spare is None:
+        elif progress and self._restarts and self._spare is None:
             self._spare = self._host(0)  # a cluster has no place that costs nothing
         ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0) if self._running else ([], [])
         for done in ready:

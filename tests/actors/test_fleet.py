@@ -26,7 +26,7 @@ class AccountingRay:
         self.placed, self.ended, self.killed = [], {}, []
         self.answers = {}
 
-    def init(self, address, **options):
+    def init(self, address=None, **options):
         if address == "192.0.2.99:6379":
             raise ConnectionError("nobody there")
 
@@ -37,7 +37,7 @@ class AccountingRay:
         ]
 
     def remote(self, num_cpus, scheduling_strategy, **options):
-        node, soft = scheduling_strategy
+        node, soft = ("", False) if scheduling_strategy == "SPREAD" else scheduling_strategy
         assert soft is False
 
         def made(what):
@@ -81,11 +81,11 @@ def join(monkeypatch):
     for name, value in (("NOTE_S", -1.0), ("SHORT_S", 1e9), ("JOIN_S", 1e9)):
         monkeypatch.setattr(fleet, name, value)
 
-    def joined(ray, actors, address="auto", **options):
+    def joined(ray, actors, address="auto", restarts=1, **options):
         nonlocal promised
         promised = missing.Expected(*options.pop("promised", ((), 0)))
         monkeypatch.setitem(sys.modules, "ray", ray)
-        return fleet.Fleet(actors, restarts=1, address=address, **options)
+        return fleet.Fleet(actors, restarts, address, **options)
 
     return joined
 
@@ -131,6 +131,16 @@ def test_workers_are_launched_when_there_is_a_core_for_each_and_spread(join, loc
     assert [made.watch(notes.append, 0) for _ in range(3)] == [2, 2, 2]
     assert sorted(names(ray)) == ["n1", "n2"] and {cpus for _, cpus in ray.placed} == {1}
     assert notes[-1] == "workers: n1 (10.0.0.1): w0; n2 (10.0.0.2): w1"
+
+
+@pytest.mark.parametrize("restarts", [0, 1])
+def test_on_one_machine_a_spare_is_kept_from_the_first_progress_on_if_it_could_be_needed(join, restarts):
+    ray = AccountingRay()
+    made = join(ray, 1, address=None, restarts=restarts, oversubscribe=True)
+    made.start(OURS, "run")
+    for progress in (0, 1, 2):
+        made.watch(print, progress)
+    assert ray.placed == [("", 1)] + [("", 0)] * restarts
 
 
 def test_without_a_number_a_fleet_is_as_large_as_the_cluster_and_grows_with_it(join, local_name):
