@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import torch
 
 import tests.typecheck
 
+gc.disable()  # until everything is imported
 pytest.register_assert_rewrite("tests.contracts")
 
 imported = [name for name in sys.modules if name.split(".")[0] == "icrl_dist"]
@@ -50,6 +52,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return FIRST.index(folder) if folder in FIRST else len(FIRST)
 
     items.sort(key=turn)
+
+
+def pytest_collection_finish() -> None:
+    """What is imported stays: nobody looks through it for garbage again."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
