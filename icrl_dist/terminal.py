@@ -128,9 +128,13 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
             result.agent,
             *cells,
             f"{result.last(last):.1f}",
-            *([f"{result.last(last) / ceilings[result.p]:.0%}"] if best else []),
+            *([_share(result.last(last), ceilings[result.p])] if best else []),
         )
     return table
+
+
+def _share(value: float, ceiling: float) -> str:
+    return f"{value / ceiling:.0%}" if ceiling else "-"
 
 
 def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:

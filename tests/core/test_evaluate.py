@@ -18,6 +18,7 @@ from icrl_dist.files import Checkpoint, StoreError, save_checkpoint, version_fil
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.oracle import Hypotheses, optimal_returns, soft_labels
 from icrl_dist.stats import mean_and_error
+from icrl_dist.terminal import returns_table
 from icrl_dist.types import Variation
 from learner import checkpoints
 
@@ -210,3 +211,10 @@ def test_what_cannot_be_measured_is_told_in_one_line(folder, capsys, arguments, 
     assert cli.main(words) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert expected in line
+
+
+@pytest.mark.parametrize(("best", "share"), [([4.0, 8.0], "50%"), ([0.0, 0.0], "-")])
+def test_returns_stand_beside_the_best_that_an_expert_does_be_it_nothing(best, share):
+    rows = {"T^1": [2.0, 4.0], evaluate.EXPERT: best}
+    table = returns_table([evaluate.Result(name, 0.0, np.array([[row]]), None) for name, row in rows.items()], "")
+    assert table.columns[-1].header == "of SAC expert" and next(iter(table.columns[-1].cells)) == share
