@@ -13,7 +13,7 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests.e2e.training import endpoint_of, equal, finish, result_of, start, wait_for
 
-SAC = {"hidden": "[16]", "batch": 16, "random-steps": 100, "warmup": 100, "steps": 800}
+SAC = {"hidden": "[16]", "batch": 16, "random-steps": 100, "warmup": 100, "steps": 500}
 TINY = [
     *(word for name, value in SAC.items() for word in ("--set", f"sac.{name.replace('-', '_')}={value}")),
     *("--control.horizon", "50", "--control.test-tasks", "2", "--stream.job-tasks", "2"),
@@ -80,7 +80,7 @@ def test_experts_alone_are_kept_for_every_later_run(tmp_path):
         results.append(result_of(tmp_path / f"{number}"))
         saved.append([line for line in output.splitlines() if "experts from the cache" in line])
     assert saved[0] == [] and len(saved[1]) == 2
-    assert all("4 experts from the cache, 3,200 steps of SAC saved" in line for line in saved[1])
+    assert all("4 experts from the cache, 2,000 steps of SAC saved" in line for line in saved[1])
     rows = results[0]["experts"]
     assert [row["adversary"] for row in rows] == ["null", "network"] * 4 and all(len(row["returns"]) == 2 for row in rows)
     assert results[1]["experts"] == rows and equal(*results) and results[0]["trajectories"] == 32
