@@ -10,7 +10,7 @@ import pytest
 
 from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
-from tests.e2e.training import SMOKE, endpoint_of, equal, finish, kill_the_tree, result_of, start
+from tests.e2e.training import ONE_LIFE, SMOKE, endpoint_of, equal, finish, kill_the_tree, result_of, start
 
 
 def act_when(folder, reached, act):
@@ -52,12 +52,13 @@ def fitting(kind, fields):
 @pytest.mark.timeout(300)
 def test_kill_9_of_the_whole_tree_at_three_points_then_of_the_command_alone_changes_nothing(reference, tmp_path):
     folder = tmp_path / "killed"
-    moments = [collecting("pretrain/0/", 60), fitting, collecting("adapt/1/", 50)]
+    run = ["train", *SMOKE, *ONE_LIFE, "--out", folder]
+    moments = [collecting("pretrain/0/", 40), fitting, collecting("adapt/1/", 30)]
     for number, reached in enumerate(moments):
-        process = start("train", *SMOKE, "--out", folder, *["--resume"] * bool(number), start_new_session=True)
+        process = start(*run, "--actors", "1", *["--resume"] * bool(number), start_new_session=True)
         kill_when(process, folder, reached)
         assert not (folder / "result.json").exists()
-    process = start("train", *SMOKE, "--out", folder, "--resume", start_new_session=True)
+    process = start(*run, "--resume", start_new_session=True)
     ours = []
 
     def kill_the_command():
@@ -69,7 +70,7 @@ def test_kill_9_of_the_whole_tree_at_three_points_then_of_the_command_alone_chan
 
     act_when(folder, collecting("adapt/1/", 1), kill_the_command)
     assert len(ours) >= 3
-    again = start("train", *SMOKE, "--out", folder, "--resume")  # at once: the old learner may still be there
+    again = start(*run, "--resume")  # at once: the old learner may still be there
     output = finish(again)
     assert again.returncode == 0, output
     assert equal(result_of(folder), reference)
@@ -79,7 +80,7 @@ def test_kill_9_of_the_whole_tree_at_three_points_then_of_the_command_alone_chan
 
 def test_four_workers_end_with_the_bytes_of_none(reference, tmp_path):
     folder = tmp_path / "workers-4"
-    process = start("train", *SMOKE, "--out", folder, "--actors", 4, "--oversubscribe")
+    process = start("train", *SMOKE, *ONE_LIFE, "--out", folder, "--actors", 4, "--oversubscribe")
     output = finish(process)
     assert process.returncode == 0, output
     assert equal(result_of(folder), reference)

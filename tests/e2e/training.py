@@ -13,8 +13,12 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
-# The whole training of smoke, hardly an evaluation.
-SMOKE = ["smoke", "--evaluate.episodes", "1", "--evaluate.seeds", "1", "--evaluate.p", "0"]
+# Both of smoke's rounds, with fewer trajectories in each.
+SMALLER = ["smoke", "--pretrain.contexts", "140", "--icaa.trials", "20", "--icaa.context-trials", "6"]
+# The same with hardly an evaluation.
+SMOKE = [*SMALLER, "--evaluate.episodes", "1", "--evaluate.seeds", "1", "--evaluate.p", "0"]
+# For runs in which no process dies and is replaced: no worker is kept ready for it.
+ONE_LIFE = ["--learner.restarts", "0"]
 
 
 def start(*arguments, **options):
