@@ -18,6 +18,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -34,8 +35,10 @@ BOUND = 0.98
 """Being watched may cost a trajectory's CPU time this share."""
 STREAMS, PER_S = 1000, 20.0
 PAGE_CORES, TERMINAL_CORES = 0.5, 1.0
-_ROUND = ("--pretrain.contexts", "390", "--pretrain.steps", "20", "--icaa.trials", "400", "--icaa.context-trials", "5")
-_CONTEXTS = ("--method", "dpt", "--pretrain.contexts", "3900000")
+_FULL = ("--context.max", "200")
+"""Contexts are full after six episodes: from then on each costs the same."""
+_ROUND = (*_FULL, "--pretrain.contexts", "390", "--pretrain.steps", "20", "--icaa.trials", "1500", "--icaa.context-trials", "5")
+_CONTEXTS = ("--method", "dpt", "--pretrain.contexts", "780000")
 _VIEWER = (sys.executable, "-m", "icrl_dist.bench.viewer")
 
 How = Literal["live", "stopped"]
@@ -45,8 +48,8 @@ def run(folder: Path = Path("runs"), pairs: int = 8, seconds: float = 5.0) -> di
     """Watch an ICAA round and the making of random contexts, then the crowd.
 
     ``ratio_live`` and ``ratio_stopped``: CPU seconds a trajectory without a viewer over those with
-    one that looks on, or that was stopped by SIGSTOP; the median of ``pairs`` pairs of windows of
-    ``seconds``, in an ICAA round; ``contexts_...``: the same where a trajectory costs least.
+    one that looks on, or that was stopped by SIGSTOP; over ``pairs`` pairs of windows of ``seconds``, in
+    an ICAA round; ``contexts_...``: the same where a trajectory costs least.
     ``page_cores``, ``terminal_cores``: CPU seconds a second of the two views, ``STREAMS`` variations
     ending ``PER_S`` episodes a second each.  ``ok``: within the bounds.
     """
@@ -86,26 +89,29 @@ def _watched(out: Path, settings: Sequence[str], pairs: int, seconds: float, nam
         with ZenohLink.connect(endpoint, 60.0) as link, _Viewer(endpoint) as viewer:
             meter = _Meter(process, link, out.name, "pretrain" if name else "adapt")
             meter.wait()
-            ratios: dict[How, list[float]] = {"live": [], "stopped": []}
-            costs: list[float] = []
+            spent: dict[tuple[How, bool], list[tuple[float, int]]] = defaultdict(list)
             for pair in range(pairs):
                 how: How
                 for how in ("live", "stopped"):
                     alone_first = pair % 2 == 0
-                    costs_of = {}
                     for watched in (not alone_first, alone_first):
-                        if watched:
-                            with viewer.watching(stopped=how == "stopped"):
-                                costs_of[True] = meter.cost(seconds)
-                        else:
-                            costs_of[False] = meter.cost(seconds)
-                    ratios[how].append(costs_of[False] / costs_of[True])
-                    costs.append(costs_of[False])
+                        with viewer.watching(how == "stopped") if watched else contextlib.nullcontext():
+                            spent[how, watched].append(meter.spent(seconds))
             if viewer.heard == 0:
                 raise RuntimeError("the viewer heard nothing: nothing was compared")
-    told = {f"{name}ratio_{how}": round(statistics.median(values), 4) for how, values in ratios.items()}
-    spread = {f"{name}spread_{how}": [round(min(values), 3), round(max(values), 3)] for how, values in ratios.items()}
-    return {**told, **spread, f"{name}ms": round(1000 * statistics.median(costs), 3)}
+    told: dict[str, Any] = {}
+    for how in ("live", "stopped"):
+        alone, beside = ([cpu / max(1, made) for cpu, made in spent[how, watched]] for watched in (False, True))
+        told[f"{name}ratio_{how}"] = round(_cost(spent[how, False]) / _cost(spent[how, True]), 4)
+        pairwise = [one / max(1e-9, other) for one, other in zip(alone, beside, strict=True)]
+        told[f"{name}spread_{how}"] = [round(min(pairwise), 3), round(max(pairwise), 3)]
+    return told | {f"{name}ms": round(1000 * _cost([*spent["live", False], *spent["stopped", False]]), 3)}
+
+
+def _cost(windows: Iterable[tuple[float, int]]) -> float:
+    """CPU seconds a trajectory over all of these windows: jobs end many episodes at once, so one window is coarse."""
+    cpu, made = map(sum, zip(*windows, strict=True))
+    return cpu / max(1, made)
 
 
 class _Meter:
@@ -141,13 +147,13 @@ class _Meter:
                 need_alive(self._process)
             return self._now
 
-    def cost(self, seconds: float) -> float:
-        """CPU seconds a trajectory over the next so many seconds."""
+    def spent(self, seconds: float) -> tuple[float, int]:
+        """CPU seconds and trajectories over the next so many seconds."""
         self.wait()  # what has just changed settles
         cpu, stored = self.wait()
         time.sleep(seconds)
         later, more = self.wait()
-        return (later - cpu) / max(1, more - stored)
+        return later - cpu, more - stored
 
 
 class _Viewer:
