@@ -35,8 +35,9 @@ BOUND = 0.98
 """Being watched may cost a trajectory's CPU time this share."""
 STREAMS, PER_S = 1000, 20.0
 PAGE_CORES, TERMINAL_CORES = 0.5, 1.0
-_FULL = ("--context.max", "200")
-"""Contexts are full after six episodes: from then on each costs the same."""
+_FULL = ("--context.max", "200", "--stream.job-tasks", "2")
+"""Contexts are full after six episodes: from then on each costs the same.  A job ends 16 episodes at a time, not
+80: so a window of some seconds holds hundreds of such times, and counts trajectories to a hundredth."""
 _ROUND = (*_FULL, "--pretrain.contexts", "390", "--pretrain.steps", "20", "--icaa.trials", "1500", "--icaa.context-trials", "5")
 _CONTEXTS = ("--method", "dpt", "--pretrain.contexts", "780000")
 _VIEWER = (sys.executable, "-m", "icrl_dist.bench.viewer")

@@ -26,7 +26,7 @@ QUIET = (
     "--no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
     "--disable-component-update --disable-sync"
 )
-SHORT_S = 20
+SHORT_S = 40
 MARKUP = '<img src=x onerror="window.__pwned=1;alert(1)">'
 CLEAR = "document.querySelector('#connection').textContent === 'live'"
 
@@ -233,7 +233,7 @@ def test_a_recording_is_steered_by_keyboard(page):
         page.keyboard.press("Enter")
         page.get_by_label("Speed").select_option("50")
         page.get_by_label("Moment in the recording").press("End")
-        wait_for(lambda: len(run.controlled) == 3, "three commands", 10)
+        wait_for(lambda: len(run.controlled) == 3, "three commands", page.patience)
         assert run.controlled == [{"paused": True}, {"speed": 50}, {"at": 1100}]
         run.recording = {**run.recording, "paused": True}
         page.get_by_role("button", name="Play", exact=True).wait_for()
