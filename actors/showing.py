@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane
 from icrl_dist.stream.link import Keys, Link
 from icrl_dist.types import Identity, Trajectory
 
@@ -37,7 +37,7 @@ class Showing:
                 self._send(now)
             whole = self._samples.take(trajectory.identity, now)
         if whole:
-            self._link.publish(self._whole, wire.monitor_episode(trajectory, time.time()), droppable=True)
+            self._link.publish(self._whole, plane.episode(trajectory, time.time()), droppable=True)
 
     def flush(self) -> None:
         """Tell of those that wait.  Raises LinkError if the link is closed."""
@@ -47,7 +47,7 @@ class Showing:
 
     def _send(self, now: float) -> None:
         waiting, self._waiting, self._sent = self._waiting, [], now
-        self._link.publish(self._lines, wire.monitor_trajectories(waiting, time.time()), droppable=True)
+        self._link.publish(self._lines, plane.trajectories(waiting, time.time()), droppable=True)
 
 
 class Samples:

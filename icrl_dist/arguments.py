@@ -103,10 +103,9 @@ class Tap:
     every: int = 1
     """Of those that pass, only every so manyth."""
     format: Literal["json", "msgpack"] = "json"
-    """``json``: a line each; ``msgpack``: the messages as they came, one after another, as a
-    msgpack stream."""
+    """``json``: a line each; ``msgpack``: the same maps one after another, as a msgpack stream."""
     count: int = 0
-    """End after so many messages; 0 goes on until Ctrl-C."""
+    """End after so many trajectories; 0 goes on until Ctrl-C."""
     timeout: float = 30.0
     """Seconds to wait for the learner."""
 

@@ -40,11 +40,7 @@ def save(path: Path, spec: Spec, config: SACConfig, shapes: Shapes, arrays: Mapp
     """Write one expert's ``arrays`` (names as in ``SACBatch.arrays``), with Adam's state after ``updates``."""
     model = blank(spec, config)
     if updates:
-        for name in TRAINED:
-            optimiser = _optimiser(model, name)
-            for parameter in optimiser.param_groups[0]["params"]:
-                moments = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
-                optimiser.state[parameter] = {"step": torch.tensor(float(updates)), **moments}
+        _begin(model, updates)
     with torch.no_grad():
         for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
             theirs.copy_(ours)
@@ -76,11 +72,7 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
 
 def share(model: Expert, shapes: Shapes, arrays: Mapping[str, Tensor]) -> None:
     """From now on ``model`` trains one expert's ``arrays``: its parameters and Adam's moments become views of them."""
-    for name in TRAINED:
-        optimiser = _optimiser(model, name)
-        for parameter in optimiser.param_groups[0]["params"]:
-            moments = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
-            optimiser.state[parameter] = {"step": torch.zeros(()), **moments}
+    _begin(model, 0)
     for ours, theirs in _pairs(model, shapes, arrays, moments=True):
         theirs.data = ours
 
@@ -90,6 +82,15 @@ def count(model: Expert, updates: int) -> None:
     for name in TRAINED:
         for state in _optimiser(model, name).state.values():
             state["step"].fill_(updates)
+
+
+def _begin(model: Expert, updates: int) -> None:
+    """Adam's state after so many steps, with moments of zero."""
+    for name in TRAINED:
+        optimiser = _optimiser(model, name)
+        for parameter in optimiser.param_groups[0]["params"]:
+            moments = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
+            optimiser.state[parameter] = {"step": torch.tensor(float(updates)), **moments}
 
 
 def _pairs(

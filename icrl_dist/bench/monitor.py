@@ -102,9 +102,9 @@ def _watched(out: Path, settings: Sequence[str], pairs: int, seconds: float, nam
                 raise RuntimeError("the viewer heard nothing: nothing was compared")
     told: dict[str, Any] = {}
     for how in ("live", "stopped"):
-        alone, beside = ([cpu / max(1, made) for cpu, made in spent[how, watched]] for watched in (False, True))
         told[f"{name}ratio_{how}"] = round(_cost(spent[how, False]) / _cost(spent[how, True]), 4)
-        pairwise = [one / max(1e-9, other) for one, other in zip(alone, beside, strict=True)]
+        both = zip(spent[how, False], spent[how, True], strict=True)
+        pairwise = [_cost([alone]) / max(1e-9, _cost([beside])) for alone, beside in both]
         told[f"{name}spread_{how}"] = [round(min(pairwise), 3), round(max(pairwise), 3)]
     return told | {f"{name}ms": round(1000 * _cost([*spent["live", False], *spent["stopped", False]]), 3)}
 

@@ -25,7 +25,7 @@ from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config import ConfigError
 from icrl_dist.processes import is_learner, is_worker
 from icrl_dist.store import Store
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Identity
@@ -96,7 +96,7 @@ class _Heard:
                 self._stored = fields["trajectories"]
             elif kind == "trajectories":
                 now = time.monotonic()
-                self._sent += [(now, one["worker"], Identity.parse(one["identity"])) for one in wire.monitored(fields)]
+                self._sent += [(now, one["worker"], Identity.parse(one["identity"])) for one in plane.rows(fields)]
             self._changed.notify_all()
 
     def _read(self) -> None:

@@ -20,7 +20,7 @@ from icrl_dist.chaos.schedule import Strike
 from icrl_dist.config import Run
 from icrl_dist.processes import is_learner, is_worker
 from icrl_dist.recipes import METHODS
-from icrl_dist.stream import security, wire
+from icrl_dist.stream import plane, security, wire
 from icrl_dist.stream.link import Keys, LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
 
@@ -191,7 +191,7 @@ class _Ear:
         """One message of the monitor plane."""
         kind, fields = wire.decode_message(payload)
         if kind == "trajectories":
-            for one in wire.monitored(fields):
+            for one in plane.rows(fields):
                 name = "/".join(one["identity"].split("/")[:2])
                 self._heard[name] += 1
                 self._note(name, False, self._heard[name])

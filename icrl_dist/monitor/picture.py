@@ -17,7 +17,6 @@ from icrl_dist.monitor.pace import Pace
 from icrl_dist.monitor.plain import Odd
 from icrl_dist.monitor.staff import Staff
 from icrl_dist.stream import strict
-from icrl_dist.types import Identity
 
 LARGEST = 1 << 20
 """A message of more bytes than this is left out."""
@@ -84,7 +83,7 @@ class Picture:
         if kind == "trajectories":
             self._returned(message)
         elif kind == "episode":
-            self._curves.drawn(_identity(message), message)
+            self._curves.drawn(plain.identity(message.get("identity")), message)
         elif kind == "worker":
             self._staff.beat(message, now)
         elif kind == "learner":
@@ -157,7 +156,7 @@ class Picture:
             self._run["state"], self._run["ended"] = what, time
 
     def _belief(self, message: dict[str, Any]) -> None:
-        identity, worker = _identity(message), plain.text(message.get("worker"))
+        identity, worker = plain.identity(message.get("identity")), plain.text(message.get("worker"))
         size = plain.integer(message.get("size"), 2, 64)
         goal = [plain.integer(c, 0, size - 1) for c in plain.listed(message.get("goal"), 2)]
         laws = {name: plain.numbers(message.get(name), size * size) for name in ("implied", "exact")}
@@ -224,10 +223,3 @@ class Picture:
         """All that is kept of one variation, named ``TASK/VARIATION``, its lineage among it; None if it is not known."""
         with self._lock:
             return self._curves.detail(name)
-
-
-def _identity(message: dict[str, Any]) -> Identity:
-    try:
-        return Identity.parse(plain.text(message.get("identity"), 120))
-    except ValueError:
-        raise Odd("schema") from None

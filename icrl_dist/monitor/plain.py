@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from icrl_dist.types import Identity
+
 
 class Odd(Exception):  # noqa: N818
     """A message to be left out; says why in a word or two."""
@@ -37,6 +39,14 @@ def listed(value: object, longest: int) -> list[Any]:
     if type(value) is not list or len(value) > longest:
         raise Odd("schema")
     return value
+
+
+def identity(value: object) -> Identity:
+    """``STAGE/ROUND/TASK/VARIATION/TRIAL``.  Raises Odd for anything else."""
+    try:
+        return Identity.parse(text(value, 120))
+    except ValueError:
+        raise Odd("schema") from None
 
 
 def mapped(value: object) -> dict[str, Any]:

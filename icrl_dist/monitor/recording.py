@@ -20,7 +20,7 @@ from icrl_dist.config import ConfigError, load
 from icrl_dist.ledger import Row
 from icrl_dist.recipes import METHODS, about
 from icrl_dist.store import Store
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.stream.link import Keys
 
 _BEAT_S = 1.0
@@ -117,12 +117,12 @@ class Recording:
         drawn: dict[str, float] = {}
         for now, row in zip(self._when, self._ordered, strict=True):
             trajectory, worker = self._store.read(row.identity), row.worker
-            yield now, self._keys.monitor(f"trajectories/{_part(worker)}"), wire.monitor_trajectories([trajectory], now)
+            yield now, self._keys.monitor(f"trajectories/{_part(worker)}"), plane.trajectories([trajectory], now)
             done[worker] += 1
             steps[worker] += len(trajectory.actions)
             if now - drawn.get(worker, 0.0) >= _EPISODES_S:
                 drawn[worker] = now
-                yield now, self._keys.monitor(f"episode/{_part(worker)}"), wire.monitor_episode(trajectory, now)
+                yield now, self._keys.monitor(f"episode/{_part(worker)}"), plane.episode(trajectory, now)
             if now - beaten.get(worker, 0.0) >= _BEAT_S:
                 beaten[worker] = now
                 yield self._beat(now, row, done[worker], steps[worker])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from icrl_dist.config import ConfigError
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.types import Identity
 
 
@@ -37,7 +37,7 @@ class Tapped:
         """One message of the monitor plane."""
         try:
             kind, fields = wire.decode_message(payload)
-            told = [one for one in wire.monitored(fields) if self._passes(one)] if kind == "trajectories" else []
+            told = [one for one in plane.rows(fields) if self._passes(one)] if kind == "trajectories" else []
         except (wire.WireError, ValueError):
             return
         for one in told:

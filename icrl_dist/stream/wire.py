@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from typing import Any
 
 import msgpack
@@ -48,9 +48,6 @@ from icrl_dist.types import (
 )
 
 __all__ = ["REASONS", "VERSION", "WireError"]
-
-FRAMES = 100
-"""States of an episode that the monitor plane shows, at most, besides the last."""
 
 SMALL = 1 << 20
 """Default limit of jobs and messages, bytes."""
@@ -198,65 +195,6 @@ def decode_message(data: bytes, limit: int = SMALL) -> tuple[str, dict[str, Any]
     return text(message.pop("kind", None), "kind"), message
 
 
-def monitor_trajectories(trajectories: Iterable[Trajectory], time: float) -> bytes:
-    """What the monitor plane says of some trajectories of one worker: docs/tap.md.  ``time`` in Unix seconds."""
-    told: dict[tuple[object, ...], dict[str, Any]] = {}
-    worker = ""
-    for one in trajectories:
-        worker = one.worker
-        of = (*one.identity[:4], one.weights, one.digest)
-        if of not in told:
-            told[of] = {
-                "identity": "/".join(map(str, one.identity[:4])),
-                "problem": one.variation.task.kind,
-                "task": _plain(one.variation.task.params),
-                "adversary": {**_plain(one.variation.adversary.params), "kind": one.variation.adversary.kind},
-                "weights": one.weights,
-                "digest": one.digest,
-                **{name: [] for name in _COLUMNS},
-            }
-        for name, value in zip(_COLUMNS, (one.identity.trial, one.episode_return, len(one.actions)), strict=True):
-            told[of][name].append(value)
-    return encode_message("trajectories", worker=worker, time=float(time), variations=list(told.values()))
-
-
-def monitored(fields: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Each trajectory that a message of that kind tells of, as a map of its own: what ``icrl-dist tap`` prints.
-
-    Raises WireError for fields that are none of such a message.
-    """
-    for told in as_list(fields.get("variations"), "variations"):
-        of = dict(as_map(told, "variations"))
-        identity = text(of.pop("identity", None), "identity")
-        columns = [as_list(of.pop(name, None), name) for name in _COLUMNS]
-        if len({len(column) for column in columns}) != 1:
-            raise WireError("shape", f"{_COLUMNS} have {[len(column) for column in columns]} entries, expected as many of each")
-        for trial, earned, steps in zip(*columns, strict=True):
-            one = {"identity": f"{identity}/{trial}", **of, "episode_return": earned, "steps": steps}
-            yield {**one, "worker": fields.get("worker"), "time": fields.get("time")}
-
-
-def monitor_episode(trajectory: Trajectory, time: float) -> bytes:
-    """An episode to be drawn, of at most ``FRAMES`` states of it: docs/tap.md.  ``time`` in Unix seconds."""
-    every = -(-len(trajectory.actions) // FRAMES)
-    adversary = trajectory.adversary
-    if adversary.ndim == 2:  # how hard it pushed
-        adversary = np.linalg.norm(adversary, axis=1) / max(1, adversary.shape[1]) ** 0.5
-    return encode_message(
-        "episode",
-        identity=str(trajectory.identity),
-        problem=trajectory.variation.task.kind,
-        task=_plain(trajectory.variation.task.params),
-        episode_return=trajectory.episode_return,
-        every=every,
-        observations=from_array(np.ascontiguousarray(trajectory.observations[::every])),
-        adversary=from_array(adversary[::every].astype("<f4")),
-        worker=trajectory.worker,
-        time=float(time),
-    )
-
-
-_COLUMNS = ("trials", "returns", "steps")
 _ALWAYS = {"v", "kind"}
 _TRAJECTORY = _ALWAYS | {"identity", "variation", "weights", "digest", "worker", "origin", "arrays"}
 _WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}
@@ -283,10 +221,6 @@ def _to_identity(value: object) -> Identity:
 
 def _from_params(params: Params) -> list[object]:
     return [[name, list(value) if isinstance(value, tuple) else value] for name, value in params]
-
-
-def _plain(params: Params) -> dict[str, object]:
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in params}
 
 
 def _to_params(value: object, what: str) -> Params:

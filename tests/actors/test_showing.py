@@ -7,7 +7,7 @@ import pytest
 
 from actors import showing
 from actors.showing import Samples, Showing
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.types import Identity
 from tests.monitor.messages import trajectory
@@ -27,7 +27,7 @@ class Heard:
         kind, fields = wire.decode_message(payload)
         if kind == "trajectories":
             assert key == KEYS.monitor("trajectories/w0")
-            self.messages.append([one["identity"] for one in wire.monitored(fields)])
+            self.messages.append([one["identity"] for one in plane.rows(fields)])
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from icrl_dist.config import dumps
 from icrl_dist.envs import spec, tasks
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.recipes import METHODS
-from icrl_dist.stream import batch, wire
+from icrl_dist.stream import batch, plane, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
@@ -82,7 +82,7 @@ def test_a_worker_does_its_job_says_who_it_is_and_stops(hub, small_run):
     assert {t.worker for t in learner.stored} == {"w7"}
     assert learner.asked[0][1]["version"] == icrl_dist.__version__
     assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
-    monitored = [one["identity"] for kind, fields in seen if kind == "trajectories" for one in wire.monitored(fields)]
+    monitored = [one["identity"] for kind, fields in seen if kind == "trajectories" for one in plane.rows(fields)]
     assert monitored == [str(i) for i in job.identities()]
 
 

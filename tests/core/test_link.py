@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Link, LinkError, Unanswered, matches
 from icrl_dist.stream.memory_link import MemoryHub
@@ -258,7 +258,7 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
             reader.start()
             end = time.monotonic() + 15
             while not lines and time.monotonic() < end:
-                learner.publish(KEYS.monitor("trajectories/w0"), wire.monitor_trajectories([episode], 5.0), droppable=True)
+                learner.publish(KEYS.monitor("trajectories/w0"), plane.trajectories([episode], 5.0), droppable=True)
                 time.sleep(0.05)
         finally:
             tap.kill()

@@ -9,7 +9,7 @@ import time
 
 import psutil
 
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
@@ -56,7 +56,7 @@ def on_first_adapt_trajectory(folder, act, round_=0):
 
     def hear(key, payload):
         _, fields = wire.decode_message(payload)
-        heard = any(one["identity"].startswith(f"adapt/{round_}") for one in wire.monitored(fields))
+        heard = any(one["identity"].startswith(f"adapt/{round_}") for one in plane.rows(fields))
         if heard and not acted.is_set():
             acted.set()
             act()

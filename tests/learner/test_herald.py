@@ -8,7 +8,7 @@ import pytest
 from icrl_dist import launch
 from icrl_dist.alerts import AlertsConfig
 from icrl_dist.metrics import NAMES, TEXTS
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.stream.memory_link import MemoryLink
 from learner import herald, service
 
@@ -51,7 +51,7 @@ def test_monitors_are_told_all_that_docs_say(said):
     assert of["event"][-1]["what"] in ("finished", "worker")
     assert {row["stage"].partition("/")[0] for row in rows} <= {*NAMES, *TEXTS}
     stored = [row["trajectories"] for row in rows if row["stage"] == "ingest"]
-    told = [one["identity"] for fields in of["trajectories"] for one in wire.monitored(fields)]
+    told = [one["identity"] for fields in of["trajectories"] for one in plane.rows(fields)]
     assert stored == sorted(stored) and stored[-1] == len(told) == len(set(told))
     assert len(of["episode"]) < len(told), "only some are shown whole"
     assert len(of["trajectories"]) < len(told) / 2, "a message tells of many"

@@ -13,14 +13,14 @@ from icrl_dist.monitor import curves, staff
 from icrl_dist.monitor.pace import Pace
 from icrl_dist.monitor.picture import Picture
 from icrl_dist.oracle import Hypotheses, optimal_returns
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from tests.monitor.messages import PUSHY, ROOM, about, beat, event, hear, progress, trajectory
 
 
 def watch(picture, *trajectories, now=0.0):
     for one in trajectories:
-        hear(picture, f"trajectories/{one.worker}", wire.monitor_trajectories([one], now), now)
-        hear(picture, f"episode/{one.worker}", wire.monitor_episode(one, now), now)
+        hear(picture, f"trajectories/{one.worker}", plane.trajectories([one], now), now)
+        hear(picture, f"episode/{one.worker}", plane.episode(one, now), now)
 
 
 def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum():
@@ -235,8 +235,8 @@ def test_one_run_is_shown_and_another_at_the_same_place_left_out():
 
 
 MESSAGES = {
-    "trajectories": wire.monitor_trajectories([trajectory()], 0.0),
-    "episode": wire.monitor_episode(trajectory(), 0.0),
+    "trajectories": plane.trajectories([trajectory()], 0.0),
+    "episode": plane.episode(trajectory(), 0.0),
     "worker": beat(),
     "learner": progress(),
     "run": about(),

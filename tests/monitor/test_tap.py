@@ -9,7 +9,7 @@ import pytest
 
 from icrl_dist.config import ConfigError
 from icrl_dist.monitor.tap import Tapped
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.types import NULL
 from tests.monitor.messages import progress, trajectory
 
@@ -30,7 +30,7 @@ def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0)
                 law = {"adversary": NULL} if variation == 0 else {}
                 made.append(trajectory(f"adapt/0/{task}/{variation}/{trial}", **law))
     for first in range(0, len(made), 7):
-        tap("key", wire.monitor_trajectories(made[first : first + 7], 0.0))
+        tap("key", plane.trajectories(made[first : first + 7], 0.0))
     broken = [{"identity": "x"}, {"identity": "adapt/0/0/0", "trials": [1], "returns": [], "steps": []}, 7]
     for odd in (progress(), b"garbage", *(wire.encode_message("trajectories", variations=[one]) for one in broken)):
         tap("key", odd)

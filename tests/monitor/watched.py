@@ -11,7 +11,7 @@ import numpy as np
 from icrl_dist.envs import darkroom
 from icrl_dist.monitor.picture import Picture
 from icrl_dist.store import Store
-from icrl_dist.stream import wire
+from icrl_dist.stream import plane, wire
 from icrl_dist.types import NULL, Adversary, Identity, Trajectory, Variation
 
 BEGAN = 1_700_000_000.0
@@ -95,10 +95,10 @@ class Watched:
         self.say("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
 
     def store(self, trajectory):
-        self.picture.hear("icrl/demo/mon/trajectories/w0", wire.monitor_trajectories([trajectory], self.time), self.time)
+        self.picture.hear("icrl/demo/mon/trajectories/w0", plane.trajectories([trajectory], self.time), self.time)
 
     def draw(self, trajectory):
-        self.picture.hear("icrl/demo/mon/episode/w0", wire.monitor_episode(trajectory, self.time), self.time)
+        self.picture.hear("icrl/demo/mon/episode/w0", plane.episode(trajectory, self.time), self.time)
 
     def busy(self):
         """Four tasks of two variations, two workers."""
