@@ -130,12 +130,13 @@ class Worker:
         reply = patiently(lambda: self._link.request(self._keys.work, payload, timeout_s=5.0), self._patience_s)
         return wire.decode_message(reply)
 
-    def _count(self, sender: CreditSender) -> dict[str, int]:
+    def _count(self, sender: CreditSender) -> dict[str, float]:
         return {
             "episodes": self._episodes,
             "steps": self._steps,
             "resent": sender.resent,
             "trajectories": sender.acknowledged,
+            "waited_s": round(sender.waited_s, 3),
         }
 
     @contextlib.contextmanager

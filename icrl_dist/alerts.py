@@ -13,6 +13,8 @@ _PAIRS = 20
 _MOST = 200_000
 """Returns remembered of a version; beyond them no more pairs are formed."""
 _SHOWN = 3
+_WINDOW_S = 10.0
+"""The time over which ingest is compared with demand, seconds."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class AlertsConfig:
     silent_s: float = 5.0
     """A worker that has not been heard of for so long, seconds."""
     ingest: float = 0.5
-    """Trajectories stored a second fall below this share of the episodes that workers finish, over ten seconds."""
+    """Trajectories are stored at less than this share of the rate at which workers could make them: for the
+    rest of the last ten seconds they have waited for the learner to store what they sent."""
     labels: float = 0.05
     """The share of a round's own labels that are optimal falls by this much from round to round (ICAA in Dark Room)."""
 
@@ -59,7 +62,7 @@ class Alerts:
         self._zeros: dict[tuple[int, int], int] = {}
         self._returns: dict[int, dict[tuple[int, int, int], float]] = {}
         self._agreement: dict[int, float] = {}
-        self._counts: deque[tuple[float, int, int]] = deque()
+        self._waited: deque[tuple[float, dict[str, float]]] = deque()
 
     def returned(self, place: tuple[int, int, int], version: int, value: float) -> None:
         """``version`` acted in trial ``place`` (task, variation, trial) and earned ``value``; -1 for no version."""
@@ -76,17 +79,17 @@ class Alerts:
     def began(self) -> None:
         """A phase begins: what was 0 before does not count."""
         self._zeros.clear()
-        self._counts.clear()
+        self._waited.clear()
 
     def labels(self, round: int, agreement: float) -> None:
         """So large a share of a round's labels are optimal."""
         self._agreement[round] = agreement
 
-    def counted(self, now: float, produced: int, stored: int) -> None:
-        """So many episodes were finished by workers, and so many trajectories stored, in all."""
-        self._counts.append((now, produced, stored))
-        while len(self._counts) > 2 and now - self._counts[1][0] >= 10.0:
-            self._counts.popleft()
+    def waited(self, now: float, seconds: Mapping[str, float]) -> None:
+        """So long has each worker waited, in all, for the learner to store what it sent."""
+        self._waited.append((now, dict(seconds)))
+        while len(self._waited) > 2 and now - self._waited[1][0] >= _WINDOW_S:
+            self._waited.popleft()
 
     def check(self, silent: Mapping[str, float]) -> list[Alert]:
         """What began or ended; ``silent``: seconds since each worker was heard of."""
@@ -119,13 +122,16 @@ class Alerts:
         return "zero", f"stuck at zero for {limit} episodes: variation {names}"
 
     def _ingest(self) -> tuple[str, str] | None:
-        if len(self._counts) < 2 or self._counts[-1][0] - self._counts[0][0] < 10.0:
+        if len(self._waited) < 2 or self._waited[-1][0] - self._waited[0][0] < _WINDOW_S:
             return None
-        (then, produced_before, stored_before), (now, produced, stored) = self._counts[0], self._counts[-1]
-        made, kept = (produced - produced_before) / (now - then), (stored - stored_before) / (now - then)
-        if not kept < self._config.ingest * made:
+        (then, before), (now, after) = self._waited[0], self._waited[-1]
+        throughout = before.keys() & after.keys()
+        spent = len(throughout) * (now - then)
+        idle = sum(after[worker] - before[worker] for worker in throughout)
+        if not spent - idle < self._config.ingest * spent:
             return None
-        return "ingest", f"ingest below demand: workers finish {made:.1f} episodes/s, {kept:.1f} trajectories/s are stored"
+        share = min(1.0, idle / spent)
+        return "ingest", f"ingest below demand: workers wait {share:.0%} of their time for the learner to store what they sent"
 
     def _labels(self) -> tuple[str, str] | None:
         newest = max(self._agreement, default=0)

@@ -64,11 +64,13 @@ def train(arguments: Train, console: Console) -> int:
             from icrl_dist.agent import checkpoint_file
 
             if run.method != "experts":
-                save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
-                results = heldout.online(run, folder, display)
+                with launch.interruptible():
+                    save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
+                    results = heldout.online(run, folder, display)
     except launch.TrainInterrupted:
         given = arguments.run or f"--from {arguments.source}"
-        console.print(f"interrupted; `icrl-dist train {given} --resume` goes on from the checkpoint", markup=False)
+        resume = f"`icrl-dist train {given} --resume` goes on from the checkpoint"
+        console.print(f"interrupted; {resume if folder.exists() else 'nothing had been done yet'}", markup=False)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
     if run.method == "experts":

@@ -302,6 +302,15 @@ class _Learner:
         self._log.close()
 
 
+def interruptible() -> contextlib.AbstractContextManager[None]:
+    """Within it Ctrl-C or a polite kill raises TrainInterrupted: for work that can be done again."""
+
+    def interrupt() -> None:
+        raise TrainInterrupted
+
+    return _on_signals(interrupt)
+
+
 @contextlib.contextmanager
 def _on_signals(stop: Callable[[], None]) -> Iterator[None]:
     """Call ``stop`` instead of dying on Ctrl-C or a polite kill."""

@@ -41,6 +41,7 @@ NAMES: dict[str, dict[str, str]] = {
         "lag": "versions by which the weights of the last stored trajectory were older than its round",
         "drops": "messages refused or dropped, for any reason",
         "resent": "times that a trajectory had to be sent again",
+        "waited_s": "seconds that workers have waited for the learner to store what they sent, all together",
     },
     "labels": {
         "agreement": "share of the labels that the optimal policy would also take, 0 to 1",

@@ -26,7 +26,7 @@ _MOMENT_S = 0.3
 _LINES = 60
 """So many of a worker's stacks are in its record, the newest call of the first thread first."""
 
-_COUNTS = ("episodes", "steps", "resent", "trajectories")
+_COUNTS = {"episodes": int, "steps": int, "resent": int, "trajectories": int, "waited_s": float}
 
 
 class Desk:
@@ -71,12 +71,15 @@ class Desk:
 
     @property
     def told(self) -> dict[str, Any]:
-        """What all workers said of themselves together, and for how many seconds each has been silent."""
+        """What all workers said of themselves together; for how long each has been silent, and those here have waited."""
         now, said = time.monotonic(), list(self.counters.values())
+        here = [worker for worker, alive in list(self.workers.items()) if alive and worker in self.counters]
         return {
             "episodes": sum(one["episodes"] for one in said),
             "acknowledged": sum(one["trajectories"] for one in said),
             "resent": self.resent,
+            "waited_s": sum(one["waited_s"] for one in said),
+            "waited": {worker: self.counters[worker]["waited_s"] for worker in here},
             "silent": {worker: now - heard for worker, heard in list(self._heard.items())},
         }
 
@@ -197,7 +200,7 @@ class Desk:
         worker = str(fields["worker"])
         with self._lock:
             before = self.counters.get(worker, {})
-            counts = {name: max(int(fields[name]), before.get(name, 0)) for name in _COUNTS}
+            counts = {name: max(kind(fields[name]), before.get(name, 0)) for name, kind in _COUNTS.items()}
             self.counters[worker] = {**before, **fields, **counts}
             self._heard[worker] = time.monotonic()
 

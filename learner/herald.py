@@ -95,8 +95,7 @@ class Herald:
     def progress(self, fields: dict[str, Any], force: bool, desk: Mapping[str, Any]) -> None:
         """How far a phase is; told if ``force``, or if it is time.
 
-        ``fields`` as in docs/tap.md; ``desk``: ``silent`` (seconds by worker), ``episodes`` and
-        ``acknowledged`` (by all workers), ``resent``.
+        ``fields`` as in docs/tap.md; ``desk`` as ``Desk.told``.
         """
         if not self._due("progress", PERIOD_S) and not force:
             return
@@ -121,12 +120,13 @@ class Herald:
             lag=fields["lag"],
             drops=sum(fields["drops"].values()),
             resent=desk["resent"],
+            waited_s=desk["waited_s"],
         )
 
     def _alert(self, fields: dict[str, Any], desk: Mapping[str, Any]) -> None:
         with self._lock:
             if fields["stage"] == "collect":
-                self._alerts.counted(time.monotonic(), desk["episodes"], fields["trajectories"])
+                self._alerts.waited(time.monotonic(), desk["waited"])
             changed = self._alerts.check(desk["silent"])
         now = time.time()
         for alert in changed:

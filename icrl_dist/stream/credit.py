@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from icrl_dist.stream import batch
@@ -68,15 +70,32 @@ class CreditSender:
         self._failure: Refused | LinkError | None = None
         self._closed = False
         self._dispatcher = Dispatcher("credit")
+        self._waited: tuple[float, float | None] = (0.0, None)
 
     @property
     def outstanding(self) -> int:
         """Items taken in and neither acknowledged nor refused."""
         return self._outstanding
 
+    @property
+    def waited_s(self) -> float:
+        """Seconds that ``send`` and ``drain`` have waited for answers, until now."""
+        ended, since = self._waited  # one value: another thread may ask
+        return ended if since is None else ended + time.monotonic() - since
+
+    @contextlib.contextmanager
+    def _wait(self) -> Iterator[None]:
+        ended, since = self._waited[0], time.monotonic()
+        self._waited = ended, since
+        try:
+            yield
+        finally:
+            self._waited = ended + time.monotonic() - since, None
+
     def send(self, payload: bytes) -> None:
         """Take an item, waiting for a credit.  Raises Refused for an earlier item, LinkError if closed."""
-        self._credit.get()
+        with self._wait():
+            self._credit.get()
         with self._changed:
             try:
                 self._raise()
@@ -91,7 +110,8 @@ class CreditSender:
     def drain(self, timeout_s: float) -> None:
         """Wait until every item is acknowledged.  Raises Refused for one that was not, Unanswered after ``timeout_s``."""
         with self._changed:
-            self._changed.wait_for(lambda: self._failure or self._closed or not self._outstanding, timeout_s)
+            with self._wait():
+                self._changed.wait_for(lambda: self._failure or self._closed or not self._outstanding, timeout_s)
             if self._failure or self._outstanding:
                 self._raise()
                 raise Unanswered(f"{self._outstanding} items on {self._key} unanswered after {timeout_s:g} s")

@@ -165,7 +165,7 @@ def test_every_ask_says_what_was_done_and_heartbeats_go_on_meanwhile(hub, small_
     assert said[0] == dict.fromkeys(said[0], 0)
     assert said[1] == {"episodes": count, "steps": count * small_run.darkroom.horizon, "trajectories": count, "resent": 0}
     assert {kind for kind, _ in heard} == {"worker"}
-    assert all(fields["worker"] == "w0" and fields["memory_mb"] > 10 for _, fields in heard)
+    assert all(fields["worker"] == "w0" and fields["memory_mb"] > 10 and fields["waited_s"] >= 0 for _, fields in heard)
 
 
 def test_a_refused_hello_ends_the_worker_with_the_reason(hub):

@@ -329,11 +329,21 @@ class LinkBattery:
         sender = CreditSender(worker, KEYS.data, 2, 30.0)
         sender.send(b"1")
         sender.send(b"2")
+        before = sender.waited_s
         with pytest.raises(Unanswered, match="2 items"):
             sender.drain(0.1)
-        threading.Timer(0.1, sender.close).start()
+        drained = sender.waited_s
+        assert drained - before >= 0.1
+        seen: list[float] = []
+
+        def close() -> None:
+            seen.append(sender.waited_s)
+            sender.close()
+
+        threading.Timer(0.1, close).start()
         with pytest.raises(LinkError, match="closed"):
             sender.send(b"3")
+        assert drained < seen[0] < sender.waited_s == sender.waited_s, "the wait that is on counts, one that is over is over"
         sender.close()
 
     def test_nothing_is_lost_nor_committed_twice_when_answers_are(self, links: Links) -> None:

@@ -62,14 +62,22 @@ def test_a_worker_that_is_silent_and_heard_of_again():
 def test_ingest_that_falls_behind_the_workers():
     alerts = Alerts(AlertsConfig(ingest=0.5))
     for second in range(10):
-        alerts.counted(float(second), produced=100 * second, stored=30 * second)
+        alerts.waited(float(second), {"w0": 0.8 * second, "w1": 0.6 * second})
     assert told(alerts) == [], "ten seconds have not passed"
-    alerts.counted(10.0, produced=1000, stored=300)
+    alerts.waited(10.0, {"w0": 8.0, "w1": 6.0})
     (alert,) = alerts.check({})
-    assert alert.text == "ingest below demand: workers finish 100.0 episodes/s, 30.0 trajectories/s are stored"
+    assert alert.text == "ingest below demand: workers wait 70% of their time for the learner to store what they sent"
     for second in range(11, 40):
-        alerts.counted(float(second), produced=1000 + 100 * (second - 10), stored=300 + 100 * (second - 10))
+        alerts.waited(float(second), {"w0": 8.0, "w1": 6.0})
     assert told(alerts) == [("ingest", False)]
+
+
+def test_bursts_and_workers_that_come_and_go_are_no_lack_of_ingest():
+    alerts = Alerts(AlertsConfig(ingest=0.5))
+    for second in range(60):
+        there = {"w0": 4.0 * (second // 10)} | ({"w1": 50.0 + second / 2} if second % 7 else {})
+        alerts.waited(float(second), there)
+        assert told(alerts) == [], second
 
 
 def test_label_quality_that_falls_from_round_to_round():
@@ -87,7 +95,7 @@ def test_nought_is_never():
     for trial in range(50):
         alerts.returned((0, 0, trial), 0, 5.0)
         alerts.returned((0, 0, trial), 1, 0.0)
-        alerts.counted(float(trial), 100 * trial, 0)
+        alerts.waited(float(trial), {"w0": float(trial)})
     alerts.labels(0, 1.0)
     alerts.labels(1, 0.0)
     assert told(alerts, {"w0": 1e9}) == []

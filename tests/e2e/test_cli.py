@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -10,7 +12,7 @@ from importlib import metadata
 
 import pytest
 
-from icrl_dist import cli
+from icrl_dist import agent, cli, heldout, launch
 
 
 def refused(capsys, *arguments):
@@ -166,6 +168,30 @@ sys.exit(cli.main(["train", "smoke", "--actors", "1", "--out", sys.argv[1]]))
 """
     ran = subprocess.run([sys.executable, "-c", script, tmp_path / "run"], capture_output=True, text=True)
     assert ran.returncode == 130 and ran.stdout.splitlines()[0] == "", ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_an_evaluation_that_is_stopped_says_how_to_go_on(monkeypatch, tmp_path, capsys, name):
+    def stopped(*_):
+        signal.raise_signal(getattr(signal, name))
+        pytest.fail("it went on")
+
+    monkeypatch.setattr(launch, "train_inline", lambda *_: {})
+    monkeypatch.setattr(agent, "checkpoint_file", lambda folder: folder / "none")
+    monkeypatch.setattr(heldout, "calibrate", stopped)
+    assert cli.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
+    assert "interrupted; `icrl-dist train smoke --resume` goes on" in capsys.readouterr().out
+    assert (tmp_path / "run" / "run.toml").exists()
+
+
+def test_a_run_stopped_before_it_began_promises_no_checkpoint(monkeypatch, tmp_path, capsys):
+    def stopped(run, folder, *_):
+        shutil.rmtree(folder)
+        raise launch.TrainInterrupted
+
+    monkeypatch.setattr(launch, "train_ray", stopped)
+    assert cli.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "run")]) == 130
+    assert capsys.readouterr().out == "interrupted; nothing had been done yet\n"
 
 
 def test_our_packages_are_the_ones_imported():

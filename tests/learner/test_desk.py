@@ -18,7 +18,7 @@ from learner.desk import Desk
 from learner.work import Board
 
 KEYS = Keys("test")
-COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0}
+COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "waited_s": 0.0}
 RECORD = {"what": "raised", "job": "pretrain/0/0", "exception": "ValueError: no (room.py:3)"}
 
 
@@ -115,7 +115,7 @@ def test_the_service_says_which_weights_a_job_acts_with(office):
 
 
 def test_counters_are_the_newest_of_every_worker_and_never_fall(office, hub):
-    office.ask("w0", episodes=3, steps=24, resent=2, trajectories=3)
+    office.ask("w0", episodes=3, steps=24, resent=2, trajectories=3, waited_s=1.5)
     office.ask("w1", resent=1)
     heartbeat = {**COUNTS, "episodes": 2, "resent": 1, "memory_mb": 80.5, "job": "pretrain/0/0"}
     beating = hub()
@@ -125,8 +125,8 @@ def test_counters_are_the_newest_of_every_worker_and_never_fall(office, hub):
         assert time.monotonic() < deadline, "the heartbeat was not heard"
         time.sleep(0.01)
     said = office.desk.counters["w0"]
-    assert [said[name] for name in COUNTS] == [3, 24, 2, 3] and said["memory_mb"] == 80.5
-    assert office.desk.resent == 3
+    assert [said[name] for name in COUNTS] == [3, 24, 2, 3, 1.5] and said["memory_mb"] == 80.5
+    assert office.desk.resent == 3 and office.desk.told["waited_s"] == 1.5
 
 
 def test_nobody_waits_for_a_worker_whose_next_life_has_come(office, worker):

@@ -391,9 +391,9 @@ def test_a_real_terminal_shows_a_recording_and_is_left_as_it_was(tmp_path):
         done = subprocess.run(["tmux", "-S", socket, *arguments], capture_output=True, text=True, timeout=20, check=True)
         return done.stdout
 
-    def wait_for(*parts):
+    def wait_for(*patterns):
         deadline = time.monotonic() + 120
-        while not all(part in (screen := tmux("capture-pane", "-p", "-t", "view")) for part in parts):
+        while not all(re.search(pattern, screen := tmux("capture-pane", "-p", "-t", "view")) for pattern in patterns):
             assert time.monotonic() < deadline, screen
             time.sleep(0.2)
         return screen
@@ -401,8 +401,7 @@ def test_a_real_terminal_shows_a_recording_and_is_left_as_it_was(tmp_path):
     tmux("-f", "/dev/null", "new-session", "-d", "-s", "view", "-x", "100", "-y", "30", "-c", str(Path.cwd()), command)
     try:
         tmux("send-keys", "-t", "view", "")
-        screen = wait_for("night  icaa · darkroom", "2/1")
-        assert re.search(r"2/1 .*dirichlet.* adapt/0 .*[▁▂▃▄▅▆▇█]{4}", screen), screen
+        screen = wait_for("night  icaa · darkroom", r"2/1 .*dirichlet.* adapt/0 .*[▁▂▃▄▅▆▇█]{4}")
         assert "recording" in screen and "q quit" in screen
         tmux("send-keys", "-t", "view", "q")
         screen = wait_for("left with 0")
