@@ -44,7 +44,7 @@ class Worker:
         self._stop = threading.Event()
         self._episodes = self._steps = 0
         self._job = self._doing = ""
-        self._weights = -1
+        self._weights, self._reached = -1, 0
         self._showing = Showing(link, self._keys, name)
 
     def stop(self) -> None:
@@ -108,14 +108,14 @@ class Worker:
             _settle(sender, drain_s)
             self._ask("failed", job=list(job.name), record=record, file=self._keep(record))
         finally:
-            self._job = self._doing = ""
+            self._job, self._doing, self._reached = "", "", 0
 
-    def _tell(self, text: str, note: bool = False) -> None:
+    def _tell(self, text: str, note: bool = False, reached: int = 0) -> None:
         """A note goes to whoever looks at the run; anything else with the next heartbeat."""
         if note:
             self._ask("note", text=text)
         else:
-            self._doing = text
+            self._doing, self._reached = text, reached
 
     def _keep(self, record: dict[str, Any]) -> str:
         """Write the record into the run folder, if that is on this machine; the file's name."""
@@ -151,6 +151,7 @@ class Worker:
                 now = {
                     "job": self._job,
                     "doing": self._doing,
+                    "reached": self._reached,
                     "weights": self._weights,
                     "pid": os.getpid(),
                     "time": time.time(),

@@ -20,6 +20,14 @@ def digest() -> str:
     return _digest((file.relative_to(above).as_posix(), file.read_bytes()) for file in files)
 
 
+@functools.cache
+def digest_of(parts: tuple[str, ...]) -> str:
+    """SHA-256 of some of the modules in ``icrl_dist``, hex: files, or folders with all that is in them."""
+    root = Path(__file__).parent
+    files = [found for part in parts for found in ((root / part).rglob("*.py") if part.endswith("/") else [root / part])]
+    return _digest((found.relative_to(root).as_posix(), found.read_bytes()) for found in files)
+
+
 def digest_of_wheel(wheel: Path) -> str:
     """SHA-256 of the code in a wheel, hex.  Raises OSError or zipfile.BadZipFile if it cannot be read."""
     with zipfile.ZipFile(wheel) as archive:

@@ -65,7 +65,8 @@ class PretrainConfig:
     """The pretraining dataset D_pre and the fit to it (sections 2 and 4.1)."""
 
     contexts: int = 80000
-    """Episodes in all, the same for every method and every K (appendix C.1)."""
+    """Episodes in all, the same for every method and every K (appendix C.1); of a SAC expert's history
+    no more than its training has."""
     behaviours: tuple[Literal["random", "persistent", "goals", "sweep"], ...] = ("random",)
     """Who walks through the contexts, by turns: ``random`` actions (the paper's); ``persistent``
     walks, which mostly go on as before; walks to random ``goals``, with a rest there; a ``sweep``

@@ -38,6 +38,8 @@ class Result:
     returns: Float[np.ndarray, "tasks seeds episodes"]
     optimum: Float[np.ndarray, " tasks"] | None
     """Expected return of the optimal policy in each task's variation, by value iteration; None in a continuous game."""
+    broken: int = 0
+    """Episodes that ended early because the simulation broke down: they count with what they had earned by then."""
 
     def last(self, episodes: int) -> float:
         """Mean return over the last episodes."""
@@ -64,6 +66,7 @@ class Result:
             "optimum": None if best is None else round(best, 3),
             "last5": round(self.last(5), 3),
             "last5_over_optimum": None if best is None else round(self.last(5) / best, 4),
+            **({"broken": self.broken} if self.broken else {}),
         }
 
 
@@ -97,11 +100,11 @@ def scripted(rows: Sequence[Variation]) -> Actor:
 
 def expert(run: Run, chosen: Sequence[Task]) -> MakePolicy | None:
     """The SAC experts of these tasks, undisturbed, if they were trained on this machine."""
-    asked = {task: histories.kept(Variation(task), run.sac, run.seed) for task in chosen}
+    asked = {task: histories.any_kept(Variation(task), run.sac, run.seed) for task in chosen}
     found = {task: history for task, history in asked.items() if history is not None}
     if len(found) < len(asked):
         return None
-    return lambda rows: experts.ExpertPolicy([found[row.task] for row in rows], tasks.spec(run), run.sac)
+    return lambda rows: experts.ExpertPolicy([found[row.task] for row in rows], run.sac)
 
 
 def optimal(run: Run) -> MakePolicy:
@@ -150,15 +153,16 @@ def online(
         for name, make in agents.items():
             env = envs.batch(rows)
             trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
-            returns = []
+            returns, broken = [], 0
             policy = make(rows)
             if isinstance(policy, ScriptedPolicy):
                 policy.meet(env)
             for ran in deploy_online(env, policy, trials):
                 returns.append(ran.returns)
+                broken += 0 if ran.diverged is None else int(ran.diverged.sum())
                 progress(name, p, len(returns))
             shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
-            results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum))
+            results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum, broken))
     return results
 
 

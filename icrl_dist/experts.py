@@ -3,7 +3,7 @@
 What a variation is learned from: episodes of its expert's training, from the first random ones to
 the last, and at every state of them the action of the expert that came of it.  Expert networks
 never travel; histories and experts are kept where they were made, by what they are of, so that
-nobody trains them twice.
+nobody trains them twice.  An expert is seeded by its variation: in any company it becomes the same.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist import envs
-from icrl_dist.envs import Batch
+from icrl_dist.delivery import Act, delivered, labelled, lead, scripted
 from icrl_dist.envs.recorder import Recorder
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
 from icrl_dist.games import SACConfig
-from icrl_dist.histories import KEPT, LED, History, file, keep, kept, key, sac_of
-from icrl_dist.types import Identity, Job, Spec, Trajectory
+from icrl_dist.histories import History, Trainer, episodes, file, keep, kept, key, own_seed, remembered, sac_of
+from icrl_dist.types import Job, Trajectory, Variation
 
 if TYPE_CHECKING:
     from icrl_dist.algos.sac_batch import By, SACBatch
@@ -36,12 +36,15 @@ CHECKPOINT_S = 60.0
 
 
 class Tell(Protocol):
-    """Hears how long work goes on; what is a ``note`` is worth a line of its own."""
+    """Hears how long work goes on; what is a ``note`` is worth a line of its own.
 
-    def __call__(self, text: str, note: bool = False) -> None: ...
+    ``reached`` is how far it is: who does it once more after a kill, and gets further, is not to blame.
+    """
+
+    def __call__(self, text: str, note: bool = False, reached: int = 0) -> None: ...
 
 
-def unheard(text: str, note: bool = False) -> None:
+def unheard(text: str, note: bool = False, reached: int = 0) -> None:
     """Nobody listens."""
 
 
@@ -50,127 +53,90 @@ def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajec
 
     All of a job's experts train together, in lockstep; they, and so the histories, are known when
     the last step is made.  Settings: those of ``settings``; ``queries`` a trajectory; ``stretches``
-    a trajectory, of ``stretch`` states, a share ``misled`` of them led by another's expert.  Raises
+    a trajectory, of ``stretch`` states, a share ``misled`` of them led by another task's expert.  Raises
     RuntimeError for a variation whose simulation keeps breaking down.
     """
-    yield from delivered(job, _histories(job, sac_of(job), tell), worker)
-
-
-def delivered(job: Job, found: Sequence[History], worker: str) -> Iterator[Trajectory]:
-    """``job.trials`` episodes of each variation's history, evenly spaced, with query states and labels."""
-    for row, (task, variation) in enumerate(job.rows()):
-        history = found[row]
-        chosen = np.linspace(0, len(history.rewards) - 1, job.trials).round().astype(int)
-        for trial, episode in enumerate(chosen.tolist()):
-            identity = Identity(job.stage, job.round, task, variation, trial)
-            yield Trajectory(
-                identity=identity,
-                variation=job.variation(identity),
-                weights=job.weights,
-                digest="",
-                worker=worker,
-                observations=history.observations[episode],
-                actions=history.actions[episode],
-                rewards=history.rewards[episode],
-                adversary=history.adversary[episode],
-                origin="expert",
-                **_known(job, history, identity.rng(job.seed)),
-            )
-
-
-def _known(job: Job, history: History, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Query states of the history and stretches of what experts led, with their labels: a trajectory's last arrays."""
-    queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
-    place = np.unravel_index(rng.integers(history.rewards.size, size=queries), history.rewards.shape)
-    wrong = rng.random(stretches) < float(str(job.setting("misled")))
-    right_ones, wrong_ones = np.flatnonzero(~history.led_wrong), np.flatnonzero(history.led_wrong)
-    led, at = [], []
-    for misled in wrong.tolist():
-        episodes = wrong_ones if misled and len(wrong_ones) else right_ones
-        led += [int(rng.choice(episodes))] * length
-        first = int(rng.integers(history.led_rewards.shape[1] - length + 1))
-        at += list(range(first, first + length))
-    rest = np.array(led, int), np.array(at, int)
-    return {
-        "queries": np.concatenate([history.observations[:, :-1][place], history.led_observations[:, :-1][rest]]),
-        "labels": np.concatenate([history.labels[place], history.led_labels[rest]]),
-        "taken": history.led_actions[rest],
-        "gained": history.led_rewards[rest],
-    }
+    config = sac_of(job)
+    found = _histories(job, config, tell)
+    yield from delivered(job, found, worker, _by_actors(found, config))
 
 
 def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
-    """Of each of the job's variations: from the cache if all are there, else of a training of all of them.
-
-    The batch belongs to the job, as everywhere: experts that trained in other company differ in
-    their last digits.
-    """
-    found = [kept(variation, config, job.seed) for variation in job.variations]
-    whole = [history for history in found if history is not None]
-    if len(whole) == len(found):
-        saved = f"{len(whole) * config.steps:,} steps of SAC saved"
-        tell(f"{job.label}: {len(whole)} experts from the cache, {saved}", note=True)
-        return whole
-    made = _train(job, config, tell)
-    for variation, history in zip(job.variations, made, strict=True):
-        keep(history, variation, config, job.seed)
-    return made
+    """Of each of the job's variations: from the cache, and of a training of those that are not there."""
+    by = trained_by(len(job.variations))
+    there = {variation: kept(variation, config, job.seed, _trainer(by), job.trials) for variation in job.variations}
+    found = {variation: history for variation, history in there.items() if history is not None}
+    missing = [variation for variation in there if variation not in found]
+    if found:
+        tell(f"{job.label}: {len(found)} experts from the cache, {len(found) * config.steps:,} steps of SAC saved", note=True)
+    if missing:
+        for variation, history in zip(missing, _train(job, missing, by, config, tell), strict=True):
+            keep(history, variation, config, job.seed, _trainer(by), job.trials)
+            found[variation] = history
+    return [found[variation] for variation in job.variations]
 
 
 def trained_by(experts: int) -> By:
-    """stable-baselines3, the reference, trains an expert that is alone; several train in lockstep, and so does one on a GPU."""
+    """stable-baselines3, the reference, trains a job's expert that is alone; several train in lockstep, and one on a GPU."""
     from icrl_dist.algos.sac_batch import pick
 
     return "stable-baselines3" if experts == 1 and pick("auto").type == "cpu" else "lockstep"
 
 
-def _train(job: Job, config: SACConfig, tell: Tell) -> list[History]:
+def _trainer(by: By) -> Trainer:
+    from icrl_dist.algos.sac_batch import pick
+
+    return "lockstep, cuda" if by == "lockstep" and pick("auto").type == "cuda" else by
+
+
+def _train(job: Job, variations: Sequence[Variation], by: By, config: SACConfig, tell: Tell) -> list[History]:
     from icrl_dist.algos.sac_batch import train
 
-    names = [key(variation, config, job.seed) for variation in job.variations]
+    names = [key(variation, config, job.seed, _trainer(by), job.trials) for variation in variations]
     part = file(config, "part-" + hashlib.sha256("".join(names).encode()).hexdigest()) if config.cache else None
-    env = envs.batch(job.variations)
-    recorder = Recorder(env, max(1, config.steps // env.spec.horizon), KEPT)
+    env, seeds = envs.batch(variations), [own_seed(variation, job.seed) for variation in variations]
+    task = variations[0].task
+    recorder = Recorder(env, episodes(task, config), remembered(task, config, job.trials))
     state = _resumed(part, recorder) if part is not None and part.exists() else None
     written = time.monotonic()
 
     def progress(experts: SACBatch, returns: np.ndarray) -> None:
         nonlocal written
         mean = f"mean return {returns.mean():.0f}"
-        tell(f"{len(names)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}")
+        tell(f"{len(names)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
         if part is not None and time.monotonic() - written >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}
             save_checkpoint(part, Checkpoint(arrays, {}))
             written = time.monotonic()
 
-    rng = Identity(job.stage, job.round, job.task, job.first, 0).rng(job.seed)
-    seed, chance = int(rng.integers(2**31)), int(rng.integers(2**31))
-    experts = train(
-        recorder, config, recorder.episodes * recorder.spec.horizon, seed, progress, state=state, by=trained_by(env.batch)
-    )
-    columns, led = labelled(recorder.columns(), experts), lead(env, experts, chance)
-    made = assembled(job, columns, led, experts.arrays["actor"].cpu().numpy(), tell)
+    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, progress, state=state, by=by)
+    columns, led = labelled(recorder.columns(), experts.act), lead(env, experts.act, seeds, range(env.batch))
+    made = assembled(job, variations, columns, led, experts.arrays["actor"].cpu().numpy(), tell)
     if part is not None:
         part.unlink(missing_ok=True)
     return made
 
 
 def assembled(
-    job: Job, columns: dict[str, np.ndarray], led: dict[str, np.ndarray], actors: np.ndarray, tell: Tell
+    job: Job,
+    variations: Sequence[Variation],
+    columns: dict[str, np.ndarray],
+    led: dict[str, np.ndarray],
+    actors: np.ndarray,
+    tell: Tell,
 ) -> list[History]:
-    """The history of each variation, without the episodes that broke down.
+    """The history of each of these of the job's variations, without the episodes that broke down.
 
     Raises RuntimeError for a variation of which nothing is left.
     """
     parts, made = {"": columns, "led_": led}, []
-    for row, variation in enumerate(job.variations):
+    for row, variation in enumerate(variations):
         whole = {prefix: of["whole"][row] for prefix, of in parts.items()}
         lost = sum(int((~one).sum()) for one in whole.values())
         if lost:
             tell(f"{job.label}: {lost} episodes of {variation} broke down, and are left out", note=True)
-        broken = not all(one.any() for one in whole.values() if len(one))
-        if broken or (led["wrong"].size and led["wrong"][row][whole["led_"]].all()):
+        if not all(one.any() for one in whole.values() if len(one)):
             raise RuntimeError(f"{variation}: its simulation breaks down in every episode; leave it out, or push it less")
         taken = {
             prefix + name: column[row][whole[prefix]]
@@ -180,47 +146,6 @@ def assembled(
         }
         made.append(History(**taken, actor=actors[row]))
     return made
-
-
-def labelled(columns: dict[str, np.ndarray], experts: SACBatch | None) -> dict[str, np.ndarray]:
-    """Episodes with the right action at each of their states in place of the true states."""
-    truths = columns.pop("truths", None)
-    if truths is None:
-        assert experts is not None, "a game without a scripted policy"
-        seen = columns["observations"][:, :, :-1]
-        labels = experts.act(seen.reshape(len(seen), -1, seen.shape[-1]), None, deterministic=True)
-    else:
-        labels = scripted(truths)
-    return {**columns, "labels": labels.reshape(columns["actions"].shape)}
-
-
-def lead(env: Batch, experts: SACBatch | None, seed: int) -> dict[str, np.ndarray]:
-    """``LED`` episodes in which each row's own expert acts, and, if there are several, as many in which the next row's does."""
-    count = env.batch
-    recorder = Recorder(env, episodes := 2 * LED if count > 1 else LED, episodes)
-    for episode in range(episodes):
-        by = np.roll(np.arange(count), -int(episode >= LED))  # row r follows expert by[r]
-        seen = recorder.reset(
-            [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(episode, r))) for r in range(count)]
-        )
-        for _ in range(env.spec.horizon):
-            seen = recorder.step(_led_by(by, seen, getattr(env, "truth", None), experts)).observation
-    wrong = np.broadcast_to(np.arange(episodes) >= LED, (count, episodes))
-    columns = labelled(recorder.columns(), experts)
-    del columns["adversary"]  # zeta holds nothing of it
-    return {**columns, "wrong": wrong}
-
-
-def _led_by(
-    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, experts: SACBatch | None
-) -> Float32[np.ndarray, "B A"]:
-    """What the expert ``by[r]`` does in row r; Meta-World's is the scripted policy that is told that row's goal."""
-    if truth is not None:
-        return scripted(np.concatenate([truth[:, :-3], truth[by, -3:]], axis=1))
-    assert experts is not None, "a game without a scripted policy"
-    asked = np.empty_like(seen)
-    asked[by] = seen
-    return experts.act(asked, None, deterministic=True)[by]
 
 
 def _resumed(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
@@ -234,29 +159,31 @@ def _resumed(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
         return None
 
 
-def scripted(truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
-    """Meta-World's scripted policy at these true states."""
-    from icrl_dist.envs.metaworld import expert
+def _by_actors(found: Sequence[History], config: SACConfig) -> Act:
+    """What these experts do, by ``History.actor``."""
+    import torch
 
-    return expert(truths.reshape(-1, truths.shape[-1]).astype(np.float64))
+    from icrl_dist.algos.stacked import Shape, outputs
+
+    sizes = found[0].observations.shape[-1], *config.hidden, 2 * found[0].actions.shape[-1]
+    shape, actors = Shape(sizes), torch.from_numpy(np.stack([history.actor for history in found]))
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        mean: np.ndarray = outputs(shape, actors, torch.from_numpy(seen.copy()))[..., : sizes[-1] // 2].tanh().numpy()
+        return mean
+
+    return act
 
 
 class ExpertPolicy:
-    """The experts of B variations, each in its row: means of their actions, by ``History.actor``."""
+    """The experts of B variations, each in its row: means of their actions."""
 
-    def __init__(self, histories: Sequence[History], spec: Spec, config: SACConfig) -> None:
-        import torch
-
-        from icrl_dist.algos.stacked import Shape, outputs
-
-        shape = Shape((spec.observation, *config.hidden, 2 * spec.actions))
-        actors = torch.from_numpy(np.stack([history.actor for history in histories]))
-        self._outputs: Callable[[Any], Any] = lambda seen: outputs(shape, actors, torch.from_numpy(seen[:, None].copy()))
-        self._actions = spec.actions
+    def __init__(self, histories: Sequence[History], config: SACConfig) -> None:
+        self._act = _by_actors(histories, config)
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
         """The mean action of each expert."""
-        mean: np.ndarray = self._outputs(observation)[:, 0, : self._actions].tanh().numpy()
+        mean: Float32[np.ndarray, "B A"] = self._act(observation[:, None])[:, 0]
         return mean
 
     def observe(self, *transition: object) -> None:

@@ -25,6 +25,11 @@ PROBLEMS = (
 """What a run may be about: the kinds of tasks that ``envs`` makes."""
 
 
+def horizon(problem: str, given: int = 0) -> int:
+    """Steps an episode of a continuous game: those given, or if that is 0 the problem's own."""
+    return given or (500 if problem.startswith("metaworld") else 200)
+
+
 @dataclass(frozen=True)
 class ControlConfig:
     """The continuous games (appendix C.2, C.3); without effect in Dark Room."""

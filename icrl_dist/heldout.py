@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
-from icrl_dist import evaluate, plots, rollout, surprise, truth
+from icrl_dist import evaluate, histories, plots, rollout, surprise, truth
 from icrl_dist.agent import calibrated, checkpoint_file, model_of, outcomes_of
 from icrl_dist.config import Deployment, Run, default_deployment
 from icrl_dist.envs import tasks
@@ -68,7 +68,10 @@ def online(
         agents[newest] = watched
     if (deploy or default_deployment(run.model)) != "paper":
         agents[f"{newest}, Algorithm 1"] = evaluate.in_context(run, model, "paper")
-    agents |= _others(run)
+    others = _others(run)
+    agents |= others
+    if run.problem.startswith("dmc-") and evaluate.EXPERT not in others:
+        display.report({"event": "note", "text": _no_expert(run, what)})
     results = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
     return results, {f"{p:g}": _spread(one.now()) for p, one in zip(run.evaluate.p, watches, strict=False)}
 
@@ -84,6 +87,16 @@ def _others(run: Run) -> dict[str, evaluate.MakePolicy]:
         return agents | {evaluate.SCRIPTED: evaluate.scripted}
     trained = evaluate.expert(run, tasks.evaluated(run))
     return agents if trained is None else agents | {evaluate.EXPERT: trained}
+
+
+def _no_expert(run: Run, what: Path) -> str:
+    """Why no expert stands beside the models, and what would put it there."""
+    if not run.sac.cache:
+        return "no SAC expert stands beside the models: with sac.cache = '' none is kept"
+    missing = [task for task in tasks.evaluated(run) if histories.any_kept(Variation(task), run.sac, run.seed) is None]
+    train = f"icrl-dist train experts-{what / 'run.toml' if what.is_dir() else 'RUN'} --out OTHER"
+    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this machine"
+    return f"no SAC expert stands beside the models: {where}; `{train}` trains them"
 
 
 def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
@@ -105,6 +118,10 @@ def show_online(
     atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
     figure = plots.adaptation(rows, folder / "adaptation.png", title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
+    for one in results:
+        if one.broken:
+            told = f"{one.agent}, p = {one.p:g}: the simulation broke down in {one.broken} of {one.returns.size} episodes; "
+            console.print(told + "they count with what they had earned by then", highlight=False, markup=False)
     for p, one in surprised.items():
         told = f"surprise at the end, p = {p}: median {one['median']:.2f}, above 1 in {one['above_1']:.0%}"
         console.print(told, highlight=False, markup=False)

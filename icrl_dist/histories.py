@@ -7,25 +7,30 @@ import hashlib
 import logging
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import msgpack
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
+from icrl_dist import code
 from icrl_dist.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
-from icrl_dist.games import SACConfig
+from icrl_dist.games import SACConfig, horizon
 from icrl_dist.stream import wire
-from icrl_dist.types import Job, Params, Variation
+from icrl_dist.types import Job, Params, Task, Variation
 
 _log = logging.getLogger(__name__)
 
 KEPT = 200
-"""Episodes of a history, evenly spaced over the training; all, if there are fewer."""
+"""Episodes of a history, evenly spaced over the training; all, if there are fewer or more are asked for."""
 LED = 8
-"""Further episodes that the variation's own expert leads, and as many that another's does."""
+"""Further episodes that the variation's own expert leads."""
 
-_PHYSICS = ("dm-control", "metaworld", "mujoco", "torch")
+Trainer = Literal["lockstep", "stable-baselines3", "lockstep, cuda"]
+"""Who trains an expert, and where: each has its own last digits, and so its own experts."""
+
+_VERSIONS = ("dm-control", "metaworld", "mujoco", "stable-baselines3", "torch")
+_CODE = ("algos/", "delivery.py", "envs/", "experts.py", "games.py", "histories.py", "optimisers.py")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,13 +44,11 @@ class History:
     labels: Float32[np.ndarray, "E H A"]
     """The right action at each of the first H states: the expert's mean; in Meta-World the scripted policy's."""
     led_actions: Float32[np.ndarray, "G H A"]
-    """G further episodes, which stretches are cut from (zeta of eq. 6): in each an expert acted, without chance of its own."""
+    """G further episodes, which stretches are cut from (zeta of eq. 6): in each the expert acted, without chance of its own."""
     led_observations: Float32[np.ndarray, "G H+1 S"]
     led_rewards: Float32[np.ndarray, "G H"]
     led_labels: Float32[np.ndarray, "G H A"]
     """The right action at each of their first H states."""
-    led_wrong: Bool[np.ndarray, " G"]
-    """Where another variation's expert acted: a guess that is wrong."""
     actor: Float32[np.ndarray, " P"]
     """The expert's parameters, as ``algos.stacked.Shape`` lays them out."""
 
@@ -65,19 +68,35 @@ def sac_of(job: Job) -> SACConfig:
     return SACConfig(**given)
 
 
-def key(variation: Variation, config: SACConfig, seed: int) -> str:
-    """What a variation's history is kept under: all that decides it, versions of the physics included."""
-    versions = [[name, metadata.version(name)] for name in _PHYSICS]
+def own_seed(variation: Variation, seed: int) -> int:
+    """The seed of a variation's expert in a run with this one: nothing of it depends on its company."""
+    return int.from_bytes(hashlib.sha256(msgpack.packb([wire.from_variation(variation), seed])).digest()[:16])
+
+
+def episodes(task: Task, config: SACConfig) -> int:
+    """Episodes of an expert's whole training."""
+    return max(1, config.steps // horizon(task.kind, int(str(dict(task.params).get("horizon", 0)))))
+
+
+def remembered(task: Task, config: SACConfig, trials: int = 1) -> int:
+    """Episodes of a history that so many are asked for of: ``KEPT``, or all if that is not enough."""
+    return episodes(task, config) if trials > KEPT else min(KEPT, episodes(task, config))
+
+
+def key(variation: Variation, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> str:
+    """What a variation's history is kept under: all that decides it, physics and code included."""
+    versions = [[name, metadata.version(name)] for name in _VERSIONS]
     numbers = [[name, value] for name, value in settings(dataclasses.replace(config, cache=""))]
-    whole = [wire.from_variation(variation), numbers, seed, versions, KEPT, LED]
+    whole = [wire.from_variation(variation), numbers, seed, by, versions, code.digest_of(_CODE)]
+    whole += [remembered(variation.task, config, trials), LED]
     return hashlib.sha256(msgpack.packb(whole)).hexdigest()
 
 
-def kept(variation: Variation, config: SACConfig, seed: int) -> History | None:
+def kept(variation: Variation, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> History | None:
     """The history in the cache; None if it is not there, or damaged."""
     if not config.cache:
         return None
-    path = file(config, key(variation, config, seed))
+    path = file(config, key(variation, config, seed, by, trials))
     try:
         return History(**load_checkpoint(path).arrays) if path.exists() else None
     except (StoreError, TypeError) as error:
@@ -85,12 +104,19 @@ def kept(variation: Variation, config: SACConfig, seed: int) -> History | None:
         return None
 
 
+def any_kept(variation: Variation, config: SACConfig, seed: int) -> History | None:
+    """The same, whoever trained the expert, and whatever is kept of that."""
+    found = (kept(variation, config, seed, by, trials) for by in get_args(Trainer) for trials in (1, KEPT + 1))
+    return next((history for history in found if history is not None), None)
+
+
 def file(config: SACConfig, name: str) -> Path:
     """Where it is kept."""
     return Path(config.cache).expanduser() / f"{name}.npz"
 
 
-def keep(history: History, variation: Variation, config: SACConfig, seed: int) -> None:
+def keep(history: History, variation: Variation, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> None:
     """For every later run that asks for the same."""
     if config.cache:
-        save_checkpoint(file(config, key(variation, config, seed)), Checkpoint(history.arrays(), {"of": str(variation)}))
+        path = file(config, key(variation, config, seed, by, trials))
+        save_checkpoint(path, Checkpoint(history.arrays(), {"of": str(variation), "by": by}))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from icrl_dist import bites, endpoints
+from icrl_dist import bites, endpoints, games
 from icrl_dist.games import PROBLEMS
 from icrl_dist.tables import ConfigError, nearest
 
@@ -62,8 +62,7 @@ def validate(run: Run, source: str) -> None:
     for where, stretches in (("pretrain.stretches", run.pretrain.stretches), ("optim.stretches", optim.stretches)):
         remedy = "above 0 exactly if model.stretch is above 1"
         need((stretches > 0) == (run.model.stretch > 1), where, stretches, remedy)
-    longest = 500 if run.problem.startswith("metaworld") else 200
-    horizon = room.horizon if run.problem == "darkroom" else run.control.horizon or longest
+    horizon = room.horizon if run.problem == "darkroom" else games.horizon(run.problem, run.control.horizon)
     need(run.model.stretch <= horizon, "model.stretch", run.model.stretch, f"at most the horizon, {horizon} steps")
     need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
     need(run.context.max >= horizon, "context.max", run.context.max, "must hold at least one episode")
@@ -147,6 +146,13 @@ def _validate_control(run: Run, need: Need) -> None:
         need(control.test_tasks > 0, "control.test_tasks", control.test_tasks, "at least 1")
         need(control.horizon <= 500, "control.horizon", control.horizon, "Meta-World allows at most 500 steps")
         need(0 <= control.disturbance <= 0.1, "control.disturbance", control.disturbance, "0 to 0.1 metres")
+    alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
+    need(
+        not (run.pretrain.stretches and run.pretrain.misled and alone),
+        "pretrain.misled",
+        run.pretrain.misled,
+        f"0, or a stream.job_tasks that leaves none of the {count} tasks alone in a job: another's expert misleads",
+    )
     need(control.horizon >= 0, "control.horizon", control.horizon, "at least 0, which is the problem's own")
     if isinstance(control.strength, float):
         need(0 <= control.strength < math.inf, "control.strength", control.strength, "must not be negative, and be finite")

@@ -110,7 +110,8 @@ def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], t
     """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
 
     All methods and all K share out the same ``pretrain.contexts`` episodes.  In a continuous game
-    contexts are histories of SAC experts, or of Meta-World's scripted policy.
+    contexts are histories of SAC experts, or of Meta-World's scripted policy: of an expert's no more
+    episodes than its training has.
     """
     if run.problem == "darkroom":
         kind, settings = "random_context", (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
@@ -120,6 +121,8 @@ def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], t
             kind, settings = "scripted_context", _of_histories(run)
     chosen = [variations(i, task) for i, task in enumerate(tasks.split(run).train)]
     trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
+    if kind == "train_expert":
+        trials = min(trials, histories.episodes(chosen[0][0].task, run.sac))
     return _jobs(run, phase, kind, chosen, trials, settings)
 
 

@@ -15,9 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 
 from icrl_dist import envs
+from icrl_dist.delivery import delivered, labelled, lead, scripted
 from icrl_dist.envs import pick_place
 from icrl_dist.envs.recorder import Recorder
-from icrl_dist.experts import Tell, assembled, delivered, labelled, lead, scripted, unheard
+from icrl_dist.experts import Tell, assembled, unheard
+from icrl_dist.histories import own_seed
 from icrl_dist.types import Identity, Job, Spec, Trajectory
 
 NOISE = 0.6
@@ -45,13 +47,12 @@ def scripted_context(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Tr
             recorder.step(_actions(env.truth, leads, step))  # type: ignore[attr-defined]
         tell(f"{count * (trial + 1)} of {count * job.trials} episodes of the scripted policy")
     columns = labelled(recorder.columns(), None)
-    rng = Identity(job.stage, job.round, job.task, job.first, job.trials).rng(job.seed)
     if int(str(job.setting("stretches"))):
-        led = lead(env, None, int(rng.integers(2**31)))
+        led = lead(env, None, [own_seed(variation, job.seed) for variation in job.variations], range(count))
     else:
         led = {name: column[:, :0] for name, column in columns.items() if name != "adversary"}
-        led["wrong"] = np.zeros((count, 0), bool)
-    yield from delivered(job, assembled(job, columns, led, np.zeros((count, 0), np.float32), tell), worker)
+    found = assembled(job, job.variations, columns, led, np.zeros((count, 0), np.float32), tell)
+    yield from delivered(job, found, worker, None)
 
 
 class Lead(NamedTuple):

@@ -144,9 +144,9 @@ class Identity(NamedTuple):
         """First version of the weights that is fitted to it: 0 for ``pretrain``, j + 1 for round j."""
         return self.round + 1 if self.stage == "adapt" else 0
 
-    def rng(self, seed: int) -> np.random.Generator:
-        """The generator of this trajectory's draws; which worker runs it makes no difference."""
-        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=self.key()))
+    def rng(self, seed: int, *what: int) -> np.random.Generator:
+        """The generator of this trajectory's draws, or of some of them; which worker runs it makes no difference."""
+        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*self.key(), *what)))
 
     def __str__(self) -> str:
         return "/".join(map(str, self))

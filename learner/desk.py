@@ -203,6 +203,7 @@ class Desk:
             counts = {name: max(kind(fields[name]), before.get(name, 0)) for name, kind in _COUNTS.items()}
             self.counters[worker] = {**before, **fields, **counts}
             self._heard[worker] = time.monotonic()
+            self._board.reached(worker, str(fields.get("job")), int(fields.get("reached", 0)))
 
     def _work(self, query: Query) -> None:
         try:

@@ -21,6 +21,10 @@ DEATHS = 3
 
 _DOUBLINGS = 10
 
+_AT_ONCE = ("train_expert",)
+"""Kinds of jobs whose first trajectory comes after hours of training, or from a cache at once: no gap tells how long the
+next takes."""
+
 
 @dataclass(frozen=True)
 class Lease:
@@ -40,6 +44,9 @@ class _Slot:
     allowed: float = 0.0
     expired: int = 0
     blame: int = 0
+    reached: int = 0
+    """How far the work is of whoever has the job now, and at most was of those before."""
+    before: int = 0
     pinned: bool = False
 
     def number(self, identity: Identity) -> int:
@@ -167,6 +174,7 @@ class Board:
             slot.job = dataclasses.replace(slot.job, weights=acting(slot.job))
         slot.pinned = True
         slot.worker, slot.since, slot.allowed = worker, now, self._allowed(slot)
+        slot.reached, slot.before = 0, max(slot.before, slot.reached)
         self._holding[worker] = slot
         phase.leases += 1
         return Lease(slot.job, slot.allowed)
@@ -197,16 +205,25 @@ class Board:
         if slot is not None:
             slot.since = now
 
+    def reached(self, worker: str, job: str, how_far: int) -> None:
+        """The worker says how far it is in a job that takes long before its first trajectory."""
+        slot = self._holding.get(worker)
+        if slot is not None and slot.job.label == job:
+            slot.reached = max(slot.reached, how_far)
+
     def lost(self, worker: str, now: float, cause: str = "its worker died") -> list[Job]:
         """The worker is gone: its unfinished job is to blame, and goes to the next who asks.
 
-        That holds even if its lease had run out before and another has the job now.  Returns
-        what is free again.
+        That holds even if its lease had run out before and another has the job now; but nothing that was
+        before is held against a job which got further than ever: it goes on from a checkpoint, and
+        worker after worker may be killed from outside.  Returns what is free again.
         """
         slot = self._holding.get(worker)
         if slot is None or not self._release(worker):
             return []
         self._deaths[worker] = slot
+        if slot.reached > slot.before:
+            slot.blame = 0
         self._accuse(slot, cause)
         return [slot.job] if slot.missing and not slot.worker else []
 
@@ -246,7 +263,7 @@ class Board:
         return self._open(slot)
 
     def _allowed(self, slot: _Slot) -> float:
-        longest = self._longest.get(slot.job.kind)
+        longest = None if slot.job.kind in _AT_ONCE else self._longest.get(slot.job.kind)
         base = self._lease_s if longest is None else min(self._lease_s, max(self._floor_s, self._factor * longest))
         return base * 2.0 ** min(_DOUBLINGS, slot.expired + slot.blame)
 

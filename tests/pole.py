@@ -29,13 +29,13 @@ def main():
         for episode in range(10):
             seen = env.reset([np.random.default_rng((1, episode))])
             for _ in range(200):
-                seen, reward, *_ = env.step(experts.act(seen, None, deterministic=True))
+                seen, reward, *_ = env.step(experts.act(seen))
                 total += float(reward[0])
         print(total / 10, flush=True)
         if total / 10 >= 190:
             sys.exit("torch's compiler was imported" if "torch._dynamo" in sys.modules else 0)
 
-    train(envs.batch(pole), config, 12_000, 2, look, "cpu")
+    train(envs.batch(pole), config, 12_000, [2], look, "cpu")
 
 
 if __name__ == "__main__":

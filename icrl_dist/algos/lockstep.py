@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from icrl_dist.algos.replay import Transitions
-from icrl_dist.algos.stacked import Buffers, Perceptrons, Shape
+from icrl_dist.algos.stacked import ALIGNED, Buffers, Perceptrons, Shape
 from icrl_dist.games import SACConfig
 from icrl_dist.optimisers import Adam
 
@@ -50,13 +50,29 @@ def draw(output: Float[Tensor, "G R O"], noise: Float[Tensor, "G R A"]) -> Drawn
     return Drawn(actions, log_likelihood, inner, scaled * free, free)
 
 
+def apart(numbers: Float[Tensor, " G"]) -> Float[Tensor, " G"]:
+    """The numbers in cache lines of their own.
+
+    Fused Adam rounds what is left over after whole vectors otherwise: which of G numbers in a row that
+    is depends on G.
+    """
+    lines = torch.zeros(len(numbers), ALIGNED, device=numbers.device)
+    lines[:, 0] = numbers
+    return lines[:, 0]
+
+
+def _lines(numbers: Float[Tensor, " G"]) -> Float[Tensor, "G L"]:
+    """The cache lines of numbers that are ``apart``; what else is in them is 0 and stays 0."""
+    return numbers.as_strided((len(numbers), ALIGNED), (ALIGNED, 1))
+
+
 class Lockstep:
     """G experts that are updated together; their parameters and moments stay where they are."""
 
     def __init__(
         self, arrays: Mapping[str, Tensor], actor: Shape, critic: Shape, config: SACConfig, dtype: torch.dtype
     ) -> None:
-        """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place."""
+        """``arrays`` are those of ``SACBatch.arrays``, of G experts, and are changed in place; temperatures lie ``apart``."""
         experts, device = len(arrays["actor"]), arrays["actor"].device
         self._config, self._arrays = config, arrays
         both = {name: arrays[name].view(2 * experts, -1) for name in ("critic", "target")}
@@ -64,14 +80,15 @@ class Lockstep:
         self._critic = Perceptrons(critic, both["critic"], dtype)
         self._target = Perceptrons(critic, both["target"], dtype)
         self._log_temperature = arrays["log_temperature"]
-        self._temperature_gradient = torch.zeros_like(self._log_temperature)
+        temperature_lines = _lines(self._log_temperature)
+        self._temperature_gradient = torch.zeros_like(temperature_lines)
         self._actor_buffers = Buffers(actor, experts, 2 * config.batch, dtype, device)
         self._critic_buffers = Buffers(critic, 2 * experts, config.batch, dtype, device)
         self._output_gradient = torch.empty(experts, config.batch, actor.sizes[-1], device=device)
         self._counts: list[Tensor] = []
         self._actor_adam = self._adam(
             ("actor", self._actor.flat, self._actor.gradient, config.actor_rate),
-            ("log_temperature", self._log_temperature, self._temperature_gradient, config.temperature_rate),
+            ("log_temperature", temperature_lines, self._temperature_gradient, config.temperature_rate),
         )
         self._critic_adam = self._adam(("critic", self._critic.flat, self._critic.gradient, config.critic_rate))
 
@@ -82,7 +99,8 @@ class Lockstep:
         for name, numbers, gradient, _ in parts:
             numbers.grad = gradient
             self._counts.append(torch.zeros((), device=numbers.device))
-            moments = {moment: self._arrays[f"{name}/{moment}"].view_as(numbers) for moment in MOMENTS}
+            moments = {moment: self._arrays[f"{name}/{moment}"] for moment in MOMENTS}
+            moments = {m: _lines(own) if own.dim() == 1 else own.view_as(numbers) for m, own in moments.items()}
             made.state[numbers] = {"step": self._counts[-1], **moments}
         return made
 
@@ -135,7 +153,7 @@ class Lockstep:
         mean.copy_(by_u)
         torch.sub(by_u * now.scaled, weight * now.free, out=deviation)
         self._actor.backward(self._actor_buffers, self._output_gradient)
-        torch.neg(now.log_likelihood.mean(1) - actions, out=self._temperature_gradient)
+        torch.neg(now.log_likelihood.mean(1) - actions, out=self._temperature_gradient[:, 0])
         self._actor_adam.step()
         self._actor.refresh()
 

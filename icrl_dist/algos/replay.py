@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -57,13 +57,12 @@ class Replay:
         self._rows[:, self.added % capacity] = row
         self.added += 1
 
-    def sample(self, batch: int, generator: torch.Generator) -> Transitions:
-        """``batch`` transitions of each expert, each drawn alone, with replacement.  Raises IndexError if there are none."""
+    def take(self, picks: Int[Tensor, "N B"]) -> Transitions:
+        """Transitions of each expert, by any numbers: modulo those that there are.  Raises IndexError if there are none."""
         if not self.added:
-            raise IndexError("nothing to sample from: add transitions first")
-        experts, _, width = self._rows.shape
-        drawn = torch.randint(len(self), (experts, batch), generator=generator, device=self._rows.device)
-        rows = self._rows.view(-1, width).index_select(0, (drawn + self._first).flatten())
+            raise IndexError("nothing to take: add transitions first")
+        (experts, batch), width = picks.shape, self._rows.shape[2]
+        rows = self._rows.view(-1, width).index_select(0, (picks % len(self) + self._first).flatten())
         observations, actions, rewards, following = torch.split_with_sizes(
             rows.view(experts, batch, width), self._widths, dim=2
         )

@@ -1,8 +1,9 @@
 """Soft actor-critic for N experts of one shape in lockstep: one product a layer for all of them.
 
 The mathematics, step for step, is that of ``stable_baselines3.SAC.train``; tests hold both together
-from the same weights, batches and noise.  Each expert has its own losses: their sum is descended,
-never their mean, so an expert learns the same in any company.
+from the same weights, batches and noise.  Each expert has its own losses (their sum is descended,
+never their mean) and its own chance, so an expert becomes the same in any company; on a CPU to the bit,
+if batches are of a multiple of 16 transitions.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
-from icrl_dist.algos import sb3
+from icrl_dist.algos import chance, sb3
+from icrl_dist.algos.chance import Chance
 from icrl_dist.algos.graphed import Graphed
-from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep
+from icrl_dist.algos.lockstep import MOMENTS, TRAINED, Lockstep, apart
 from icrl_dist.algos.reference import Reference
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.stacked import Shape, outputs
@@ -45,22 +47,22 @@ class SACBatch:
 
     def __init__(
         self,
-        experts: int,
+        seeds: Sequence[int],
         spec: Spec,
         config: SACConfig,
-        seed: int,
         device: str = "auto",
         products: Products = "float32",
         capacity: int | None = None,
         graph: bool = True,
         by: By = "lockstep",
     ) -> None:
-        """``seed`` draws the first parameters, the same on every device; ``products`` are of float32 or
+        """An expert for each seed, which draws its first parameters; ``products`` are of float32 or
         bfloat16 numbers, parameters and Adam of float32; ``capacity`` of the replay is ``config.replay``
         if not given; on a GPU an update is a CUDA graph, unless ``graph`` is false.  ``by``
         stable-baselines3 is one expert's, float32 on the CPU.  Raises ValueError for discrete
         actions, no expert, or what stable-baselines3 has not.
         """
+        experts = len(seeds)
         if spec.discrete or experts < 1:
             raise ValueError(f"SAC: {experts} experts, discrete = {spec.discrete}: at least 1, and actions in [-1, 1]^A")
         self.experts, self.spec, self.config, self.device = experts, spec, config, pick(device)
@@ -70,17 +72,17 @@ class SACBatch:
         S, A = spec.observation, spec.actions
         self.actor_shape = Shape((S, *config.hidden, 2 * A))
         self.critic_shape = Shape((S + A, *config.hidden, 1))
-        generator = torch.Generator().manual_seed(seed)
-        actor = self.actor_shape.draw(experts, generator)
-        critic = self.critic_shape.draw(2 * experts, generator).view(experts, 2, -1)
+        generators = [chance.generator(seed, chance.FIRST) for seed in seeds]
+        critic = torch.stack([self.critic_shape.draw(2, own) for own in generators])
         first = {
-            "actor": actor,
+            "actor": torch.cat([self.actor_shape.draw(1, own) for own in generators]),
             "critic": critic,
             "target": critic.clone(),
             "log_temperature": torch.full((experts,), config.temperature).log(),
         }
         first |= {f"{name}/{moment}": torch.zeros_like(first[name]) for name in TRAINED for moment in MOMENTS}
-        self.arrays: dict[str, Tensor] = {name: array.to(self.device) for name, array in first.items()}
+        placed = {name: array.to(self.device) for name, array in first.items()}
+        self.arrays: dict[str, Tensor] = {name: apart(one) if one.dim() == 1 else one for name, one in placed.items()}
         """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
         self._updater = updater = self._made_by(by, products)
@@ -104,20 +106,18 @@ class SACBatch:
 
     @torch.no_grad()
     def act(
-        self, observations: Float[np.ndarray, "N *E S"], rng: np.random.Generator | None, deterministic: bool = False
+        self, observations: Float[np.ndarray, "N *E S"], normal: Float32[np.ndarray, "N *E A"] | None = None
     ) -> Float32[np.ndarray, "N *E A"]:
-        """Actions in [-1, 1] of each expert in its environment, or in its E environments.
+        """Actions in [-1, 1] of each expert in its environment, or in its E environments: the mean squashed.
 
-        ``rng`` draws them unless ``deterministic``, which gives the mean squashed.
+        With standard ``normal`` noise an action that is drawn.
         """
         flat = np.array(observations, np.float32).reshape(self.experts, -1, self.spec.observation)
         given = torch.from_numpy(flat).to(self.device)
         mean, spread = outputs(self.actor_shape, self.arrays["actor"], given).chunk(2, dim=2)
-        if not deterministic:
-            if rng is None:
-                raise ValueError("act: rng = None draws no actions: give a generator, or deterministic=True")
-            normal = torch.from_numpy(rng.standard_normal(mean.shape, dtype=np.float32)).to(self.device)
-            mean = mean + normal * spread.clamp(-20.0, 2.0).exp()
+        if normal is not None:
+            noise = torch.from_numpy(normal.reshape(mean.shape)).to(self.device)
+            mean = mean + noise * spread.clamp(-20.0, 2.0).exp()
         chosen: np.ndarray = mean.tanh().cpu().numpy()
         return chosen.reshape(*np.shape(observations)[:-1], self.spec.actions)
 
@@ -135,11 +135,9 @@ class SACBatch:
         self.replay.add(*(torch.from_numpy(np.array(column)) for column in columns))
         self.steps += 1
 
-    def learn(self, generator: torch.Generator) -> None:
-        """One update from the replay; ``generator``, on the experts' device, draws batch and noise."""
-        batch = self.replay.sample(self.config.batch, generator)
-        size = (2, self.experts, self.config.batch, self.spec.actions)
-        self.update(batch, torch.randn(size, generator=generator, device=self.device))
+    def learn(self, picks: Int[Tensor, "N B"], noise: Float[Tensor, "2 N B A"]) -> None:
+        """One update from the replay: by the transitions with these numbers."""
+        self.update(self.replay.take(picks), noise)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that further training depends on, as plain arrays."""
@@ -190,7 +188,7 @@ def train(
     env: Batch,
     config: SACConfig,
     steps: int,
-    seed: int,
+    seeds: Sequence[int],
     progress: Callable[[SACBatch, Float[np.ndarray, " N"]], None] = lambda experts, returns: None,
     device: str = "auto",
     products: Products = "float32",
@@ -199,40 +197,44 @@ def train(
 ) -> SACBatch:
     """An expert for each of the N environments of ``env``, after ``steps`` steps in it.
 
-    ``progress`` hears the experts and their returns after every episode.  All draws are keyed by
-    ``seed`` and the episode: from a ``state`` that was taken in ``progress`` training goes on as if
-    it had never stopped.  On a CPU give torch one thread: two are slower.  Raises ValueError for a
-    state within an episode, FloatingPointError if an expert's weights stop being numbers.
+    ``progress`` hears the experts and their returns after every episode.  All draws are keyed by an
+    expert's seed and the episode: from a ``state`` that was taken in ``progress`` training goes on as if
+    it had never stopped.  On a CPU give torch one thread: two are slower.  Raises ValueError for another
+    number of seeds and for a state within an episode, FloatingPointError if an expert's weights stop being
+    numbers.
     """
     horizon = env.spec.horizon
-    experts = SACBatch(env.batch, env.spec, config, seed, device, products, min(config.replay, steps), by=by)
+    if len(seeds) != env.batch:
+        raise ValueError(f"{len(seeds)} seeds for {env.batch} environments: give one for each")
+    experts = SACBatch(seeds, env.spec, config, device, products, min(config.replay, steps), by=by)
     if state is not None:
         experts.load(state)
     if experts.steps % horizon:
         raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon}: take it in `progress`")
     while experts.steps < steps:
-        episode, total = experts.steps // horizon, np.zeros(experts.experts)
-        rng, *rngs = (np.random.default_rng(_key(seed, episode, row)) for row in range(experts.experts + 1))
-        generator = torch.Generator(experts.device).manual_seed(int(_key(seed, episode).generate_state(1, np.uint64)[0] >> 1))
-        seen = np.asarray(env.reset(rngs), np.float32)
-        for _ in range(min(horizon, steps - experts.steps)):
+        first, total = experts.steps, np.zeros(experts.experts)
+        last = min(first + horizon, steps)
+        learning = [step for step in range(first + 1, last + 1) if step > config.warmup and step % config.update_every == 0]
+        drawn = Chance(seeds, first // horizon, env.spec, config, len(learning), experts.device)
+        updates = iter(drawn.updates)
+        seen = np.asarray(env.reset(drawn.starts), np.float32)
+        for number in range(last - first):
             if experts.steps < config.random_steps:
-                action = rng.uniform(-1, 1, (experts.experts, env.spec.actions)).astype(np.float32)
+                action = drawn.uniform[number].astype(np.float32)
             else:
-                action = experts.act(seen, rng)
+                action = experts.act(seen, drawn.normal[number])
+                _need_numbers(action, experts.steps)
             step = env.step(action)
             experts.remember(seen, action, step)
-            if experts.steps > config.warmup and experts.steps % config.update_every == 0:
-                experts.learn(generator)
+            if experts.steps in learning:
+                experts.learn(*next(updates))
             seen, total = step.observation, total + step.reward
-        lost = [i for i, row in enumerate(experts.arrays["actor"]) if not row.isfinite().all()]
-        if lost:
-            raise FloatingPointError(
-                f"weights of experts {lost} are not numbers at step {experts.steps}: lower the learning rates"
-            )
+        _need_numbers(experts.arrays["actor"].cpu().numpy(), experts.steps)
         progress(experts, total)
     return experts
 
 
-def _key(*key: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence(key[0], spawn_key=key[1:])
+def _need_numbers(of: Float32[np.ndarray, "N *_"], steps: int) -> None:
+    lost = [number for number, own in enumerate(of) if not np.isfinite(own).all()]
+    if lost:
+        raise FloatingPointError(f"weights of experts {lost} are not numbers at step {steps}: lower the learning rates")

@@ -58,6 +58,13 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
             f"{path} holds an expert of {found[0]} observations, {found[1]} actions and hidden layers {found[2]}, "
             f"not {spec.observation}, {spec.actions} and {config.hidden}: load it into its own shape"
         )
+    acts: Any = model.action_space
+    bounds, between = (acts.low, acts.high), model.policy.activation_fn
+    if between is not nn.ReLU or (bounds[0] != -1).any() or (bounds[1] != 1).any():
+        raise ValueError(
+            f"{path} holds an expert with {between.__name__} between its layers and actions from {bounds[0].tolist()} to "
+            f"{bounds[1].tolist()}: only ReLU and actions in [-1, 1] can go on here"
+        )
     actor, critic = (torch.zeros(shape.parameters) for shape in shapes)
     arrays = {"actor": actor, "critic": torch.stack([critic, critic]), "log_temperature": torch.zeros(())}
     arrays |= {f"{name}/{moment}": torch.zeros_like(arrays[name]) for name in TRAINED for moment in MOMENTS}

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_ALIGNED = 16  # numbers: a cache line of float32
+ALIGNED = 16
+"""Numbers of float32 in a cache line."""
 
 Layer = tuple[Float[Tensor, "M I O"], Float[Tensor, "M 1 O"]]
 """Weights and bias of one layer."""
@@ -26,7 +27,7 @@ class Shape:
         self.sizes = tuple(sizes)
         """Numbers in, numbers in each hidden layer, numbers out."""
         used = sum((rows + 1) * columns for rows, columns in zip(self.sizes, self.sizes[1:], strict=False))
-        self.parameters = -(-used // _ALIGNED) * _ALIGNED
+        self.parameters = -(-used // ALIGNED) * ALIGNED
         """Length of a row, P; what is left over at its end is 0 and stays 0."""
 
     def layers(self, flat: Float[Tensor, "M P"]) -> list[Layer]:

@@ -182,17 +182,17 @@ def _expert(kind: str, config: SACConfig, report: Report) -> Make:
     variations = tuple(Variation(task) for task in problems.grid(kind, 2))
     told = itertools.count(1)
 
-    def tell(text: str, note: bool = False) -> None:
+    def tell(text: str, note: bool = False, reached: int = 0) -> None:
         if note or next(told) % 10 == 0:
             report(f"{kind}: {text}")
 
     asked = (*histories.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
     for _ in train_expert(Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, asked, len(variations)), "bench", tell):
         pass  # what is wanted is in the cache
-    found = [history for one in variations if (history := histories.kept(one, config, 0)) is not None]
+    found = [history for one in variations if (history := histories.any_kept(one, config, 0)) is not None]
     if len(found) < len(variations):
         raise ConfigError(f"sac.cache = {config.cache!r}: the experts that were trained are not there; name a folder")
-    return lambda env: ExpertPolicy([one for one in found for _ in range(env.batch // len(found))], env.spec, config)
+    return lambda env: ExpertPolicy([one for one in found for _ in range(env.batch // len(found))], config)
 
 
 def _keep(row: dict[str, Any]) -> None:

@@ -121,18 +121,18 @@ def policy(kind: str, config: SACConfig, report: Report) -> Make:
     if kind == pick_place.KIND:
         return ToldTheGoal
     history = expert(kind, config, report)
-    return lambda env: ExpertPolicy([history] * env.batch, env.spec, config)
+    return lambda env: ExpertPolicy([history] * env.batch, config)
 
 
 def expert(kind: str, config: SACConfig, report: Report) -> History:
     """The undisturbed expert of the problem's nominal task, from the cache or of a training."""
     variation = Variation(problems.task(kind))
-    found = histories.kept(variation, config, 0)
+    found = histories.any_kept(variation, config, 0)
     if found is None:
         report(f"{kind}: an expert trains for {config.steps:,} steps")
         told = itertools.count(1)
 
-        def tell(text: str, note: bool = False) -> None:
+        def tell(text: str, note: bool = False, reached: int = 0) -> None:
             if note or next(told) % 10 == 0:
                 report(f"{kind}: {text}")
 
@@ -140,7 +140,7 @@ def expert(kind: str, config: SACConfig, report: Report) -> History:
         job = Job("train_expert", "pretrain", 0, 0, (variation,), 1, -1, 0, asked)
         for _ in train_expert(job, "bench", tell):
             pass  # what is wanted is in the cache
-        found = histories.kept(variation, config, 0)
+        found = histories.any_kept(variation, config, 0)
     if found is None:
         raise ConfigError(
             f"sac.cache = {config.cache!r}: the expert that was trained is not there; name a folder that keeps it"

@@ -6,6 +6,7 @@ Both on one core, taking turns, batches drawn from a full replay and noise inclu
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
+from icrl_dist.algos.chance import of_updates
 from icrl_dist.algos.sac_batch import Products, SACBatch
 from icrl_dist.algos.sb3 import blank
 from icrl_dist.games import SACConfig
@@ -92,15 +94,15 @@ def _seconds(update: Callable[[int], None], count: int) -> float:
 def lockstep(sizes: Sizes, products: Products, device: str = "cpu", graph: bool = True) -> Callable[[int], None]:
     """So many updates of our experts."""
     config = sizes.config
-    experts = SACBatch(sizes.experts, SPEC, config, 0, device, products, None, graph)
+    experts = SACBatch(range(sizes.experts), SPEC, config, device, products, None, graph)
     remembered = [_remembered(np.random.default_rng((0, index)), config.replay) for index in range(sizes.experts)]
     rows = np.stack([np.concatenate(columns, axis=1) for columns in remembered])
     experts.replay.load({"rows": rows, "added": np.array(config.replay)})
-    generator = torch.Generator(experts.device).manual_seed(0)
+    episodes, shape = itertools.count(), (config.batch, SPEC.actions)
 
     def update(count: int) -> None:
-        for _ in range(count):
-            experts.learn(generator)
+        for picks, noise in of_updates(range(sizes.experts), next(episodes), shape, count, experts.device):
+            experts.learn(picks, noise)
 
     return update
 

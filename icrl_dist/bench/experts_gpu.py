@@ -16,13 +16,14 @@ import numpy as np
 import torch
 
 from icrl_dist import envs
+from icrl_dist.algos.chance import Chance
 from icrl_dist.algos.sac_batch import Products, SACBatch, pick, train
 from icrl_dist.bench.experts import REMEMBERED, Sizes, alone, lockstep
 from icrl_dist.config import ConfigError, load
 from icrl_dist.envs import Batch, tasks
 from icrl_dist.games import SACConfig
 
-SIZES = Sizes(160, SACConfig(replay=REMEMBERED), 20, 12)
+SIZES = Sizes(160, SACConfig(replay=REMEMBERED), 60, 12)
 LEAST = 300.0
 """Aggregate updates a second over stable-baselines3's on one core, below which the benchmark fails."""
 PAPER = "dmc-cartpole-balance"
@@ -120,7 +121,7 @@ def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) 
         _wait(device)
         marks.append((experts.steps, time.perf_counter()))
 
-    experts = train(env, config, config.warmup + max(steps, 3 * horizon), 0, progress, str(device))
+    experts = train(env, config, config.warmup + max(steps, 3 * horizon), range(env.batch), progress, str(device))
     warm, warm_end = next(mark for mark in marks if mark[0] >= config.warmup)
     first, first_end = next(mark for mark in marks if mark[0] >= config.warmup + horizon)
     last, last_end = marks[-1]
@@ -142,8 +143,8 @@ def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) 
 
 def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.device) -> dict[str, float]:
     """Seconds a step of each part of one more episode, the device idle before and after each."""
-    rng, generator = np.random.default_rng(0), torch.Generator(device).manual_seed(0)
-    spent = dict.fromkeys(("environment", "act", "remember", "update"), 0.0)
+    spent = dict.fromkeys(("draw", "environment", "act", "remember", "update"), 0.0)
+    count, horizon = -(-env.spec.horizon // config.update_every), env.spec.horizon
 
     @contextlib.contextmanager
     def timed(part: str) -> Iterator[None]:
@@ -152,19 +153,22 @@ def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.devic
         _wait(device)
         spent[part] += time.perf_counter() - began
 
-    seen = np.asarray(env.reset([np.random.default_rng((0, row)) for row in range(env.batch)]), np.float32)
-    for number in range(env.spec.horizon):
+    with timed("draw"):
+        drawn = Chance(range(env.batch), experts.steps // horizon, env.spec, config, count, device)
+    updates = iter(drawn.updates)
+    seen = np.asarray(env.reset(drawn.starts), np.float32)
+    for number in range(horizon):
         with timed("act"):
-            action = experts.act(seen, rng)
+            action = experts.act(seen, drawn.normal[number])
         with timed("environment"):
             step = env.step(action)
         with timed("remember"):
             experts.remember(seen, action, step)
         if number % config.update_every == 0:
             with timed("update"):
-                experts.learn(generator)
+                experts.learn(*next(updates))
         seen = step.observation
-    return {part: seconds / env.spec.horizon for part, seconds in spent.items()}
+    return {part: seconds / horizon for part, seconds in spent.items()}
 
 
 def _elapsed(update: Callable[[int], None], count: int, device: torch.device) -> float:

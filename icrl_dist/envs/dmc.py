@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from icrl_dist.envs.network import Networks
-from icrl_dist.envs.problems import AXES, HORIZON, Preset, problem, spec
+from icrl_dist.envs.problems import AXES, HORIZON, Preset, check, problem, spec
 from icrl_dist.envs.suite import BROKEN, DOMAINS, Rows, check_step, drawn, observed
 from icrl_dist.types import Step, Task, Variation
 
@@ -38,6 +38,8 @@ class DMC:
         shapes = {(one.kind, one.get("horizon", HORIZON), one.get("forces", "paper")) for one in tasks}
         if len(shapes) != 1:
             raise ValueError(f"dmc: one batch holds one problem, horizon and preset of forces, not {sorted(map(str, shapes))}")
+        for one in tasks:
+            check(one)
         self.spec, self.batch = spec(tasks[0]), len(tasks)
         self._problem = problem(tasks[0].kind)
         preset: Preset = "qarl" if tasks[0].get("forces", "paper") == "qarl" else "paper"

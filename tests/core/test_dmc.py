@@ -277,6 +277,9 @@ def test_what_does_not_fit_the_game_is_refused_with_the_remedy():
     cheetah, walker = problems.task("dmc-cheetah-run"), problems.task("dmc-walker-run")
     with pytest.raises(ValueError, match="one problem, horizon and preset"):
         dmc.DMC([cheetah, walker])
+    for wrong in (Task.of("dmc-cheetah-run", torso_mass=1000.0), Task.of("dmc-cheetah-run", torso_mas=1.0)):
+        with pytest.raises(ValueError, match="torso_mas"):
+            dmc.DMC([cheetah, wrong])
     with pytest.raises(ValueError, match=r"5 inputs and 2 outputs: this game has 17.*6 of disturbance"):
         envs.batch([Variation(cheetah, network.network(0, 5, 2))])
     with pytest.raises(ValueError, match=r"'dirichlet'.*null and network"):

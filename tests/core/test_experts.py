@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist import context, envs, experts, histories, jobs, pretrain, rollout
+from icrl_dist import context, envs, evaluate, experts, heldout, histories, jobs, pretrain, rollout
 from icrl_dist.algos import sac_batch
-from icrl_dist.config import AdversaryConfig
+from icrl_dist.config import AdversaryConfig, ConfigError, validate
 from icrl_dist.envs import metaworld, tasks
 from icrl_dist.envs.network import Networks
 from icrl_dist.experts import ExpertPolicy, ScriptedPolicy
@@ -57,7 +57,7 @@ def test_contexts_are_episodes_of_the_training_and_labels_what_its_expert_would_
     job = asked(run)[0]
     sent = list(jobs.do(job, None, "w"))
     assert [t.identity for t in sent] == list(job.identities())
-    found = [histories.kept(v, run.sac, run.seed) for v in job.variations]
+    found = [histories.any_kept(v, run.sac, run.seed) for v in job.variations]
     for t in sent:
         row = job.variations.index(t.variation)
         history = found[row]
@@ -67,7 +67,7 @@ def test_contexts_are_episodes_of_the_training_and_labels_what_its_expert_would_
             np.testing.assert_array_equal(getattr(t, name), getattr(history, name)[number])
         states = history.observations[:, :-1].reshape(-1, 6)
         assert all((states == query).all(axis=1).any() for query in t.queries) and len(t.queries) == 6
-        policy = ExpertPolicy([history] * 6, envs.spec(t.variation.task), run.sac)
+        policy = ExpertPolicy([history] * 6, run.sac)
         np.testing.assert_allclose(t.labels, policy.act(t.queries, np.zeros((6, 2))), atol=1e-5)
         pushes = Networks([t.variation.adversary] * HORIZON, envs.spec(t.variation.task), 2).act(t.observations[:-1])
         np.testing.assert_allclose(t.adversary, pushes, atol=1e-6)
@@ -85,7 +85,7 @@ def test_the_same_job_gives_the_same_bytes_with_or_without_a_cache(run, tmp_path
     assert digests(jobs.do(asked(other)[0], None, "w")) != here
 
 
-def test_nothing_is_trained_that_is_in_the_cache_and_all_of_it_if_something_is_not(run, monkeypatch, caplog):
+def test_nothing_is_trained_that_is_in_the_cache(run, monkeypatch, caplog):
     trained = []
     real = sac_batch.train
     monkeypatch.setattr(sac_batch, "train", lambda env, *rest, **more: trained.append(env.batch) or real(env, *rest, **more))
@@ -93,30 +93,61 @@ def test_nothing_is_trained_that_is_in_the_cache_and_all_of_it_if_something_is_n
     first = digests(jobs.do(job, None, "w"))
     assert trained == [4]
     assert digests(jobs.do(dataclasses.replace(job, trials=2), None, "w")) != first and trained == [4]
-    file = histories.file(run.sac, histories.key(job.variations[2], run.sac, run.seed))
+    file = histories.file(run.sac, histories.key(job.variations[2], run.sac, run.seed, "lockstep"))
     whole = file.read_bytes()
     for damage in (whole[: len(whole) // 2], b"nothing"):
         file.write_bytes(damage)
         assert digests(jobs.do(job, None, "w")) == first
-    assert trained == [4, 4, 4] and "made anew" in caplog.text and file.read_bytes() == whole
+    assert trained == [4, 1, 1] and "made anew" in caplog.text and file.read_bytes() == whole
+
+
+def test_what_one_method_trained_another_takes_and_ends_with_the_bytes_of_its_own(run, monkeypatch, tmp_path):
+    """DPT has the undisturbed ones of ICAG's experts, in other company."""
+    trained, real = [], sac_batch.train
+    monkeypatch.setattr(sac_batch, "train", lambda env, *rest, **more: trained.append(env.batch) or real(env, *rest, **more))
+    alone = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=str(tmp_path / "other")))
+    own = [digests(jobs.do(job, None, "w")) for job in asked(alone, "dpt")]
+    assert trained == [2, 2]
+    for job in asked(run, "icag"):
+        list(jobs.do(job, None, "w"))
+    assert trained == [2, 2, 4, 4]
+    assert [digests(jobs.do(job, None, "w")) for job in asked(run, "dpt")] == own and trained == [2, 2, 4, 4]
+
+
+def test_a_history_gives_no_more_episodes_than_its_training_had_and_all_of_them_if_they_are_asked_for(run, monkeypatch):
+    monkeypatch.setattr(histories, "KEPT", 6)
+    many = dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, contexts=8 * 30))
+    job = asked(many)[0]
+    assert job.trials == EPISODES
+    sent = list(jobs.do(job, None, "w"))
+    assert len({t.actions.tobytes() for t in sent}) == len(sent) == 4 * EPISODES
+    few = asked(run)[0]
+    assert few.trials == 3
+    list(jobs.do(few, None, "w"))
+    assert len(histories.kept(few.variations[0], run.sac, run.seed, "lockstep").rewards) == 6
 
 
 def test_what_decides_a_history_decides_where_it_is_kept(run, monkeypatch):
     job = asked(run)[0]
-    one = histories.key(job.variations[0], run.sac, 0)
+    one = histories.key(job.variations[0], run.sac, 0, "lockstep")
     changed = [
-        histories.key(job.variations[1], run.sac, 0),
-        histories.key(job.variations[2], run.sac, 0),
-        histories.key(job.variations[0], run.sac, 1),
+        histories.key(job.variations[1], run.sac, 0, "lockstep"),
+        histories.key(job.variations[2], run.sac, 0, "lockstep"),
+        histories.key(job.variations[0], run.sac, 1, "lockstep"),
+        histories.key(job.variations[0], run.sac, 0, "stable-baselines3"),
         *(
-            histories.key(job.variations[0], dataclasses.replace(run.sac, **{name: value}), 0)
+            histories.key(job.variations[0], dataclasses.replace(run.sac, **{name: value}), 0, "lockstep")
             for name, value in {"hidden": (8, 9), "gamma": 0.5, "steps": 400, "update_every": 3}.items()
         ),
     ]
     assert len({one, *changed}) == 1 + len(changed)
-    assert histories.key(job.variations[0], dataclasses.replace(run.sac, cache="/elsewhere"), 0) == one
-    monkeypatch.setattr(histories.metadata, "version", lambda name: "0")
-    assert histories.key(job.variations[0], run.sac, 0) != one, "other physics is other data"
+    again = histories.key(job.variations[0], dataclasses.replace(run.sac, cache="/elsewhere"), 0, "lockstep")
+    assert again == one
+    with monkeypatch.context() as patched:
+        patched.setattr(histories.metadata, "version", lambda name: "0")
+        assert histories.key(job.variations[0], run.sac, 0, "lockstep") != one, "other physics is other data"
+    monkeypatch.setattr(histories.code, "digest_of", lambda parts: "other")
+    assert histories.key(job.variations[0], run.sac, 0, "lockstep") != one, "so is other code"
 
 
 class KilledError(Exception):
@@ -172,8 +203,25 @@ def test_episodes_that_broke_down_are_no_data(run, monkeypatch, always):
             list(jobs.do(job, None, "w"))
         return
     list(jobs.do(job, None, "w"))
-    lengths = [len(histories.kept(v, run.sac, run.seed).rewards) for v in job.variations]
+    lengths = [len(histories.any_kept(v, run.sac, run.seed).rewards) for v in job.variations]
     assert lengths == [EPISODES, EPISODES - 2, EPISODES, EPISODES - 2]
+
+
+def test_an_evaluation_counts_what_broke_down_and_says_whose_expert_is_missing(run, monkeypatch, tmp_path):
+    run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, episodes=3, seeds=1, p=(0.0, 1.0)))
+    real = envs.batch
+    monkeypatch.setattr(evaluate.envs, "batch", lambda variations: Breaking(real(variations), False))
+    results = evaluate.online(run, {"random": evaluate.random_vectors})
+    assert [result.broken for result in results] == [4, 4] and results[0].row()["broken"] == 4
+    monkeypatch.undo()
+    assert "broken" not in evaluate.online(run, {"random": evaluate.random_vectors})[0].row()
+    assert "4 of the evaluated tasks" in heldout._no_expert(run, tmp_path)
+    assert f"`icrl-dist train experts-{tmp_path}/run.toml --out OTHER` trains them" in heldout._no_expert(run, tmp_path)
+    list(jobs.do(asked(run)[0], None, "w"))
+    assert "2 of the evaluated tasks" in heldout._no_expert(run, tmp_path)
+    assert evaluate.expert(run, tasks.evaluated(run)) is None
+    list(jobs.do(asked(run)[1], None, "w"))
+    assert evaluate.expert(run, tasks.evaluated(run)) is not None
 
 
 def test_a_rollout_that_broke_down_is_no_data(run, monkeypatch):
@@ -226,15 +274,15 @@ def test_in_meta_world_the_scripted_policy_labels_what_it_alone_sees_whole(small
 def test_experts_act_each_in_its_row(run):
     torch.manual_seed(0)
     spec = envs.spec(tasks.split(run).train[0])
-    batch = sac_batch.SACBatch(3, spec, run.sac, 0, "cpu")
+    batch = sac_batch.SACBatch(range(3), spec, run.sac, "cpu")
     shapes = dict.fromkeys(("actions", "adversary", "labels", "led_actions", "led_labels"), (0, 1, 2))
-    shapes |= {"rewards": (0, 1), "led_rewards": (0, 1), "observations": (0, 2, 2), "led_observations": (0, 2, 2)}
+    shapes |= {"rewards": (0, 1), "led_rewards": (0, 1), "observations": (0, 2, 6), "led_observations": (0, 2, 6)}
     empty = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     actors = batch.arrays["actor"].numpy()
-    made = [History(**empty, led_wrong=np.zeros(0, bool), actor=actor) for actor in actors]
-    policy = ExpertPolicy(made, spec, run.sac)
+    made = [History(**empty, actor=actor) for actor in actors]
+    policy = ExpertPolicy(made, run.sac)
     seen = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
-    np.testing.assert_allclose(policy.act(seen, np.zeros((3, 2))), batch.act(seen, None, deterministic=True), atol=1e-6)
+    np.testing.assert_allclose(policy.act(seen, np.zeros((3, 2))), batch.act(seen), atol=1e-6)
 
 
 def test_the_scripted_policy_acts_by_the_truth_of_the_environment_that_it_met():
@@ -254,13 +302,13 @@ def envs_variation():
 
 def test_a_training_says_how_far_it_is_and_a_cache_what_it_saved(run):
     job, heard = asked(run)[0], []
-    tell = lambda text, note=False: heard.append((text, note))  # noqa: E731
+    tell = lambda text, note=False, reached=0: heard.append((text, note, reached))  # noqa: E731
     list(jobs.do(job, None, "w", tell))
     assert len(heard) == EPISODES and heard[4][0].startswith("4 experts at 100 of 200 steps, mean return ")
-    assert not any(note for _, note in heard)
+    assert not any(note for _, note, _ in heard) and [reached for *_, reached in heard] == list(range(20, 201, 20))
     heard.clear()
     list(jobs.do(job, None, "w", tell))
-    assert heard == [(f"{job.label}: 4 experts from the cache, 800 steps of SAC saved", True)]
+    assert heard == [(f"{job.label}: 4 experts from the cache, 800 steps of SAC saved", True, 0)]
 
 
 @pytest.fixture
@@ -270,40 +318,37 @@ def stretched(run):
     return dataclasses.replace(run, model=model, pretrain=pretrain, optim=dataclasses.replace(run.optim, stretches=2))
 
 
-def test_stretches_are_cut_from_episodes_that_experts_led_some_of_them_another_variations(stretched):
+def test_stretches_are_cut_from_episodes_that_experts_led_some_of_them_another_tasks(stretched):
     job = asked(stretched)[0]
     sent = list(jobs.do(job, None, "w"))
-    found = [histories.kept(v, stretched.sac, stretched.seed) for v in job.variations]
-    spec, led = envs.spec(job.variations[0].task), {False: 0, True: 0}
-    for row, history in enumerate(found):
-        assert history.led_wrong.tolist() == [False] * LED + [True] * LED
-        other = found[(row + 1) % len(found)]
-        for wrong, actor in ((False, history), (True, other)):
-            seen = history.led_observations[history.led_wrong == wrong][:, :-1].reshape(-1, 6)
-            acted = history.led_actions[history.led_wrong == wrong].reshape(-1, 2)
-            labels = history.led_labels[history.led_wrong == wrong].reshape(-1, 2)
-            for array, expert in ((acted, actor), (labels, history)):
-                right = ExpertPolicy([expert] * len(seen), spec, stretched.sac).act(seen, np.zeros((len(seen), 2)))
-                np.testing.assert_allclose(array, right, atol=1e-5)
+    found = [histories.any_kept(v, stretched.sac, stretched.seed) for v in job.variations]
+    policies = [ExpertPolicy([history] * 4, stretched.sac) for history in found]
+    unused, led = np.zeros((4, 2)), {False: 0, True: 0}
     for t in sent:
-        history = found[job.variations.index(t.variation)]
+        row = job.variations.index(t.variation)
+        own, other = policies[row], policies[(row + 2) % 4]  # two variations of each of two tasks
+        assert t.variation.task != job.variations[(row + 2) % 4].task
         assert len(t.queries) == 6 + 5 * 4 and len(t.taken) == 20
-        columns = (
-            t.queries[6:].reshape(5, 4, 6),
-            t.taken.reshape(5, 4, 2),
-            t.gained.reshape(5, 4),
-            t.labels[6:].reshape(5, 4, 2),
-        )
-        whole = history.led_observations[:, :-1]
-        for states, taken, gained, labels in zip(*columns, strict=True):
-            places = [(g, h) for g in range(len(whole)) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states).all()]
-            assert places, "no four states in a row of a led episode"
-            g, h = places[0]
-            np.testing.assert_array_equal(taken, history.led_actions[g, h : h + 4])
-            np.testing.assert_array_equal(gained, history.led_rewards[g, h : h + 4])
-            np.testing.assert_array_equal(labels, history.led_labels[g, h : h + 4])
-            led[bool(history.led_wrong[g])] += 1
+        states, taken, labels = t.queries[6:].reshape(5, 4, 6), t.taken.reshape(5, 4, 2), t.labels[6:].reshape(5, 4, 2)
+        whole = found[row].led_observations[:, :-1]
+        for n in range(5):
+            np.testing.assert_allclose(labels[n], own.act(states[n], unused), atol=1e-5)
+            misled = np.abs(taken[n] - labels[n]).max() > 1e-4
+            led[bool(misled)] += 1
+            np.testing.assert_allclose(taken[n], (other if misled else own).act(states[n], unused), atol=1e-5)
+            places = [(g, h) for g in range(LED) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states[n]).all()]
+            assert bool(places) != misled, "four states in a row of an episode that its own expert led, or of another"
+            if places:
+                g, h = places[0]
+                np.testing.assert_array_equal(t.gained.reshape(5, 4)[n], found[row].led_rewards[g, h : h + 4])
     assert min(led.values()) > 0.25 * sum(led.values())
+
+
+def test_nobody_can_be_misled_in_a_job_of_one_task(stretched):
+    alone = dataclasses.replace(stretched, stream=dataclasses.replace(stretched.stream, job_tasks=1))
+    with pytest.raises(ConfigError, match=r"pretrain\.misled = 0\.5: 0, or a stream\.job_tasks that leaves none"):
+        validate(alone, "x")
+    validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, misled=0.0)), "x")
 
 
 def test_a_model_of_vectors_trains_on_stretches_and_is_deployed_committed(stretched):

@@ -18,7 +18,7 @@ BY = "stable-baselines3"
 
 
 def test_its_updates_are_stable_baselines3s_own_and_the_engines_up_to_rounding(tmp_path, monkeypatch):
-    alone, engine = SACBatch(1, SPEC, SMALL, 0, "cpu", by=BY), SACBatch(1, SPEC, SMALL, 0, "cpu")
+    alone, engine = SACBatch([0], SPEC, SMALL, "cpu", by=BY), SACBatch([0], SPEC, SMALL, "cpu")
     alone.save_sb3(0, tmp_path / "before.zip")
     for batch, noise in drawn(SMALL, 10, experts=1):
         alone.update(batch, noise)
@@ -31,7 +31,7 @@ def test_its_updates_are_stable_baselines3s_own_and_the_engines_up_to_rounding(t
     for name, array in alone.arrays.items():
         torch.testing.assert_close(array[0], theirs[name], atol=1e-6, rtol=1e-4, msg=name)
         torch.testing.assert_close(array, engine.arrays[name], atol=2e-5, rtol=1e-3, msg=name)
-    moved = SACBatch(1, SPEC, SMALL, 0, "cpu")
+    moved = SACBatch([0], SPEC, SMALL, "cpu")
     assert all(not torch.equal(alone.arrays[name], array) for name, array in moved.arrays.items())
 
 
@@ -39,18 +39,18 @@ def test_its_training_goes_on_from_a_state_and_leaves_the_global_generators_alon
     kept = {}
     torch.manual_seed(3)
     before = torch.get_rng_state(), np.random.get_state()[1].tolist()
-    whole = train(Line(1), LINE, 35, 5, lambda e, _: kept.update({e.steps: e.state()}), "cpu", by=BY).state()
+    whole = train(Line(1), LINE, 35, [5], lambda e, _: kept.update({e.steps: e.state()}), "cpu", by=BY).state()
     assert torch.equal(before[0], torch.get_rng_state()) and before[1] == np.random.get_state()[1].tolist()
-    again = train(Line(1), LINE, 35, 5, device="cpu", state=kept[21], by=BY).state()
+    again = train(Line(1), LINE, 35, [5], device="cpu", state=kept[21], by=BY).state()
     assert whole["updates"] == 8 and not np.array_equal(kept[21]["actor"], whole["actor"])
     for name, array in whole.items():
         np.testing.assert_array_equal(again[name], array, err_msg=name)
 
 
-@pytest.mark.parametrize("more", [{"experts": 2}, {"products": "bfloat16"}])
+@pytest.mark.parametrize("more", [{"seeds": [0, 1]}, {"products": "bfloat16"}])
 def test_what_stable_baselines3_has_not_is_refused(more):
     with pytest.raises(ValueError, match=r"stable-baselines3: . experts.*take lockstep"):
-        SACBatch(**{"experts": 1, "spec": SPEC, "config": SMALL, "seed": 0, "device": "cpu", "by": BY, **more})
+        SACBatch(**{"seeds": [0], "spec": SPEC, "config": SMALL, "device": "cpu", "by": BY, **more})
 
 
 def test_a_job_of_one_expert_is_its_and_resumes_to_the_same_bytes_and_one_of_two_is_not(run, monkeypatch):  # noqa: F811

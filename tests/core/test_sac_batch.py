@@ -12,6 +12,7 @@ import torch
 from stable_baselines3.common.buffers import ReplayBufferSamples
 from stable_baselines3.common.logger import configure
 
+from icrl_dist.algos.chance import of_updates
 from icrl_dist.algos.lockstep import draw
 from icrl_dist.algos.replay import Replay, Transitions
 from icrl_dist.algos.sac import Expert
@@ -82,7 +83,7 @@ def opened(engine, index, path):
 
 @pytest.mark.parametrize(("updates", "actors", "critics"), [(1, 2e-6, 4e-5), (10, 6e-6, 4e-5), (50, 6e-4, 2e-4)])
 def test_updates_are_those_of_stable_baselines3(updates, actors, critics, tmp_path, monkeypatch):
-    engine = SACBatch(N, SPEC, PAPER, 0, "cpu")
+    engine = SACBatch(range(N), SPEC, PAPER, "cpu")
     models = []
     for index in (0, N - 1):
         engine.save_sb3(index, tmp_path / "before.zip")
@@ -100,7 +101,7 @@ def test_updates_are_those_of_stable_baselines3(updates, actors, critics, tmp_pa
 
 def test_the_gradients_are_each_experts_own_sum_and_no_mean(tmp_path, monkeypatch):
     """Adam's first steps hardly depend on a gradient's size; its moments do."""
-    engine = SACBatch(N, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch(range(N), SPEC, SMALL, "cpu")
     engine.save_sb3(1, tmp_path / "before.zip")
     model = by_sb3(Expert.load(tmp_path / "before.zip", device="cpu"), 1, drawn(SMALL, 3), monkeypatch)
     for batch, noise in drawn(SMALL, 3):
@@ -117,20 +118,21 @@ def test_the_gradients_are_each_experts_own_sum_and_no_mean(tmp_path, monkeypatc
                 torch.testing.assert_close(mine[moment], theirs[moment], rtol=1e-3, atol=float(1e-4 * size))
 
 
-def test_an_expert_learns_the_same_alone_and_in_company():
-    together, single = SACBatch(N, SPEC, SMALL, 0, "cpu"), SACBatch(1, SPEC, SMALL, 1, "cpu")
-    for name, array in together.arrays.items():
-        single.arrays[name].copy_(array[1:2])
-    for batch, noise in drawn(SMALL, 10):
-        together.update(batch, noise)
-        single.update(Transitions(*(column[1:2] for column in batch)), noise[:, 1:2])
-    for name, array in together.arrays.items():
-        torch.testing.assert_close(single.arrays[name][0], array[1], atol=1e-6, rtol=1e-5)
+@pytest.mark.parametrize("batch", [16, 48])
+def test_an_expert_becomes_the_same_to_the_bit_in_any_company(batch):
+    config = dataclasses.replace(LINE, batch=batch, hidden=(8, 8), actor_rate=1e-2)
+    seeds = [3**n for n in range(37)]
+    whole = train(Line(37), config, 63, seeds, device="cpu").state()
+    assert whole["updates"] == 18
+    for rows in ([0], [36], [7, 20], range(4, 37)):
+        part = train(Line(len(rows)), config, 63, [seeds[row] for row in rows], device="cpu").state()
+        for name, array in part.items():
+            np.testing.assert_array_equal(array, whole[name] if array.ndim == 0 else whole[name][list(rows)], err_msg=name)
 
 
 def test_the_squashed_gaussian_where_its_deviation_is_clamped(tmp_path, monkeypatch):
     """Some log deviations are above 2.  At -20 stable-baselines3's own float32 has no digit left: there, in float64."""
-    engine = SACBatch(N, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch(range(N), SPEC, SMALL, "cpu")
     engine.actor_shape.layers(engine.arrays["actor"])[-1][1][..., A:] = torch.tensor([2.0, -6.0, 5.0, 2.5, 0.0, 1.0])
     engine.save_sb3(0, tmp_path / "before.zip")
     model = by_sb3(Expert.load(tmp_path / "before.zip", device="cpu"), 0, drawn(SMALL, 1), monkeypatch)
@@ -163,7 +165,7 @@ def test_a_law_and_its_derivatives_are_those_of_torch_in_float64():
 
 def test_products_of_bfloat16_follow_those_of_float32():
     """Parameters stay float32; a step is that of the float32 engine up to what 8 bits leave of a gradient."""
-    full, half = SACBatch(N, SPEC, SMALL, 0, "cpu"), SACBatch(N, SPEC, SMALL, 0, "cpu", "bfloat16")
+    full, half = SACBatch(range(N), SPEC, SMALL, "cpu"), SACBatch(range(N), SPEC, SMALL, "cpu", "bfloat16")
     for batch, noise in drawn(SMALL, 20):
         full.update(batch, noise)
         half.update(batch, noise)
@@ -176,13 +178,13 @@ def test_products_of_bfloat16_follow_those_of_float32():
 
 
 def test_a_file_opens_in_stable_baselines3_and_acts_the_same(tmp_path):
-    engine = SACBatch(N, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch(range(N), SPEC, SMALL, "cpu")
     for batch, noise in drawn(SMALL, 5):
         engine.update(batch, noise)
     seen = np.random.default_rng(0).normal(size=(N, 7, S)).astype(np.float32)
-    chosen = engine.act(seen, None, deterministic=True)
+    chosen = engine.act(seen)
     assert chosen.shape == (N, 7, A)
-    np.testing.assert_allclose(engine.act(seen[:, 0], None, deterministic=True), chosen[:, 0], atol=1e-6)
+    np.testing.assert_allclose(engine.act(seen[:, 0]), chosen[:, 0], atol=1e-6)
     for index in range(N):
         model = opened(engine, index, tmp_path / "expert.zip")
         np.testing.assert_allclose(model.predict(seen[index], deterministic=True)[0], chosen[index], atol=1e-6)
@@ -190,7 +192,7 @@ def test_a_file_opens_in_stable_baselines3_and_acts_the_same(tmp_path):
 
 
 def test_files_come_back_as_they_were_and_as_stable_baselines3_left_them(tmp_path, monkeypatch):
-    engine = SACBatch(N, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch(range(N), SPEC, SMALL, "cpu")
     for batch, noise in drawn(SMALL, 5):
         engine.update(batch, noise)
     paths = [tmp_path / f"{index}.zip" for index in range(N)]
@@ -198,7 +200,7 @@ def test_files_come_back_as_they_were_and_as_stable_baselines3_left_them(tmp_pat
         engine.save_sb3(index, path)
         again = by_sb3(Expert.load(path, device="cpu"), index, drawn(SMALL, 5, seed=1), monkeypatch)
         again.save(tmp_path / f"later-{index}.zip")
-    other = SACBatch(N, SPEC, SMALL, 7, "cpu")
+    other = SACBatch(range(7, 7 + N), SPEC, SMALL, "cpu")
     other.load_sb3(paths)
     assert other.updates == 5
     for name, array in engine.arrays.items():
@@ -212,14 +214,14 @@ def test_files_come_back_as_they_were_and_as_stable_baselines3_left_them(tmp_pat
 
 
 def test_an_expert_that_has_never_been_updated_comes_back_too(tmp_path):
-    engine, other = SACBatch(1, SPEC, SMALL, 0, "cpu"), SACBatch(1, SPEC, SMALL, 1, "cpu")
+    engine, other = SACBatch([0], SPEC, SMALL, "cpu"), SACBatch([1], SPEC, SMALL, "cpu")
     engine.save_sb3(0, tmp_path / "first.zip")
     other.load_sb3([tmp_path / "first.zip"])
     assert other.updates == 0 and all(torch.equal(other.arrays[name], array) for name, array in engine.arrays.items())
 
 
 def test_files_of_another_shape_length_or_kind_are_refused(tmp_path):
-    engine = SACBatch(2, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch(range(2), SPEC, SMALL, "cpu")
     paths = [tmp_path / "0.zip", tmp_path / "1.zip"]
     engine.save_sb3(0, paths[0])
     with pytest.raises(ValueError, match="1 files for 2 experts"):
@@ -229,7 +231,7 @@ def test_files_of_another_shape_length_or_kind_are_refused(tmp_path):
     engine.save_sb3(1, paths[1])
     with pytest.raises(ValueError, match=r"after \[0, 1\] updates"):
         engine.load_sb3(paths)
-    wide = SACBatch(1, SPEC, dataclasses.replace(SMALL, hidden=(16, 9)), 0, "cpu")
+    wide = SACBatch([0], SPEC, dataclasses.replace(SMALL, hidden=(16, 9)), "cpu")
     with pytest.raises(ValueError, match=r"hidden layers \[16, 8\], not 17, 6 and \(16, 9\)"):
         wide.load_sb3(paths[:1])
     fixed = stable_baselines3.SAC(
@@ -237,44 +239,52 @@ def test_files_of_another_shape_length_or_kind_are_refused(tmp_path):
     )
     fixed.save(paths[0])
     with pytest.raises(ValueError, match="temperature is fixed"):
-        SACBatch(1, SPEC, SMALL, 0, "cpu").load_sb3(paths[:1])
+        SACBatch([0], SPEC, SMALL, "cpu").load_sb3(paths[:1])
+    for low, between, words in ((-1, torch.nn.Tanh, "with Tanh between"), (-2, torch.nn.ReLU, r"actions from \[-2.0")):
+        spaces = Spaces()
+        spaces.action_space = gymnasium.spaces.Box(low, 1, (A,), np.float32)
+        kinds = {"net_arch": [16, 8], "activation_fn": between}
+        stable_baselines3.SAC("MlpPolicy", spaces, policy_kwargs=kinds, buffer_size=1, device="cpu").save(paths[0])
+        with pytest.raises(ValueError, match=words):
+            SACBatch([0], SPEC, SMALL, "cpu").load_sb3(paths[:1])
 
 
 def test_no_update_touches_the_global_generators(tmp_path):
     torch.manual_seed(3)
     before = torch.get_rng_state(), np.random.get_state()[1].tolist()
-    engine = SACBatch(1, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch([0], SPEC, SMALL, "cpu")
     engine.save_sb3(0, tmp_path / "expert.zip")
     engine.load_sb3([tmp_path / "expert.zip"])
     seen, acted = np.ones((1, S), np.float32), np.ones((1, A), np.float32)
     engine.remember(seen, acted, Step(seen, np.ones(1, np.float32), False, np.zeros((1, 2), np.float32)))
-    engine.learn(torch.Generator().manual_seed(0))
+    ((picks, noise),) = of_updates([0], 0, (SMALL.batch, A), 1, torch.device("cpu"))
+    engine.learn(picks, noise)
     assert torch.equal(before[0], torch.get_rng_state()) and before[1] == np.random.get_state()[1].tolist()
 
 
 def test_actions_are_drawn_from_the_squashed_gaussian():
-    engine = SACBatch(1, SPEC, SMALL, 0, "cpu")
+    engine = SACBatch([0], SPEC, SMALL, "cpu")
     weights, bias = engine.actor_shape.layers(engine.arrays["actor"])[-1]
     weights.zero_()
     bias[0, 0] = torch.tensor([0.0, 0.5, -0.5, 0.0, 1.0, 0.2, -1.0, -2.0, -30.0, 9.0, -1.0, -1.0])
-    drawn_ = engine.act(np.zeros((1, 20000, S), np.float32), np.random.default_rng(0))[0].astype(np.float64)
+    noise = np.random.default_rng(0).standard_normal((1, 20000, A), dtype=np.float32)
+    drawn_ = engine.act(np.zeros((1, 20000, S), np.float32), noise)[0].astype(np.float64)
     normal = np.arctanh(np.clip(drawn_, -1 + 1e-7, 1 - 1e-7))
     np.testing.assert_allclose(np.median(normal, axis=0), [0.0, 0.5, -0.5, 0.0, 1.0, 0.2], atol=0.15)
     np.testing.assert_allclose(normal.std(axis=0)[[0, 1, 2, 4]], np.exp([-1.0, -2.0, -20.0, -1.0]), rtol=0.03, atol=1e-6)
     assert np.quantile(np.abs(normal[:, 3]), 0.3) == pytest.approx(np.exp(2.0) * 0.385, rel=0.05)
-    with pytest.raises(ValueError, match="give a generator"):
-        engine.act(np.zeros((1, S), np.float32), None)
 
 
 def test_the_replay_forgets_the_oldest_and_draws_each_experts_own():
     replay = Replay(2, 4, 2, 1, torch.device("cpu"))
     with pytest.raises(IndexError, match="add transitions first"):
-        replay.sample(1, torch.Generator())
+        replay.take(torch.zeros(2, 1, dtype=torch.int64))
     for step in range(6):
         here = torch.tensor([[step, 0.0], [step, 1.0]])
         replay.add(here, here[:, :1] / 10, here[:, 0] * 2, here + 1)
     assert (len(replay), replay.added) == (4, 6)
-    found = replay.sample(500, torch.Generator().manual_seed(0))
+    ((picks, _),) = of_updates([0, 1], 0, (500, 1), 1, torch.device("cpu"))
+    found = replay.take(picks)
     for expert_ in range(2):
         steps, own = found.observations[expert_].T
         assert set(own.tolist()) == {float(expert_)} and set(steps.tolist()) == {2.0, 3.0, 4.0, 5.0}
@@ -284,7 +294,7 @@ def test_the_replay_forgets_the_oldest_and_draws_each_experts_own():
     assert not torch.equal(found.observations[0, :, 0], found.observations[1, :, 0]), "both draw the same places"
     again = Replay(2, 4, 2, 1, torch.device("cpu"))
     again.load(replay.state())
-    for column, other in zip(found, again.sample(500, torch.Generator().manual_seed(0)), strict=True):
+    for column, other in zip(found, again.take(picks), strict=True):
         assert torch.equal(column, other)
     with pytest.raises(ValueError, match="do not fit 2 experts of 5 transitions"):
         Replay(2, 5, 2, 1, torch.device("cpu")).load(replay.state())
@@ -326,7 +336,7 @@ LINE = SACConfig(hidden=(8,), batch=4, random_steps=5, warmup=9, update_every=3,
 def test_the_target_bootstraps_through_the_time_limit():
     """The last step of an episode is remembered with what was seen at the limit, and its target has what is to come."""
     heard = []
-    engine = train(Line(2), LINE, 14, 0, lambda _, returns: heard.append(returns), "cpu")
+    engine = train(Line(2), LINE, 14, [0, 1], lambda _, returns: heard.append(returns), "cpu")
     rows = torch.from_numpy(engine.replay.state()["rows"])
     assert rows.shape == (2, 14, 6) and rows[:, 6, 5].tolist() == [7, 7] and rows[:, 7, 1].tolist() == [0, 0]
     np.testing.assert_allclose(np.array(heard), rows[:, :, 3].reshape(2, 2, 7).sum(2).T, rtol=1e-5)
@@ -361,7 +371,7 @@ def test_actions_are_uniform_for_the_random_steps_and_the_experts_then(monkeypat
     asked, act = [], SACBatch.act
     monkeypatch.setattr(SACBatch, "act", lambda self, *given: asked.append(self.steps) or act(self, *given))
     line = Line(400)
-    train(line, LINE, 14, 0, device="cpu")
+    train(line, LINE, 14, range(400), device="cpu")
     assert asked == list(range(5, 14))
     uniform = np.stack(line.acted)[:5].ravel()
     assert np.abs(np.quantile(uniform, [0.1, 0.5, 0.9]) - [-0.8, 0.0, 0.8]).max() < 0.08
@@ -374,21 +384,24 @@ def test_a_training_draws_by_its_seed_alone_and_goes_on_from_a_state():
         kept[engine.steps] = engine.state()
 
     line = Line(2)
-    whole = train(line, LINE, 35, 5, keep, "cpu").state()
+    whole = train(line, LINE, 35, [5, 6], keep, "cpu").state()
     assert whole["updates"] == 8  # after the steps 12, 15, ..., 33, not yet after 9
     assert len({tuple(start) for start in line.starts}) == 5 and len({x for start in line.starts for x in start}) == 10
     np.random.seed(1)
     torch.manual_seed(1)
-    for again in (train(Line(2), LINE, 35, 5, device="cpu"), train(Line(2), LINE, 35, 5, device="cpu", state=kept[14])):
+    for again in (
+        train(Line(2), LINE, 35, [5, 6], device="cpu"),
+        train(Line(2), LINE, 35, [5, 6], device="cpu", state=kept[14]),
+    ):
         state = again.state()
         assert set(state) == set(whole)
         for name, array in whole.items():
             np.testing.assert_array_equal(state[name], array, err_msg=name)
-    other = train(Line(2), LINE, 35, 6, device="cpu").state()
+    other = train(Line(2), LINE, 35, [6, 7], device="cpu").state()
     assert not np.array_equal(other["actor"], whole["actor"])
-    cut = train(Line(2), LINE, 36, 5, device="cpu").state()
+    cut = train(Line(2), LINE, 36, [5, 6], device="cpu").state()
     with pytest.raises(ValueError, match="step 36, within an episode of 7"):
-        train(Line(2), LINE, 70, 5, device="cpu", state=cut)
+        train(Line(2), LINE, 70, [5, 6], device="cpu", state=cut)
 
 
 class Wild(Broken):
@@ -399,7 +412,7 @@ class Wild(Broken):
 
 
 def test_a_simulation_that_breaks_down_teaches_nothing():
-    engine = train(Broken(2), LINE, 28, 0, device="cpu")
+    engine = train(Broken(2), LINE, 28, [0, 1], device="cpu")
     rows = engine.replay.state()["rows"]
     assert np.isfinite(rows).all() and engine.updates > 0
     assert rows[0, :7, 1].tolist() == [0, 1, 2, 3, 4, 5, 6] and rows[1, :8, 1].tolist() == [0, 1, 1, 1, 1, 1, 1, 0]
@@ -409,22 +422,24 @@ def test_a_simulation_that_breaks_down_teaches_nothing():
 
 
 def test_weights_that_are_no_numbers_stop_a_training():
-    with pytest.raises(FloatingPointError, match=r"experts \[1\] .* step 14: lower the learning rates"):
-        train(Wild(2), LINE, 28, 0, device="cpu")
+    with pytest.raises(FloatingPointError, match=r"experts \[1\] .* step 12: lower the learning rates"):
+        train(Wild(2), LINE, 28, [0, 1], device="cpu")
+    with pytest.raises(ValueError, match="1 seeds for 2 environments"):
+        train(Line(2), LINE, 28, [0], device="cpu")
 
 
 def test_what_it_cannot_be_made_of_is_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"0 experts"):
-        SACBatch(0, SPEC, SMALL, 0, "cpu")
+        SACBatch(range(0), SPEC, SMALL, "cpu")
     with pytest.raises(ValueError, match=r"discrete = True"):
-        SACBatch(1, Spec((0.0,), (1.0,), 3, 5), SMALL, 0, "cpu")
+        SACBatch([0], Spec((0.0,), (1.0,), 3, 5), SMALL, "cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert pick("auto").type == "cpu"
     with pytest.raises(ValueError, match="torch finds no GPU"):
         pick("cuda")
     with pytest.raises(ValueError, match=r"actor has the shape \(2, .*not \(1, "):
-        state = SACBatch(2, SPEC, SMALL, 0, "cpu").state()
-        engine = SACBatch(1, SPEC, SMALL, 0, "cpu")
+        state = SACBatch(range(2), SPEC, SMALL, "cpu").state()
+        engine = SACBatch([0], SPEC, SMALL, "cpu")
         engine._take({name: torch.from_numpy(state[name]) for name in engine.arrays}, 0)
 
 

@@ -30,13 +30,13 @@ def test_what_is_done_before_a_recording_is_undone_and_every_update_is_real(prod
             work()
         warmed.append(through._updater._counts[0].item() - before)
 
-    plain = SACBatch(N, SPEC, SMALL, 0, "cpu", products)
-    through = as_graph(SACBatch(N, SPEC, SMALL, 0, "cpu", products), monkeypatch, warm)
+    plain = SACBatch(range(N), SPEC, SMALL, "cpu", products)
+    through = as_graph(SACBatch(range(N), SPEC, SMALL, "cpu", products), monkeypatch, warm)
     for batch, noise in drawn(SMALL, 3):
         plain.update(batch, noise)
         through.update(batch, noise)
     assert warmed == [3.0], "warmed up once, and really"
-    other = SACBatch(N, SPEC, SMALL, 5, "cpu", products)
+    other = SACBatch(range(5, 5 + N), SPEC, SMALL, "cpu", products)
     for batch, noise in drawn(SMALL, 2, seed=9):
         other.update(batch, noise)
     for engine in (plain, through):
@@ -64,7 +64,7 @@ def test_a_graph_is_given_the_shapes_it_was_recorded_with_and_leaves_what_it_is_
 
 def test_an_update_keeps_every_tensor_in_its_place():
     """A graph writes to the places it was recorded with."""
-    engine = SACBatch(N, SPEC, SMALL, 0, "cpu", "bfloat16")
+    engine = SACBatch(range(N), SPEC, SMALL, "cpu", "bfloat16")
     before = [one.data_ptr() for one in engine._updater.changed()]
     assert len(before) == 10 + 3 + 3 and len(set(before)) == len(before)  # arrays, counts, copies in bfloat16
     for batch, noise in drawn(SMALL, 2):
@@ -92,7 +92,7 @@ def near(one, other, actors=6e-6, critics=4e-5):
 @cuda
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
 def test_a_graph_updates_as_the_same_work_without_it(products):
-    through, plain = (SACBatch(N, SPEC, PAPER, 0, "cuda", products, graph=graph) for graph in (True, False))
+    through, plain = (SACBatch(range(N), SPEC, PAPER, "cuda", products, graph=graph) for graph in (True, False))
     assert isinstance(through._step, Graphed) and not isinstance(plain._step, Graphed)
     for batch, noise in on_gpu(PAPER, 10):
         through.update(batch, noise)
@@ -103,7 +103,7 @@ def test_a_graph_updates_as_the_same_work_without_it(products):
 
 @cuda
 def test_a_gpu_updates_as_a_cpu_does():
-    there, here = SACBatch(N, SPEC, PAPER, 0, "cuda"), SACBatch(N, SPEC, PAPER, 0, "cpu")
+    there, here = SACBatch(range(N), SPEC, PAPER, "cuda"), SACBatch(range(N), SPEC, PAPER, "cpu")
     near(there, here, 0, 0)
     for (batch, noise), (batch_, noise_) in zip(on_gpu(PAPER, 10), drawn(PAPER, 10), strict=True):
         there.update(batch, noise)
@@ -113,7 +113,7 @@ def test_a_gpu_updates_as_a_cpu_does():
 
 @cuda
 def test_a_graph_takes_up_what_is_loaded_after_it_was_recorded():
-    first, other, later = (SACBatch(N, SPEC, SMALL, seed, "cuda") for seed in (0, 1, 2))
+    first, other, later = (SACBatch(range(seed, seed + N), SPEC, SMALL, "cuda") for seed in (0, 10, 20))
     for engine, seed in ((first, 3), (other, 4)):
         for batch, noise in on_gpu(SMALL, 3, seed=seed):
             engine.update(batch, noise)
@@ -136,8 +136,8 @@ def test_a_training_on_a_gpu_goes_on_from_a_state():
     def keep(engine, returns):
         kept[engine.steps] = engine.state()
 
-    whole = train(Line(2), LINE, 35, 5, keep, "cuda")
-    again = train(Line(2), LINE, 35, 5, device="cuda", state=kept[14])
+    whole = train(Line(2), LINE, 35, [5, 6], keep, "cuda")
+    again = train(Line(2), LINE, 35, [5, 6], device="cuda", state=kept[14])
     assert whole.updates == again.updates == 8
     np.testing.assert_allclose(again.replay.state()["rows"], whole.replay.state()["rows"], atol=1e-3)
     near(again, whole, 1e-3, 1e-3)

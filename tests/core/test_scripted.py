@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from icrl_dist import envs, experts, jobs, scripted
+from icrl_dist import delivery, envs, jobs, scripted
 from icrl_dist.config import AdversaryConfig, ConfigError, load, override
 from icrl_dist.context import Examples
 from icrl_dist.envs import metaworld, pick_place
@@ -92,7 +92,7 @@ def test_actions_are_the_leaders_with_its_noise_and_labels_the_true_goals(run, m
 
 
 def test_the_same_job_gives_the_same_bytes_and_stretches_when_they_are_asked_for(run, monkeypatch):
-    monkeypatch.setattr(experts, "LED", 1)
+    monkeypatch.setattr(delivery, "LED", 1)
     model = dataclasses.replace(run.model, stretch=4)
     run = dataclasses.replace(run, model=model, pretrain=dataclasses.replace(run.pretrain, stretches=3, contexts=4))
     job = dataclasses.replace(asked(run), tasks=1, variations=asked(run).variations[:2])

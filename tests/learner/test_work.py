@@ -55,6 +55,36 @@ def split_first(board):
         kill(board, worker)
 
 
+# Jobs that take long before their first trajectory.
+
+
+@pytest.fixture
+def training(jobs):
+    return [dataclasses.replace(job, kind="train_expert") for job in jobs]
+
+
+def test_what_comes_from_a_cache_at_once_shortens_no_training_of_experts(training):
+    board = Board(LEASE, floor_s=0.1, factor=2.0)
+    board.open(training, nothing)
+    board.lease("a", 0.0)
+    finish(board, training[0], 0.01)
+    assert board.lease("a", 0.02).deadline_s == LEASE
+
+
+def test_a_training_that_gets_further_in_every_life_is_not_to_blame_for_their_ends(training):
+    board = Board(LEASE)
+    board.open(training[:1], nothing)
+    for life in range(6):
+        assert leased(board, f"w{life}") == training[0], "whole: in parts it would begin anew"
+        board.reached(f"w{life}", training[0].label, 1000 * (life + 1))
+        board.reached(f"w{life}", "another job", 10**9)
+        kill(board, f"w{life}")
+    leased(board, "w6")
+    board.reached("w6", training[0].label, 6000)  # no further than before
+    kill(board, "w6")
+    assert len(leased(board, "w7").variations) == 1
+
+
 # Leases.
 
 
