@@ -101,13 +101,12 @@ class Curves:
             self._dirty.append(curve)
 
     def quarantined(self, name: str, cause: str) -> None:
-        """The run goes on without ``STAGE/ROUND/TASK/VARIATION``."""
-        parts = name.split("/")
-        if len(parts) == 4 and all(part.isdigit() and len(part) < 10 for part in parts[2:]):
-            curve = self._curves.get((int(parts[2]), int(parts[3])))
-            if curve is not None:
-                curve.quarantine = cause
-                self._touch(curve)
+        """The run goes on without ``STAGE/ROUND/TASK/VARIATION``.  Raises Odd for any other name."""
+        identity = _of_variation(name)
+        curve = self._curves.get((identity.task, identity.variation))
+        if curve is not None:
+            curve.quarantine = cause
+            self._touch(curve)
 
     def drawn(self, identity: Identity, message: dict[str, Any]) -> None:
         """An episode to be drawn; of a variation the newest is kept."""

@@ -149,7 +149,7 @@ class Picture:
             elif len(self._alerts) < _EVENTS:
                 self._alerts[name] = {"name": name, "text": text, "since": time}
         elif what == "quarantine":
-            self._curves.quarantined(plain.text(message.get("identity")), text)
+            self._curves.quarantined(plain.text(message.get("identity"), 120), text)
         elif what == "version":
             self._run["version"] = plain.integer(message.get("version"), 0)
         elif what in _OVER:

@@ -10,46 +10,30 @@ import pytest
 
 from icrl_dist.monitor import serve
 from icrl_dist.monitor.page import EVENT, Teller, showing
-from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.serve import application, serving
-from icrl_dist.stream import wire
 from tests.monitor.test_serve import Page, wait_for
+from tests.monitor.watched import Watched
 
 ASSETS = resources.files("icrl_dist.monitor") / "assets"
-NOBODY = {"time": 1000.0, "worker": "w0"}
 
 
-class Run:
-    """A feed whose time is ours: ``tell`` is what the page's thread does four times a second."""
+class Run(Watched):
+    """A feed that remembers since when pictures were asked for; ``tick`` is what the page's thread does."""
 
     def __init__(self):
-        self.picture, self.time, self.recording, self.controlled = Picture(), 1000.0, None, []
+        super().__init__()
         self.snapshots = []
         snapshot = self.picture.snapshot
         self.picture.snapshot = lambda now, since=-1: self.snapshots.append(since) or snapshot(now, since)
-
-    def now(self):
-        return self.time
-
-    def replay(self):
-        return self.recording
-
-    def control(self, **fields):
-        self.controlled.append(fields)
-
-    def said(self, kind, **fields):
-        message = wire.encode_message(kind, **{**NOBODY, **fields})
-        self.picture.hear(f"icrl/a-run/mon/{kind}/w0", message, self.time)
 
     def returned(self, variation, trial, earned):
         named = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
         columns = {"trials": [trial], "returns": [earned], "steps": [8], "weights": 0, "digest": "d" * 64}
         told = {"identity": f"adapt/0/{variation}", "problem": "darkroom", **named, **columns}
-        self.said("trajectories", variations=[told])
+        self.say("trajectories", worker="w0", variations=[told])
 
     def tick(self):
-        self.time += 0.25
-        self.picture.tick(self.time)
+        self.pass_time(0.25)
 
 
 class View:
@@ -105,14 +89,14 @@ def page(run):
 def test_a_viewer_is_told_the_whole_and_then_only_what_changed(run, page):
     run.returned("0/0", 0, 1.0)
     run.returned("0/1", 0, 2.0)
-    run.said("event", what="version", text="T^0 is fitted", version=0)
+    run.say("event", what="version", text="T^0 is fitted", version=0)
     run.tick()
     view = page.view()
     whole = view.next()
     assert whole["since"] == -1 and whole["replay"] is None
     assert [row["name"] for row in whole["variations"]] == ["0/0", "0/1"] and len(whole["events"]) == 1
     run.returned("0/1", 1, 3.0)
-    run.said("event", what="version", text="T^1 is fitted", version=1)
+    run.say("event", what="version", text="T^1 is fitted", version=1)
     run.tick()
     page.tell()
     delta = view.next()
@@ -236,7 +220,7 @@ def test_a_recording_is_stopped_hurried_and_wound(run, page):
     for bad in ({"paused": 1}, {"speed": "fast"}, {"speed": 0}, {"speed": True}, {"at": None}, {"at": -1}, {"stop": 1}):
         status, text = page.order(json.dumps(bad))
         assert status == 400 and next(iter(bad)) in json.loads(text)["error"]
-    assert run.controlled == orders
+    assert run.controls == orders
     run.tick()
     assert page.view().next()["replay"] == run.recording
 

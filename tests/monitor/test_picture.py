@@ -203,6 +203,9 @@ def test_alerts_are_shown_while_they_are_on_and_a_quarantine_for_good():
     assert shown["variations"][0]["quarantine"] == "it crashes"
     hear(picture, "event", event("alert", "over: stuck at zero", alert="zero", active=False))
     assert picture.snapshot(1.0)["alerts"] == []
+    for name in ("adapt/0/3", "adapt/0/3/-1", "3/1", "nowhere/0/3/1"):
+        hear(picture, "event", event("quarantine", "what?", identity=name))
+    assert picture.ignored["schema"] == 4 and picture.snapshot(1.0)["variations"][0]["quarantine"] == "it crashes"
 
 
 def test_memory_is_bounded_whatever_comes(monkeypatch):

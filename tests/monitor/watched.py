@@ -48,18 +48,18 @@ class Watched:
     """A feed of what the test says."""
 
     def __init__(self, replay=None):
-        self.picture, self.time, self._replay, self.controls = Picture(), BEGAN, replay, []
+        self.picture, self.time, self.recording, self.controls = Picture(), BEGAN, replay, []
 
     def now(self):
         return self.time
 
     def replay(self):
-        return self._replay
+        return self.recording
 
     def control(self, **wanted):
         self.controls.append(wanted)
-        if self._replay is not None:
-            self._replay |= wanted
+        if self.recording is not None:
+            self.recording |= wanted
 
     def close(self):
         pass
