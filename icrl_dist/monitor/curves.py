@@ -100,9 +100,8 @@ class Curves:
             curve.dirty = True
             self._dirty.append(curve)
 
-    def quarantined(self, name: str, cause: str) -> None:
-        """The run goes on without ``STAGE/ROUND/TASK/VARIATION``.  Raises Odd for any other name."""
-        identity = _of_variation(name)
+    def quarantined(self, identity: Identity, cause: str) -> None:
+        """The run goes on without the variation of which this is a trial."""
         curve = self._curves.get((identity.task, identity.variation))
         if curve is not None:
             curve.quarantine = cause
@@ -118,7 +117,7 @@ class Curves:
             "identity": "/".join(map(str, identity)),
             "worker": plain.text(message.get("worker")),
             "episode_return": plain.number(message.get("episode_return")),
-            "time": plain.number(message.get("time")),
+            "time": plain.when(message.get("time")),
         }
         self._episodes[place] = {**told, "drawing": drawing, "seq": self._next}
         if len(self._episodes) > _DRAWN:

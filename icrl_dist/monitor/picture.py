@@ -11,7 +11,7 @@ import uuid
 from collections import Counter, deque
 from typing import Any
 
-from icrl_dist.monitor import plain
+from icrl_dist.monitor import plain, readers
 from icrl_dist.monitor.curves import Curves
 from icrl_dist.monitor.pace import Pace
 from icrl_dist.monitor.plain import Odd
@@ -20,7 +20,6 @@ from icrl_dist.stream import strict
 
 LARGEST = 1 << 20
 """A message of more bytes than this is left out."""
-_EVENTS = 200
 _SILENT_S = 3.0
 """A learner that says nothing for so long is called silent."""
 _BELIEFS = 16
@@ -54,7 +53,7 @@ class Picture:
             self._staff = Staff(not self._recorded)
             self._curves = Curves()
             self._pace = Pace()
-            self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+            self._events: deque[dict[str, Any]] = deque(maxlen=readers.EVENTS)
             self._event_count = 0
             self._alerts: dict[str, dict[str, Any]] = {}
             self._beliefs: dict[str, dict[str, Any]] = {}
@@ -87,18 +86,18 @@ class Picture:
         elif kind == "worker":
             self._staff.beat(message, now)
         elif kind == "learner":
-            self._progress(message, now)
+            self._progress(readers.progress(message), now)
         elif kind == "run":
-            self._begin(message)
+            self._begin(readers.about(message))
         elif kind == "event":
-            self._event(message, now)
+            self._event(readers.event(message), now)
         elif kind == "belief":
-            self._belief(message)
+            self._belief(readers.belief(message))
         else:
             raise Odd("unknown kind")
 
     def _returned(self, message: dict[str, Any]) -> None:
-        worker, time, odd = plain.text(message.get("worker")), plain.number(message.get("time")), None
+        worker, time, odd = plain.text(message.get("worker")), plain.when(message.get("time")), None
         for told in plain.listed(message.get("variations"), _VARIATIONS):
             try:
                 self._pace.produced(self._curves.returned(plain.mapped(told), worker, time))
@@ -107,63 +106,42 @@ class Picture:
         if odd:
             raise odd
 
-    def _progress(self, message: dict[str, Any], now: float) -> None:
+    def _progress(self, told: dict[str, Any], now: float) -> None:
         run = self._run
-        stage = plain.text(message.get("stage"), 32)
-        for name in ("round", "step", "steps", "version", "trajectories", "workers", "lag"):
-            run[name] = plain.integer(message.get(name), -1, 2**53)
-        run["phase"] = plain.text(message.get("phase"), 32)
-        run["drops"] = plain.counts(message.get("drops"))
-        run["doing"] = [plain.text(line, 200) for line in plain.listed(message.get("doing"), 64)]
-        loss = message.get("loss")
-        run["loss"] = plain.number(loss) if loss is not None else run.get("loss")
-        run["stage"] = stage
-        if run["state"] != "finished":  # an interrupted or failed run may go on
-            run["state"] = {"collect": "collecting", "fit": "fitting"}.get(stage, stage)
+        if run["state"] not in _OVER or told["time"] > run["ended"]:  # a run that was over may go on
+            run["state"] = {"collect": "collecting", "fit": "fitting"}[told["stage"]]
             run.pop("ended", None)
+        run.update({name: value for name, value in told.items() if name != "time"})
         self._heard = now
         self._pace.progress(run, now)
 
-    def _begin(self, message: dict[str, Any]) -> None:
-        for name, longest in (("method", 32), ("problem", 64)):
-            self._run[name] = plain.text(message.get(name), longest)
-        for name in ("tasks", "variations", "rounds"):
-            self._run[name] = plain.integer(message.get(name), 0, 10**7)
-        self._run["began"] = plain.number(message.get("began"))
-        phases = [plain.listed(phase, 3) for phase in plain.listed(message.get("phases"), 4096)]
-        self._pace.phases = [
-            (plain.text(p[0], 32), plain.integer(p[1], 0), plain.integer(p[2], 0)) for p in phases if len(p) == 3
-        ]
+    def _begin(self, told: dict[str, Any]) -> None:
+        self._pace.phases = told.pop("phases")
+        self._run.update(told)
 
-    def _event(self, message: dict[str, Any], now: float) -> None:
-        what, text = plain.text(message.get("what"), 32), plain.text(message.get("text"), 500)
-        time = plain.number(message.get("time"))
-        self._event_count += 1
-        self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
+    def _event(self, told: dict[str, Any], now: float) -> None:
+        what, text, time = told["what"], told["text"], told["time"]
         if what == "worker":
-            self._staff.came(plain.text(message.get("worker")), bool(message.get("alive")), now)
+            self._staff.came(told["worker"], told["alive"], now)
         elif what == "alert":
-            name = plain.text(message.get("alert"))
-            if not message.get("active"):
+            name = told["alert"]
+            if not told["active"]:
                 self._alerts.pop(name, None)
-            elif len(self._alerts) < _EVENTS:
+            elif len(self._alerts) < readers.EVENTS:
                 self._alerts[name] = {"name": name, "text": text, "since": time}
         elif what == "quarantine":
-            self._curves.quarantined(plain.text(message.get("identity"), 120), text)
+            self._curves.quarantined(told["identity"], text)
         elif what == "version":
-            self._run["version"] = plain.integer(message.get("version"), 0)
+            self._run["version"] = told["version"]
         elif what in _OVER:
             self._run["state"], self._run["ended"] = what, time
+        self._event_count += 1
+        self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
 
-    def _belief(self, message: dict[str, Any]) -> None:
-        identity, worker = plain.identity(message.get("identity")), plain.text(message.get("worker"))
-        size = plain.integer(message.get("size"), 2, 64)
-        goal = [plain.integer(c, 0, size - 1) for c in plain.listed(message.get("goal"), 2)]
-        laws = {name: plain.numbers(message.get(name), size * size) for name in ("implied", "exact")}
-        if any(len(law) != size * size for law in laws.values()) or len(goal) != 2:
-            raise Odd("schema")
+    def _belief(self, told: dict[str, Any]) -> None:
+        worker = told.pop("worker")
         if worker in self._beliefs or len(self._beliefs) < _BELIEFS:
-            self._beliefs[worker] = {"identity": str(identity), "size": size, "goal": goal, **laws, "seq": self._seq + 1}
+            self._beliefs[worker] = {**told, "seq": self._seq + 1}
 
     # What the views call.
 

@@ -287,6 +287,41 @@ def test_no_field_of_any_message_can_break_it(kind):
     assert picture.heard > sum(picture.ignored.values()), "some were taken in"
 
 
+IMPOSSIBLE = [
+    ("learner", progress, {"phase": None}),
+    ("learner", progress, {"phase": "x"}),
+    ("learner", progress, {"stage": "finished"}),
+    ("learner", progress, {"doing": [1]}),
+    ("run", about, {"began": -1.7e308}),
+    ("run", about, {"began": 3e11}),
+    ("run", about, {"phases": [["pretrain", 0, -1]]}),
+    ("event", lambda **odd: event("finished", "x", **odd), {"time": 1.7e308}),
+    ("event", lambda **odd: event("finished", "x", **odd), {"time": -3e11}),
+    ("event", lambda **odd: event("version", "x", **odd), {"version": -1}),
+    ("event", lambda **odd: event("quarantine", "x", **odd), {"identity": "3/1"}),
+]
+
+
+@pytest.mark.parametrize(("kind", "message", "odd"), IMPOSSIBLE)
+def test_of_a_message_with_one_odd_field_nothing_is_believed(kind, message, odd):
+    picture = Picture()
+    hear(picture, "learner", progress())
+    before = picture.snapshot(2.0)
+    hear(picture, kind, message(**odd), 1.0)
+    after = picture.snapshot(2.0)
+    assert after.pop("ignored") == {"schema": 1} and after.pop("heard") == before.pop("heard") + 1
+    assert after == {name: value for name, value in before.items() if name != "ignored"}
+
+
+@pytest.mark.parametrize("alpha", [1e5, 1e308, 0.0])
+def test_where_a_law_makes_no_numbers_nobody_knows_the_optimum(alpha):
+    picture = Picture()
+    watch(picture, trajectory(adversary=PUSHY.replace(alpha=(alpha,) * 5)))
+    picture.tick(1.0)
+    (row,) = picture.snapshot(1.0)["variations"]
+    assert row["optimum"] is None and json.dumps(row, allow_nan=False)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.binary(max_size=200), st.text(max_size=20))
 def test_no_bytes_can_break_it(payload, topic):
