@@ -116,7 +116,9 @@ class Picture:
         self._pace.progress(run, now)
 
     def _begin(self, told: dict[str, Any]) -> None:
-        self._pace.phases = told.pop("phases")
+        self._pace.phases, alerts = told.pop("phases"), told.pop("alerts")
+        if alerts is not None:  # the events tell of each once, if they arrive
+            self._alerts = {alert["name"]: alert for alert in alerts}
         self._run.update(told)
 
     def _event(self, told: dict[str, Any], now: float) -> None:
@@ -127,8 +129,9 @@ class Picture:
             name = told["alert"]
             if not told["active"]:
                 self._alerts.pop(name, None)
-            elif len(self._alerts) < readers.EVENTS:
-                self._alerts[name] = {"name": name, "text": text, "since": time}
+            elif name in self._alerts or len(self._alerts) < readers.EVENTS:
+                since = self._alerts.get(name, {"since": time})["since"]
+                self._alerts[name] = {"name": name, "text": text, "since": since}
         elif what == "quarantine":
             self._curves.quarantined(told["identity"], text)
         elif what == "version":

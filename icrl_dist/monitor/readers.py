@@ -36,14 +36,21 @@ def progress(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def about(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``run`` message: what the run is about."""
+    """Of a ``run`` message: what the run is about, and the alerts that are on; None where it does not say (a recording)."""
     phases = [plain.listed(phase, 3) for phase in plain.listed(message.get("phases"), _TOLD)]
+    alerts = message.get("alerts")
     return {
         **{name: plain.text(message.get(name), longest) for name, longest in (("method", 32), ("problem", 64))},
         **{name: plain.integer(message.get(name), 0, 10**7) for name in ("tasks", "variations", "rounds")},
         "began": plain.when(message.get("began")),
         "phases": [(plain.text(p[0], 32), plain.integer(p[1], 0), plain.integer(p[2], 0)) for p in phases if len(p) == 3],
+        "alerts": None if alerts is None else [_alert(plain.mapped(one)) for one in plain.listed(alerts, _TOLD)[:EVENTS]],
     }
+
+
+def _alert(told: dict[str, Any]) -> dict[str, Any]:
+    text = plain.text(told.get("text"), 500)
+    return {"name": plain.text(told.get("name")), "text": text, "since": plain.when(told.get("since"))}
 
 
 def event(message: dict[str, Any]) -> dict[str, Any]:

@@ -208,6 +208,23 @@ def test_alerts_are_shown_while_they_are_on_and_a_quarantine_for_good():
     assert picture.ignored["schema"] == 4 and picture.snapshot(1.0)["variations"][0]["quarantine"] == "it crashes"
 
 
+def test_the_alerts_that_are_on_are_those_the_learner_repeats():
+    on = [{"name": "zero", "text": "stuck", "since": 2.0}, {"name": "silent w0", "text": "w0 is silent", "since": 3.0}]
+    late = Picture()
+    hear(late, "run", about(alerts=on))
+    assert late.snapshot(9.0)["alerts"] == on, "the events were before its time"
+    hear(late, "event", event("alert", "stuck in more", alert="zero", active=True, time=8.0))
+    assert late.snapshot(9.0)["alerts"][0] == {"name": "zero", "text": "stuck in more", "since": 2.0}
+    hear(late, "run", about(alerts=on[1:]))  # that it is over was dropped, or the learner began anew
+    hear(late, "run", about())  # a recording does not say
+    for odd in ([1], [{"name": "x", "text": "x"}], "x", [{"name": "x", "text": "x", "since": 1e300}]):
+        hear(late, "run", about(alerts=odd))
+    hear(late, "run", about(alerts=on * 2000))
+    assert late.snapshot(9.0)["ignored"] == {"schema": 4} and len(late.snapshot(9.0)["alerts"]) == 2
+    hear(late, "run", about(alerts=[]))
+    assert late.snapshot(9.0)["alerts"] == []
+
+
 def test_memory_is_bounded_whatever_comes(monkeypatch):
     monkeypatch.setattr(curves, "VARIATIONS", 5)
     monkeypatch.setattr(curves, "_EPISODES", 12)
