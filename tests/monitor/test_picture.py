@@ -31,8 +31,47 @@ def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum
     assert (row["name"], row["problem"]) == ("3/1", "darkroom")
     assert row["parameters"] == {"goal": [2, 1], "size": 4, "horizon": 9, "start": [0, 0]}
     assert row["adversary"] == {"kind": "dirichlet", "p": 0.2, "alpha": [1.0] * 5}
-    assert row["phases"] == [{"name": "adapt/1", "trials": [0, 1, 2], "returns": [0.0, 1.0, 2.0]}]
+    (phase,) = row["phases"]
+    assert (phase["name"], phase["trials"], phase["returns"]) == ("adapt/1", [0, 1, 2], [0.0, 1.0, 2.0])
     assert row["optimum"] == pytest.approx(optimal_returns(Hypotheses.of([trajectory().variation]))[0])
+
+
+def test_every_round_has_its_own_adversary_and_optimum_and_the_newest_phase_is_the_last():
+    picture = Picture()
+    rounds = {f"adapt/{n}": PUSHY.replace(p=p) for n, p in ((1, 0.6), (0, 0.1))}  # what is late comes in its place
+    for name, adversary in rounds.items():
+        watch(picture, trajectory(f"{name}/3/1/0", adversary=adversary))
+    row = picture.variation("3/1")
+    assert (row["optimum"], [phase["optimum"] for phase in row["phases"]]) == (None, [None, None]), "nobody knows it yet"
+    picture.tick(1.0)
+    (row,) = picture.snapshot(1.0)["variations"]
+    best = {name: optimal_returns(Hypotheses.of([trajectory(adversary=one).variation]))[0] for name, one in rounds.items()}
+    assert [phase["name"] for phase in row["phases"]] == ["adapt/0", "adapt/1"]
+    for phase in row["phases"]:
+        assert phase["optimum"] == pytest.approx(best[phase["name"]]) and best["adapt/0"] > best["adapt/1"] + 1
+        assert phase["adversary"]["p"] == dict(rounds[phase["name"]].params)["p"]
+    assert (row["optimum"], row["adversary"]["p"]) == (pytest.approx(best["adapt/1"]), 0.6)
+    watch(picture, trajectory("adapt/2/3/1/0", adversary=PUSHY))
+    row = picture.variation("3/1")
+    assert (row["optimum"], row["adversary"]["p"]) == (None, 0.2), "not that of the round before"
+
+
+def test_a_quarantine_is_of_its_phase_and_known_though_nothing_was_earned_in_it():
+    picture = Picture()
+    hear(picture, "event", event("quarantine", "it crashes", identity="adapt/0/3/1"))
+    watch(picture, trajectory("adapt/1/4/0/0"))
+    hear(picture, "event", event("quarantine", "stuck", identity="adapt/1/4/0"))
+    hear(picture, "event", event("quarantine", "long ago", identity="adapt/0/5/0"))
+    watch(picture, trajectory("adapt/1/5/0/0"))
+    picture.tick(1.0)
+    rows = {row["name"]: row for row in picture.snapshot(1.0)["variations"]}
+    assert {name: row["quarantine"] for name, row in rows.items()} == {"3/1": "it crashes", "4/0": "stuck", "5/0": ""}
+    assert rows["3/1"]["phases"][0]["returns"] == [] and rows["3/1"]["adversary"] == {}
+    watch(picture, trajectory("adapt/0/3/1/0"))
+    assert picture.variation("3/1")["adversary"]["kind"] == "dirichlet" and picture.variation("3/1")["quarantine"]
+    for name in ("3/1", "4/0"):
+        watch(picture, trajectory(f"adapt/2/{name}/0"))
+        assert picture.variation(name)["quarantine"] == "", "it is another variation now"
 
 
 def test_from_random_starts_the_optimum_is_the_mean_over_the_cells():
@@ -193,7 +232,7 @@ def test_rates_are_counted_once_a_second():
     assert (series["loss"], series["lag"]) == ([None, None], [1, 1])
 
 
-def test_alerts_are_shown_while_they_are_on_and_a_quarantine_for_good():
+def test_alerts_are_shown_while_they_are_on_and_a_quarantine_in_its_phase():
     picture = Picture()
     watch(picture, trajectory("adapt/0/3/1/0"))
     hear(picture, "event", event("alert", "stuck at zero", alert="zero", active=True))
@@ -228,20 +267,22 @@ def test_the_alerts_that_are_on_are_those_the_learner_repeats():
 def test_memory_is_bounded_whatever_comes(monkeypatch):
     monkeypatch.setattr(curves, "VARIATIONS", 5)
     monkeypatch.setattr(curves, "_EPISODES", 12)
+    monkeypatch.setattr(curves, "_OPTIMA", 0)
     monkeypatch.setattr(staff, "_MOST", 3)
     picture = Picture()
     for n in range(300):
         watch(picture, trajectory(f"adapt/0/{n % 9}/0/{n}"))
         hear(picture, f"worker/w{n}", beat(f"w{n}"))
         hear(picture, "event", event("note", f"{n}"))
-    for n in range(10):
+    for n in range(20):
         watch(picture, *(trajectory(f"adapt/{n}/0/0/{m}") for m in range(15)))
+    assert len(picture._curves._unsolved) == 5 * 3
     picture.tick(1.0)
     shown = picture.snapshot(1.0)
     assert (len(shown["variations"]), shown["variation_count"], shown["variations_left_out"]) == (5, 9, 4)
     assert len(shown["workers"]) == 3 and len(shown["events"]) == 200 and len(shown["episodes"]) <= 48
     phases = shown["variations"][0]["phases"]
-    assert [phase["name"] for phase in phases] == ["adapt/7", "adapt/8", "adapt/9"]
+    assert [phase["name"] for phase in phases] == ["adapt/17", "adapt/18", "adapt/19"]
     assert all(len(phase["returns"]) == 12 and phase["trials"][-1] == 14 for phase in phases)
     assert shown["ignored"] == {"too many variations": 132, "too many workers": 297}
 

@@ -166,9 +166,12 @@ export class Events {
   }
 }
 
+const against = (adversary) => [String(adversary.kind ?? "?"), parameters(adversary, ["kind"])].filter(Boolean).join(": ");
+
 export const factsOf = (row) => [
   ["Task", parameters(row.parameters) || "–"],
-  ["Adversary", [String(row.adversary.kind ?? "?"), parameters(row.adversary, ["kind"])].filter(Boolean).join(": ")],
+  ["Adversary", against(row.adversary)],
+  ...row.phases.slice(0, -1).map((phase) => [`Adversary of ${phase.name}`, against(phase.adversary)]).filter(([, words]) => words !== against(row.adversary)),
   ["Optimal return, expected", brief(row.optimum)],
   ...(row.quarantine ? [["Quarantined", row.quarantine]] : []),
 ];
