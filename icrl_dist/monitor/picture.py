@@ -22,6 +22,8 @@ LARGEST = 1 << 20
 """A message of more bytes than this is left out."""
 _SILENT_S = 3.0
 """A learner that says nothing for so long is called silent."""
+_LEFT_S = 15.0
+"""After so long a silence another run at the same endpoint is shown."""
 _BELIEFS = 16
 _VARIATIONS = 4096
 """Of which a message tells, at most."""
@@ -34,9 +36,12 @@ class Picture:
     Times are Unix seconds: of this machine while a run is watched, of then while one is replayed.
     """
 
-    def __init__(self, recorded: bool = False) -> None:
-        """``recorded``: heartbeats were not kept, so nobody is called silent."""
-        self._lock, self._recorded = threading.RLock(), recorded
+    def __init__(self, run: str = "", recorded: bool = False) -> None:
+        """``run``: the name of the only one that is shown; empty for whichever is on.
+
+        ``recorded``: heartbeats were not kept, so nobody is called silent.
+        """
+        self._lock, self._only, self._recorded = threading.RLock(), run, recorded
         self.clear()
 
     def clear(self) -> None:
@@ -48,7 +53,7 @@ class Picture:
             self.heard = 0
             """Messages, those left out among them."""
             self._seq = 0
-            self._run: dict[str, Any] = {"name": "", "state": "waiting", "version": -1, "trajectories": 0}
+            self._run: dict[str, Any] = {"name": self._only, "state": "waiting", "version": -1, "trajectories": 0}
             self._heard = float("-inf")
             self._staff = Staff(not self._recorded)
             self._curves = Curves()
@@ -62,39 +67,54 @@ class Picture:
 
     def hear(self, key: str, payload: bytes, now: float) -> None:
         """Take in one message of the monitor plane, whatever it is."""
-        self.heard += 1
         try:
             message = strict.unpack(payload, LARGEST)
             kind = plain.text(message.get("kind"), 32)
-            parts = key.split("/")
+            run = plain.text(key.partition("/")[2].partition("/")[0], 200)
             with self._lock:
-                if not self._run["name"]:
-                    self._run["name"] = plain.text(parts[1], 200)
-                elif parts[1] != self._run["name"]:
-                    raise Odd("another run")
-                self._take(kind, message, now)
+                self._take(run, kind, message, now)
         except strict.WireError as error:
             self.ignored[error.reason] += 1
         except Odd as error:
             self.ignored[str(error)] += 1
+        self.heard += 1
 
-    def _take(self, kind: str, message: dict[str, Any], now: float) -> None:
-        if kind == "trajectories":
+    def _take(self, run: str, kind: str, message: dict[str, Any], now: float) -> None:
+        if kind == "learner":
+            told = readers.progress(message)
+            self._meet(run, now)
+            self._progress(told, now)
+        elif kind == "run":
+            told = readers.about(message)
+            self._meet(run, now)
+            self._begin(told)
+        elif run != self._run["name"]:
+            raise Odd("another run" if self._run["name"] else "no run yet")
+        elif kind == "trajectories":
             self._returned(message)
         elif kind == "episode":
             self._curves.drawn(plain.identity(message.get("identity")), message)
         elif kind == "worker":
             self._staff.beat(message, now)
-        elif kind == "learner":
-            self._progress(readers.progress(message), now)
-        elif kind == "run":
-            self._begin(readers.about(message))
         elif kind == "event":
             self._event(readers.event(message), now)
         elif kind == "belief":
             self._belief(readers.belief(message))
         else:
             raise Odd("unknown kind")
+
+    def _meet(self, run: str, now: float) -> None:
+        """The learner of ``run`` speaks: it is shown from now on, unless another is that is neither over nor long silent.
+
+        Raises Odd if it is not to be shown.
+        """
+        shown = self._run["name"]
+        if shown and run != shown:
+            left = self._run["state"] in _OVER or now - self._heard > _LEFT_S
+            if self._only or not left:
+                raise Odd("another run")
+            self.clear()
+        self._run["name"], self._heard = run, now
 
     def _returned(self, message: dict[str, Any]) -> None:
         worker, time, odd = plain.text(message.get("worker")), plain.when(message.get("time")), None
@@ -112,7 +132,6 @@ class Picture:
             run["state"] = {"collect": "collecting", "fit": "fitting"}[told["stage"]]
             run.pop("ended", None)
         run.update({name: value for name, value in told.items() if name != "time"})
-        self._heard = now
         self._pace.progress(run, now)
 
     def _begin(self, told: dict[str, Any]) -> None:

@@ -63,6 +63,8 @@ class Plane:
         self.hub = MemoryHub()
         self.link, self.name = self.hub.link(), name
         self.feed = LiveFeed(self.hub.link())
+        self.progress()
+        wait_for(lambda: self.feed.picture.snapshot(0.0)["run"]["name"], "the run is known", SHORT_S)
 
     def put(self, payload, topic="any", run=None):
         self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
@@ -233,8 +235,8 @@ def test_a_recording_is_steered_by_keyboard(page):
         page.keyboard.press("Enter")
         page.get_by_label("Speed").select_option("50")
         page.get_by_label("Moment in the recording").press("End")
-        wait_for(lambda: len(run.controlled) == 3, "three commands", page.patience)
-        assert run.controlled == [{"paused": True}, {"speed": 50}, {"at": 1100}]
+        wait_for(lambda: len(run.controls) == 3, "three commands", page.patience)
+        assert run.controls == [{"paused": True}, {"speed": 50}, {"at": 1100}]
         run.recording = {**run.recording, "paused": True}
         page.get_by_role("button", name="Play", exact=True).wait_for()
 
