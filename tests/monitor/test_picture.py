@@ -155,6 +155,19 @@ def test_workers_work_wait_fall_silent_go_and_come_again():
     assert [row["state"] for row in picture.snapshot(6.0)["workers"]] == ["done", "done"]
 
 
+def test_a_recording_that_stands_still_grows_nothing_and_rates_go_on_from_there():
+    picture = Picture("demo", recorded=True)
+    for second in range(5):
+        hear(picture, "worker/w0", beat(steps=100 * second), float(second))
+        picture.tick(float(second))
+    for _ in range(1000):
+        picture.tick(4.0)
+    picture.tick(3.5)  # a clock is set back
+    (row,) = picture._staff._rows.values()
+    assert len(row.marks) < 8
+    assert picture.snapshot(4.0)["workers"][0]["steps_per_s"] == pytest.approx(100.0, rel=0.3)
+
+
 def test_the_next_life_of_a_worker_takes_its_row():
     picture = Picture("demo")
     hear(picture, "worker/w0", beat("w0"), 0.0)
