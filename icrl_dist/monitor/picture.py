@@ -25,6 +25,8 @@ _SILENT_S = 3.0
 _LEFT_S = 15.0
 """After so long a silence another run at the same endpoint is shown."""
 _BELIEFS = 16
+_BELIEF_S = 60.0
+"""An older belief is of an episode long over; where it costs much a worker tells of one that seldom (200 times its cost)."""
 _VARIATIONS = 4096
 """Of which a message tells, at most."""
 _OVER = ("finished", "interrupted", "failed")
@@ -99,7 +101,7 @@ class Picture:
         elif kind == "event":
             self._event(readers.event(message), now)
         elif kind == "belief":
-            self._belief(readers.belief(message))
+            self._belief(readers.belief(message), now)
         else:
             raise Odd("unknown kind")
 
@@ -144,6 +146,8 @@ class Picture:
         what, text, time = told["what"], told["text"], told["time"]
         if what == "worker":
             self._staff.came(told["worker"], told["alive"], now)
+            if not told["alive"]:
+                self._beliefs.pop(told["worker"], None)
         elif what == "alert":
             name = told["alert"]
             if not told["active"]:
@@ -160,10 +164,10 @@ class Picture:
         self._event_count += 1
         self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
 
-    def _belief(self, told: dict[str, Any]) -> None:
+    def _belief(self, told: dict[str, Any], now: float) -> None:
         worker = told.pop("worker")
         if worker in self._beliefs or len(self._beliefs) < _BELIEFS:
-            self._beliefs[worker] = {**told, "seq": self._seq + 1}
+            self._beliefs[worker] = {**told, "heard": now, "seq": self._seq + 1}
 
     # What the views call.
 
@@ -181,6 +185,7 @@ class Picture:
             steps_per_s, unstored = sum(row["steps_per_s"] for row in rows), sum(row["unstored"] for row in rows)
             self._pace.tick(now, self._seq, self._run, steps_per_s, unstored)
             self._curves.tick(self._seq)
+            self._beliefs = {w: b for w, b in self._beliefs.items() if now - b["heard"] <= _BELIEF_S}
 
     def snapshot(self, now: float, since: int = -1) -> dict[str, Any]:
         """All that is known, as plain values that JSON can hold; of what is large only that changed after ``since``.
@@ -214,6 +219,7 @@ class Picture:
                 "series": self._pace.series(since),
                 "events": [event for event in self._events if event["seq"] > since],
                 "alerts": list(self._alerts.values()),
+                "believers": list(self._beliefs),
                 "beliefs": {w: b for w, b in self._beliefs.items() if b["seq"] > since},
                 "heard": self.heard,
                 "ignored": dict(self.ignored),

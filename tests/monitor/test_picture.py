@@ -452,4 +452,15 @@ def test_a_belief_is_kept_a_worker():
     shown = picture.snapshot(0.0)
     assert shown["beliefs"]["w0"]["goal"] == [2, 1] and shown["beliefs"]["w0"]["exact"] == law
     assert shown["ignored"] == {"schema": 1}
-    assert PUSHY.kind == "dirichlet"
+    for number in range(1, 20):
+        hear(picture, "belief", wire.encode_message("belief", time=0.0, **said | {"worker": f"w{number}"}), 30.0)
+    picture.tick(50.0)
+    assert picture.snapshot(50.0)["believers"] == [f"w{number}" for number in range(16)], "so many at once"
+    hear(picture, "event", event("worker", "w1 is gone", worker="w1", alive=False), 61.0)
+    hear(picture, "belief", wire.encode_message("belief", time=0.0, **said | {"worker": "w2"}), 61.0)
+    picture.tick(61.0)
+    shown = picture.snapshot(61.0, picture.seq - 1)
+    assert shown["believers"] == [f"w{number}" for number in range(2, 16)] and [*shown["beliefs"]] == ["w2"]
+    picture.tick(100.0)
+    hear(picture, "belief", wire.encode_message("belief", time=0.0, **said | {"worker": "w17"}), 100.0)
+    assert picture.snapshot(100.0)["believers"] == ["w2", "w17"], "there is room again"

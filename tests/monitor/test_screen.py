@@ -246,7 +246,16 @@ def test_p_freezes_a_run_that_is_on_and_shows_it_as_it_is_afterwards():
         feed.pass_time(1.0)
         await press()
         assert "30 of 120" in text(app, "header")
-        await press("p")
+        await press("enter")
+        assert "VARIATION 0/0" in text(app, "sheet") and "6 episodes" in text(app, "sheet"), "first asked for while frozen"
+        feed.store(episode(0, 0, 6))
+        await press()
+        assert "6 episodes" in text(app, "sheet")
+        await press("right_square_bracket")
+        assert "VARIATION 0/1" in text(app, "sheet") and "adapt/0/0/0/" not in text(app, "sheet")
+        await press("left_square_bracket")
+        assert "VARIATION 0/0" in text(app, "sheet") and "7 episodes" in text(app, "sheet")
+        await press("escape", "p")
         assert "90 of 120" in text(app, "header") and "FROZEN" not in text(app, "header")
 
     drive(feed, script)

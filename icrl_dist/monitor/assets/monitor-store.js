@@ -49,7 +49,8 @@ export function apply(store, told) {
     store.episodes.delete(name);
   }
   append(store, told);
-  Object.assign(store.beliefs, told.beliefs);
+  const believe = { ...store.beliefs, ...told.beliefs };
+  store.beliefs = Object.fromEntries(told.believers.filter((worker) => Object.hasOwn(believe, worker)).map((worker) => [worker, believe[worker]]));
   return true;
 }
 
