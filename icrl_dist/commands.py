@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import signal
 import sys
 import threading
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from icrl_dist.arguments import Chaos, Doctor, Evaluate, Explain, Export, Monitor, Plan, Play, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+UNREAD = 128 + signal.SIGPIPE
+"""As a shell tells it of a command that nobody read to its end."""
 LOCAL_ACTORS = 2
 """Workers on one machine, if nobody says how many."""
 
@@ -200,7 +203,13 @@ def tap(arguments: Tap, console: Console) -> int:
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
         link.subscribe(f"icrl/{run or '*'}/mon/trajectories/**", tapped)
         over.wait()
-    return OK
+    if tapped.error is None:
+        return OK
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what was not written is not tried again at the end
+    if isinstance(tapped.error, BrokenPipeError):
+        return UNREAD
+    print(f"icrl-dist: tap: standard output cannot be written: {tapped.error.strerror}", file=sys.stderr)
+    return FAILED
 
 
 def _on(folder: Path, console: Console) -> bool:
