@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import time
 
 import pytest
@@ -168,3 +169,18 @@ def test_a_folder_is_watched_while_its_learner_holds_it_and_played_when_it_is_go
     assert kind is (LiveFeed if there else ReplayFeed)
     assert name in (("" if link else "night") if there else ("", "latest", "night"))
     assert ("its learner is gone" in capsys.readouterr().out) == (endpoint and not there)
+
+
+def test_without_a_folder_the_newest_run_is_meant_whose_learner_lives(hub, tmp_path, monkeypatch):
+    found = []
+    for number, name in enumerate(("older", "crashed")):
+        folder = run_folder(tmp_path / "runs" / name)
+        (folder / "endpoint").write_text(f"tcp/127.0.0.1:{number}\n")
+        os.utime(folder / "endpoint", (1000.0 + number, 1000.0 + number))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ZenohLink, "connect", lambda endpoint, *_: found.append(endpoint) or hub())
+    monkeypatch.setattr(page, "serve", lambda feed, *_: found.append(name_in(feed.picture)) or 0)
+    with files.hold(tmp_path / "runs" / "older"):
+        assert main(["monitor", "--web", "0"]) == 0
+    assert main(["monitor", "--web", "0"]) == 0
+    assert found == ["tcp/127.0.0.1:0", "older", "tcp/127.0.0.1:1", "crashed"]
