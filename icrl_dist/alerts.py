@@ -13,6 +13,8 @@ _PAIRS = 20
 _MOST = 200_000
 """Returns remembered of a version; beyond them no more pairs are formed."""
 _SHOWN = 3
+_AGAIN_S = 30.0
+"""An alert whose words change is told of again after so long at the earliest: logs are read by people."""
 _WINDOW_S = 10.0
 """The time over which ingest is compared with demand, seconds."""
 
@@ -46,11 +48,24 @@ class AlertsConfig:
 
 @dataclass(frozen=True)
 class Alert:
-    """Something that began to be wrong, or that is over."""
+    """Something that is wrong, or that is over; told as it begins, in other words if they change, and as it ends."""
 
     name: str
     active: bool
     text: str
+
+
+@dataclass
+class On:
+    """An alert that is on."""
+
+    name: str
+    text: str
+    """As it is now."""
+    since: float
+    """Unix seconds."""
+    told: tuple[str, float]
+    """In which words it was told of last, and when."""
 
 
 class Alerts:
@@ -58,7 +73,7 @@ class Alerts:
 
     def __init__(self, config: AlertsConfig) -> None:
         self._config = config
-        self._active: dict[str, str] = {}
+        self._on: dict[str, On] = {}
         self._zeros: dict[tuple[int, int], int] = {}
         self._returns: dict[int, dict[tuple[int, int, int], float]] = {}
         self._agreement: dict[int, float] = {}
@@ -91,16 +106,29 @@ class Alerts:
         while len(self._waited) > 2 and now - self._waited[1][0] >= _WINDOW_S:
             self._waited.popleft()
 
-    def check(self, silent: Mapping[str, float]) -> list[Alert]:
-        """What began or ended; ``silent``: seconds since each worker was heard of."""
+    @property
+    def on(self) -> list[On]:
+        """Those that are on, as the last check found them."""
+        return list(self._on.values())
+
+    def check(self, silent: Mapping[str, float], now: float) -> list[Alert]:
+        """What began, ended, or is put in other words than when it was last told of.
+
+        ``silent``: seconds since each worker was heard of; ``now``: Unix seconds.
+        """
         found = dict(filter(None, (self._collapsed(), self._zero(), self._ingest(), self._labels())))
         for worker, seconds in silent.items():
             if 0 < self._config.silent_s < seconds:
                 found[f"silent {worker}"] = f"worker {worker} has not been heard of for {self._config.silent_s:g} s"
-        ended = [Alert(name, False, f"over: {text}") for name, text in self._active.items() if name not in found]
-        begun = [Alert(name, True, text) for name, text in found.items() if name not in self._active]
-        self._active = {name: self._active.get(name, text) for name, text in found.items()}
-        return ended + begun
+        ended = [name for name in self._on if name not in found]
+        changed = [Alert(name, False, f"over: {self._on.pop(name).text}") for name in ended]
+        for name, text in found.items():
+            on = self._on.setdefault(name, On(name, text, now, ("", float("-inf"))))
+            on.text = text
+            if text != on.told[0] and not 0 <= now - on.told[1] < _AGAIN_S:
+                on.told = text, now
+                changed.append(Alert(name, True, text))
+        return changed
 
     def _collapsed(self) -> tuple[str, str] | None:
         if len(self._returns) < 2 or not self._config.collapse:

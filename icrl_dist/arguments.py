@@ -120,7 +120,7 @@ class Monitor:
     """
 
     what: tyro.conf.Positional[Path | None] = None
-    """Run folder: watched if the run is on, played again if it has ended."""
+    """Run folder: watched if the run is on, played again if it has ended or crashed."""
     connect: str | None = None
     """Instead, the endpoint of a learner, such as tcp/127.0.0.1:7447."""
     certificates: str | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import signal
 import sys
 import threading
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from icrl_dist.arguments import Chaos, Doctor, Evaluate, Explain, Export, Monitor, Plan, Play, Tap, Train
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+UNREAD = 128 + signal.SIGPIPE
+"""As a shell tells it of a command that nobody read to its end."""
 LOCAL_ACTORS = 2
 """Workers on one machine, if nobody says how many."""
 
@@ -170,13 +173,13 @@ def monitor(arguments: Monitor, console: Console) -> int:
         raise ConfigError("monitor: no terminal here; --web PORT serves it as a page, `icrl-dist tap` prints a JSON line each")
     what = arguments.what
     with contextlib.ExitStack() as stack:
-        if what is not None and not arguments.connect and not (what / "endpoint").is_file():
+        if what is not None and not arguments.connect and not _on(what, console):
             feed: LiveFeed | ReplayFeed = stack.enter_context(ReplayFeed(what, arguments.speed))
         else:
-            endpoint, certificates = _learner(what, arguments.connect, arguments.certificates)
+            endpoint, certificates, run = _learner(what, arguments.connect, arguments.certificates)
             settings = security.client(certificates, "monitor")
             link = stack.enter_context(ZenohLink.connect(endpoint, arguments.timeout, settings))
-            feed = stack.enter_context(LiveFeed(link))
+            feed = stack.enter_context(LiveFeed(link, run))
         if arguments.web is not None:
             from icrl_dist.monitor.page import serve
 
@@ -192,32 +195,65 @@ def tap(arguments: Tap, console: Console) -> int:
     from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
-    endpoint, certificates = _learner(arguments.what, arguments.connect, arguments.certificates)
+    endpoint, certificates, run = _learner(arguments.what, arguments.connect, arguments.certificates)
     over = threading.Event()
     tapped = Tapped(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, over.set)
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: over.set())
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
-        link.subscribe("icrl/*/mon/trajectories/**", tapped)
+        link.subscribe(f"icrl/{run or '*'}/mon/trajectories/**", tapped)
         over.wait()
-    return OK
+    if tapped.error is None:
+        return OK
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what was not written is not tried again at the end
+    if isinstance(tapped.error, BrokenPipeError):
+        return UNREAD
+    print(f"icrl-dist: tap: standard output cannot be written: {tapped.error.strerror}", file=sys.stderr)
+    return FAILED
 
 
-def _learner(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str]:
-    """Where the learner is reached that a run folder or ``--connect`` means, and the certificates to show it."""
+def _on(folder: Path, console: Console) -> bool:
+    """Whether a run folder's learner is there; a crash may have left its endpoint behind, which is said."""
+    from icrl_dist.files import held
+
+    if not (folder / "endpoint").is_file():
+        return False
+    if held(folder):
+        return True
+    told = "its learner is gone without a word, the run is played again; --connect ENDPOINT watches one on another machine"
+    console.print(f"{folder}: {told}", highlight=False, markup=False)
+    return False
+
+
+def _learner(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, str]:
+    """Where the learner is reached that a run folder or ``--connect`` means, the certificates to show it, and its run.
+
+    The run's name is empty where only the endpoint says which it is.
+    """
+    from icrl_dist.files import held
+
     if connect:
         if not certificates and connect.startswith("tls/"):
             raise ConfigError(
                 f"--connect {connect}: TLS needs --certificates, a folder with ca.pem, monitor.pem and monitor.key"
             )
-        return connect, certificates or ""
+        return connect, certificates or "", ""
     files = [what / "endpoint"] if what else sorted(Path("runs").glob("*/endpoint"), key=lambda f: f.stat().st_mtime)
+    files = [file for file in files if held(file.parent)] or files  # a crash leaves its endpoint behind
     if not files or not files[-1].is_file():
         raise ConfigError(
             f"no run is on in {what or 'runs/'}: start one with `icrl-dist train`, or name it with --connect tcp/HOST:PORT"
         )
-    stream = load(str(files[-1].with_name("run.toml"))).stream
-    return stream.connect or files[-1].read_text().strip(), certificates or stream.certificates
+    folder = files[-1].parent
+    stream = load(str(folder / "run.toml")).stream
+    endpoint = stream.connect or files[-1].read_text().strip()
+    return endpoint, certificates or stream.certificates, _name(folder)
+
+
+def _name(folder: Path) -> str:
+    """The name of the run in a folder; empty where a link gives the folder two, of which its learner goes by either."""
+    name = folder.absolute().name
+    return name if folder.resolve().name == name else ""
 
 
 def explain(arguments: Explain, console: Console) -> int:

@@ -51,6 +51,18 @@ def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
             time.sleep(0.05)
 
 
+def held(folder: Path) -> bool:
+    """Whether somebody is at work in a run folder, as far as this machine can tell; leaves it as it is."""
+    try:
+        with (folder / ".lock").open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: others who ask are not in the way
+    except BlockingIOError:
+        return True
+    except FileNotFoundError:
+        return False
+    return False
+
+
 def version_file(folder: Path, version: int) -> Path:
     """Where T^version lies."""
     return folder / "checkpoints" / f"version-{version:04d}.npz"

@@ -26,6 +26,8 @@ PERIOD_S = 0.25
 """Progress is told this often."""
 _ABOUT_S = 2.0
 """What a run is about is told this often, for viewers that come late."""
+_ALERTS = 200
+"""Alerts of which monitors are told again, at most."""
 _INGEST_S = 1.0
 
 
@@ -102,7 +104,7 @@ class Herald:
         self._report({"event": "progress", **fields})
         self._publish("learner", "learner", **fields)
         if self._about and self._due("about", _ABOUT_S):
-            self._publish("run", "run", **self._about)
+            self._publish("run", "run", **self._about, alerts=self._on())
         if fields["stage"] == "collect" and (self._due("ingest", _INGEST_S) or force):
             self._ingest(fields, desk)
         self._alert(fields, desk)
@@ -124,16 +126,21 @@ class Herald:
         )
 
     def _alert(self, fields: dict[str, Any], desk: Mapping[str, Any]) -> None:
+        now = time.time()
         with self._lock:
             if fields["stage"] == "collect":
                 self._alerts.waited(time.monotonic(), desk["waited"])
-            changed = self._alerts.check(desk["silent"])
-        now = time.time()
+            changed = self._alerts.check(desk["silent"], now)
         for alert in changed:
             self._report({"event": "alert", "text": f"{'ALERT' if alert.active else 'alert'}: {alert.text}"})
             self._rows.append((now, "alert", {"what": alert.name, "active": alert.active, "text": alert.text}))
             about = {"alert": alert.name, "active": alert.active, "text": alert.text}
             self._publish("event", "event", now, what="alert", **about)
+
+    def _on(self) -> list[dict[str, Any]]:
+        """The alerts that are on: told again and again, for viewers that come late or missed how one began or ended."""
+        with self._lock:
+            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.on[:_ALERTS]]
 
     def write(self) -> None:
         """Everything said so far into the metrics.  Raises StoreError if it cannot be written."""

@@ -18,7 +18,7 @@ import numpy as np
 from actors.showing import PERIOD_S
 from icrl_dist.monitor.feed import PERIOD_S as LOOK_S
 from icrl_dist.monitor.feed import LiveFeed
-from icrl_dist.stream import plane
+from icrl_dist.stream import plane, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
@@ -72,6 +72,9 @@ def crowd(streams: int, per_s: float) -> None:
             if trials:
                 for topic, told in zip(topics, rows, strict=True):
                     link.publish(topic, _message(told, trials), droppable=True)
+            progress = {"stage": "collect", "phase": "adapt", "round": 0, "step": 0, "steps": 1, "version": 0, "lag": 0}
+            counts = {"trajectories": sent * streams, "workers": _WORKERS, "drops": {}, "doing": [], "time": time.time()}
+            link.publish(keys.monitor("learner"), wire.encode_message("learner", **progress, **counts), droppable=True)
             sent = due
             print(sent * streams, flush=True)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections import OrderedDict, deque
-from typing import Any
+from typing import Any, NamedTuple
 
 from icrl_dist.monitor import plain, sketch
 from icrl_dist.monitor.plain import Odd
-from icrl_dist.types import Identity
+from icrl_dist.types import STAGES, Identity
 
 VARIATIONS = 4096
 """Variations that are kept; further ones are only counted."""
@@ -27,36 +27,72 @@ _TOLD = 200
 """Variations told of a tick, at most; the others follow in their turn."""
 
 
-class Curve:
-    """One variation: who and where it is, and what was earned in it."""
+Place = tuple[int, int]
+"""A variation, as task and variation; or a phase, as stage and round."""
 
-    __slots__ = ("adversary", "changed", "dirty", "lineage", "optimum", "phases", "problem", "quarantine", "task")
 
-    def __init__(self, message: dict[str, Any]) -> None:
-        self.describe(message)
-        self.phases: OrderedDict[str, dict[int, float]] = OrderedDict()
-        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_LINEAGE)
+class About(NamedTuple):
+    """What a variation is in one phase."""
+
+    problem: str
+    task: dict[str, Any]
+    adversary: dict[str, Any]
+
+    @classmethod
+    def of(cls, told: dict[str, Any]) -> About:
+        """As an entry of ``variations`` in docs/tap.md tells it."""
+        return cls(plain.text(told.get("problem"), 64), plain.named(told.get("task")), plain.named(told.get("adversary")))
+
+
+_NOTHING = About("", {}, {})
+
+
+class Part:
+    """One phase of a variation: ICAA draws its adversary anew every round, and with it the optimum."""
+
+    __slots__ = ("about", "name", "optimum", "quarantine", "returns")
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.about: About | None = None
         self.optimum: float | None = None
         self.quarantine = ""
+        """Why the run goes on without it; nothing may be known of it but that."""
+        self.returns: dict[int, float] = {}
+
+
+class Curve:
+    """One variation: what it is in each phase, and what was earned in it."""
+
+    __slots__ = ("changed", "dirty", "lineage", "parts")
+
+    def __init__(self) -> None:
+        self.parts: dict[Place, Part] = {}
+        """By stage and round, as they were heard of; a few."""
+        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_LINEAGE)
         self.changed = 0
         self.dirty = False
 
-    def describe(self, message: dict[str, Any]) -> None:
-        """What it is in the phase that begins."""
-        self.problem = plain.text(message.get("problem"), 64)
-        self.task = plain.named(message.get("task"))
-        self.adversary = plain.named(message.get("adversary"))
+    def part(self, identity: Identity) -> Part:
+        """Its part in that phase, from now on; of many, the one that was heard of first makes room."""
+        phase = _phase(identity)
+        if phase not in self.parts:
+            if len(self.parts) >= _PHASES:
+                del self.parts[next(iter(self.parts))]
+            self.parts[phase] = Part(f"{identity.stage}/{identity.round}")
+        return self.parts[phase]
 
 
 class Curves:
     """A bounded table of variations, named ``TASK/VARIATION``."""
 
     def __init__(self) -> None:
-        self._curves: dict[tuple[int, int], Curve] = {}
-        self._left_out: set[tuple[int, int]] = set()
-        self._unsolved: deque[Curve] = deque()
+        self._curves: dict[Place, Curve] = {}
+        self._left_out: set[Place] = set()
+        self._unsolved: OrderedDict[tuple[Place, Place], None] = OrderedDict()
+        """Variations and phases whose optimum has still to be looked up."""
         self._dirty: deque[Curve] = deque()
-        self._episodes: OrderedDict[tuple[int, int], dict[str, Any]] = OrderedDict()
+        self._episodes: OrderedDict[Place, dict[str, Any]] = OrderedDict()
         self._next = 1
 
     def __len__(self) -> int:
@@ -66,47 +102,49 @@ class Curves:
     def returned(self, told: dict[str, Any], worker: str, time: float) -> int:
         """Episodes of a variation ended: as in an entry of ``variations`` in docs/tap.md; how many."""
         identity = _of_variation(plain.text(told.get("identity"), 120))
-        trials, returns = (plain.listed(told.get(name), _TOGETHER) for name in ("trials", "returns"))
+        trials = [plain.integer(trial, 0) for trial in plain.listed(told.get("trials"), _TOGETHER)]
+        returns = plain.numbers(told.get("returns"), _TOGETHER)
         if len(trials) != len(returns):
             raise Odd("schema")
-        place = identity.task, identity.variation
-        curve = self._curves.get(place)
-        if curve is None:
+        weights, digest = plain.integer(told.get("weights"), -1), plain.text(told.get("digest"), 64)
+        place, phase = (identity.task, identity.variation), _phase(identity)
+        known = self._curves[place].parts.get(phase) if place in self._curves else None
+        about = known.about if known is not None and known.about is not None else About.of(told)
+        curve = self._curve(place)
+        part = curve.part(identity)
+        if part.about is None:
+            part.about = about
+            self._unsolved[place, phase] = None
+            if len(self._unsolved) > _PHASES * VARIATIONS:
+                self._unsolved.popitem(last=False)
+        for trial, earned in zip(trials, returns, strict=True):
+            part.returns[trial] = earned
+            curve.lineage.append((part.name, trial, earned, weights, digest, worker, time))
+        for _ in range(len(part.returns) - _EPISODES):
+            del part.returns[min(part.returns)]
+        self._touch(curve)
+        return len(trials)
+
+    def _curve(self, place: Place) -> Curve:
+        """That of a variation, from now on.  Raises Odd if there are too many."""
+        if place not in self._curves:
             if len(self._curves) >= VARIATIONS:
                 if len(self._left_out) < 16 * VARIATIONS:
                     self._left_out.add(place)
                 raise Odd("too many variations")
-            curve = self._curves[place] = Curve(told)
-        weights, digest = plain.integer(told.get("weights"), -1), plain.text(told.get("digest"), 64)
-        name = f"{identity.stage}/{identity.round}"
-        known = curve.phases.get(name)
-        if known is None:
-            curve.describe(told)
-            self._unsolved.append(curve)
-            known = curve.phases[name] = {}
-            if len(curve.phases) > _PHASES:
-                curve.phases.popitem(last=False)
-        for trial, earned in zip(trials, returns, strict=True):
-            number = plain.integer(trial, 0)
-            known[number] = plain.number(earned)
-            curve.lineage.append((name, number, known[number], weights, digest, worker, time))
-        for _ in range(len(known) - _EPISODES):
-            del known[min(known)]
-        self._touch(curve)
-        return len(trials)
+            self._curves[place] = Curve()
+        return self._curves[place]
 
     def _touch(self, curve: Curve) -> None:
         if not curve.dirty:
             curve.dirty = True
             self._dirty.append(curve)
 
-    def quarantined(self, name: str, cause: str) -> None:
-        """The run goes on without ``STAGE/ROUND/TASK/VARIATION``.  Raises Odd for any other name."""
-        identity = _of_variation(name)
-        curve = self._curves.get((identity.task, identity.variation))
-        if curve is not None:
-            curve.quarantine = cause
-            self._touch(curve)
+    def quarantined(self, identity: Identity, cause: str) -> None:
+        """In that phase the run goes on without the variation of which this is a trial, and which it may never have begun."""
+        curve = self._curve((identity.task, identity.variation))
+        curve.part(identity).quarantine = cause
+        self._touch(curve)
 
     def drawn(self, identity: Identity, message: dict[str, Any]) -> None:
         """An episode to be drawn; of a variation the newest is kept."""
@@ -118,7 +156,7 @@ class Curves:
             "identity": "/".join(map(str, identity)),
             "worker": plain.text(message.get("worker")),
             "episode_return": plain.number(message.get("episode_return")),
-            "time": plain.number(message.get("time")),
+            "time": plain.when(message.get("time")),
         }
         self._episodes[place] = {**told, "drawing": drawing, "seq": self._next}
         if len(self._episodes) > _DRAWN:
@@ -128,10 +166,13 @@ class Curves:
         """Look up some optima, and let some of what has changed be told as of ``seq``."""
         self._next = seq + 1
         for _ in range(min(_OPTIMA, len(self._unsolved))):
-            curve = self._unsolved.popleft()
-            curve.optimum = sketch.optimum(curve.problem, curve.task, curve.adversary)
-            if curve.optimum is not None:
-                self._touch(curve)
+            (place, phase), _ = self._unsolved.popitem(last=False)
+            curve = self._curves[place]
+            part = curve.parts.get(phase)
+            if part is not None and part.about is not None:
+                part.optimum = sketch.optimum(*part.about)
+                if part.optimum is not None:
+                    self._touch(curve)
         for _ in range(min(_TOLD, len(self._dirty))):
             curve = self._dirty.popleft()
             curve.dirty, curve.changed = False, seq
@@ -167,26 +208,35 @@ def _of_variation(name: str) -> Identity:
 
 
 def _origin(
-    place: tuple[int, int], phase: str, trial: int, earned: float, weights: int, digest: str, worker: str, time: float
+    place: Place, phase: str, trial: int, earned: float, weights: int, digest: str, worker: str, time: float
 ) -> dict[str, Any]:
     said = {"weights": weights, "digest": digest, "worker": worker, "time": time}
     return {"identity": f"{phase}/{place[0]}/{place[1]}/{trial}", "episode_return": earned, **said}
 
 
-def _told(place: tuple[int, int], curve: Curve) -> dict[str, Any]:
+def _phase(identity: Identity) -> Place:
+    return STAGES.index(identity.stage), identity.round
+
+
+def _told(place: Place, curve: Curve) -> dict[str, Any]:
+    parts = [part for _, part in sorted(curve.parts.items())]
+    newest = parts[-1]
+    about = newest.about or _NOTHING
     return {
         "name": f"{place[0]}/{place[1]}",
         "task": place[0],
         "variation": place[1],
-        "problem": curve.problem,
-        "parameters": curve.task,
-        "adversary": curve.adversary,
-        "optimum": curve.optimum,
-        "quarantine": curve.quarantine,
-        "phases": [{"name": name, **_columns(returns)} for name, returns in curve.phases.items()],
+        "problem": about.problem,
+        "parameters": about.task,
+        "adversary": about.adversary,
+        "optimum": newest.optimum,
+        "quarantine": newest.quarantine,
+        "phases": [_part(part) for part in parts],
     }
 
 
-def _columns(returns: dict[int, float]) -> dict[str, list[Any]]:
-    trials = sorted(returns)
-    return {"trials": trials, "returns": [round(returns[trial], 4) for trial in trials]}
+def _part(part: Part) -> dict[str, Any]:
+    trials = sorted(part.returns)
+    returns = [round(part.returns[trial], 4) for trial in trials]
+    adversary = (part.about or _NOTHING).adversary
+    return {"name": part.name, "adversary": adversary, "optimum": part.optimum, "trials": trials, "returns": returns}

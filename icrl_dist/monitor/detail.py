@@ -26,7 +26,7 @@ def lines(known: dict[str, Any], width: int) -> tuple[list[Line], list[Line]]:
     body.append(_field("mean of 5", number(row["mean"], 2) + share))
     if row["quarantine"]:
         body.append([(f" QUARANTINED: {row['quarantine']}", TROUBLE)])
-    phases = [[[], *_phase(phase, known["optimum"], width)] for phase in reversed(known["phases"])]
+    phases = [[[], *_phase(phase, row["adversary"], width)] for phase in reversed(known["phases"])]
     if known["episode"] is not None:
         phases.insert(1, [[], *_episode(known["episode"])])
     for part in phases:
@@ -38,10 +38,12 @@ def _field(name: str, text: str) -> Line:
     return [(f" {cell(name, 12)}", DIM), (text or "none", PLAIN)]
 
 
-def _phase(phase: dict[str, Any], optimum: float | None, width: int) -> list[Line]:
-    returns, trials = phase["returns"], phase["trials"]
+def _phase(phase: dict[str, Any], adversary: dict[str, Any], width: int) -> list[Line]:
+    """What was earned in a phase; its adversary too, if that is another than ``adversary``."""
+    returns, trials, optimum = phase["returns"], phase["trials"], phase["optimum"]
     low, high = bounds(returns, optimum)
-    title: Line = [(f" RETURNS, {phase['name']}", TITLE), (f"  {len(returns)} episodes", DIM)]
+    against = "" if phase["adversary"] == adversary else f", against {told(phase['adversary'], 'kind')}"
+    title: Line = [(f" RETURNS, {phase['name']}", TITLE), (f"  {len(returns)} episodes{against}", DIM)]
     if not returns:
         return [title]
     room_ = max(10, width - 12)

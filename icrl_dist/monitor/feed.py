@@ -38,11 +38,11 @@ class Feed(Protocol):
 class LiveFeed:
     """A run that is on, over a link to its learner."""
 
-    def __init__(self, link: Link, run: str = "*") -> None:
-        """Subscribes to the monitor plane of ``run``, by default of whichever run is at that endpoint."""
-        self.picture = Picture()
+    def __init__(self, link: Link, run: str = "") -> None:
+        """Subscribes to the monitor plane of ``run``, by default of whichever run is on at that endpoint."""
+        self.picture = Picture(run)
         self._ended = threading.Event()
-        link.subscribe(f"icrl/{run}/mon/**", lambda key, payload: self.picture.hear(key, payload, time.time()))
+        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.picture.hear(key, payload, time.time()))
         self._thread = threading.Thread(target=self._tick, name="picture", daemon=True)
         self._thread.start()
 

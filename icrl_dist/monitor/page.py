@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import math
 import signal
 import threading
@@ -18,6 +19,8 @@ from starlette.routing import Route
 
 from icrl_dist.monitor.feed import Feed
 from icrl_dist.monitor.serve import EventStream, application, serving
+
+_log = logging.getLogger(__name__)
 
 PUSH_S = 0.25
 """Viewers are told this often."""
@@ -56,8 +59,19 @@ class Teller:
                 delta = self._picture(self._since)
                 if delta["epoch"] != self._epoch:
                     delta = self._picture(-1)
-                self._epoch, self._since = delta["epoch"], delta["seq"]
                 self.stream.publish(EVENT, delta)
+                self._epoch, self._since = delta["epoch"], delta["seq"]  # not before it was told: it is tried again
+
+    def go_on(self, over: threading.Event) -> None:
+        """Tell four times a second until ``over``; what cannot be told is logged once a kind of error."""
+        logged: set[type[Exception]] = set()
+        while not over.wait(PUSH_S):
+            try:
+                self.tell()
+            except Exception as error:
+                if type(error) not in logged:
+                    logged.add(type(error))
+                    _log.exception("viewers cannot be told of this; further ones of its kind are not logged")
 
     def command(self, fields: dict[str, Any]) -> None:
         """``speed`` (seconds of then a second of now), ``paused`` and ``at`` (Unix seconds) of a recording.
@@ -88,13 +102,9 @@ def showing(feed: Feed, host: str, port: int) -> Iterator[str]:
     """Serve the page meanwhile; gives its URL.  Raises ConfigError if it cannot listen there."""
     teller, over = Teller(feed), threading.Event()
 
-    def push() -> None:
-        while not over.wait(PUSH_S):
-            teller.tell()
-
     routes = [Route("/variation/{task}/{variation}", teller.variation)]
     app = application("monitor.html", teller.stream, teller.command, routes)
-    thread = threading.Thread(target=push, name="teller", daemon=True)
+    thread = threading.Thread(target=teller.go_on, args=(over,), name="teller", daemon=True)
     with serving(app, teller.stream, host, port) as url:
         thread.start()
         try:

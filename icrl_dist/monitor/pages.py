@@ -50,6 +50,8 @@ class Detail(Page):
     def __init__(self, variation: str) -> None:
         super().__init__()
         self.variation = variation
+        self.filled = ""
+        """The one whose figures are shown; while the view is frozen, as they were when it was first asked for."""
 
 
 class Help(Page):

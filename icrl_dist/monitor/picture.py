@@ -11,7 +11,7 @@ import uuid
 from collections import Counter, deque
 from typing import Any
 
-from icrl_dist.monitor import plain
+from icrl_dist.monitor import plain, readers
 from icrl_dist.monitor.curves import Curves
 from icrl_dist.monitor.pace import Pace
 from icrl_dist.monitor.plain import Odd
@@ -20,10 +20,13 @@ from icrl_dist.stream import strict
 
 LARGEST = 1 << 20
 """A message of more bytes than this is left out."""
-_EVENTS = 200
 _SILENT_S = 3.0
 """A learner that says nothing for so long is called silent."""
+_LEFT_S = 15.0
+"""After so long a silence another run at the same endpoint is shown."""
 _BELIEFS = 16
+_BELIEF_S = 60.0
+"""An older belief is of an episode long over; where it costs much a worker tells of one that seldom (200 times its cost)."""
 _VARIATIONS = 4096
 """Of which a message tells, at most."""
 _OVER = ("finished", "interrupted", "failed")
@@ -35,9 +38,12 @@ class Picture:
     Times are Unix seconds: of this machine while a run is watched, of then while one is replayed.
     """
 
-    def __init__(self, recorded: bool = False) -> None:
-        """``recorded``: heartbeats were not kept, so nobody is called silent."""
-        self._lock, self._recorded = threading.RLock(), recorded
+    def __init__(self, run: str = "", recorded: bool = False) -> None:
+        """``run``: the name of the only one that is shown; empty for whichever is on.
+
+        ``recorded``: heartbeats were not kept, so nobody is called silent.
+        """
+        self._lock, self._only, self._recorded = threading.RLock(), run, recorded
         self.clear()
 
     def clear(self) -> None:
@@ -49,12 +55,12 @@ class Picture:
             self.heard = 0
             """Messages, those left out among them."""
             self._seq = 0
-            self._run: dict[str, Any] = {"name": "", "state": "waiting", "version": -1, "trajectories": 0}
+            self._run: dict[str, Any] = {"name": self._only, "state": "waiting", "version": -1, "trajectories": 0}
             self._heard = float("-inf")
             self._staff = Staff(not self._recorded)
             self._curves = Curves()
             self._pace = Pace()
-            self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+            self._events: deque[dict[str, Any]] = deque(maxlen=readers.EVENTS)
             self._event_count = 0
             self._alerts: dict[str, dict[str, Any]] = {}
             self._beliefs: dict[str, dict[str, Any]] = {}
@@ -63,42 +69,57 @@ class Picture:
 
     def hear(self, key: str, payload: bytes, now: float) -> None:
         """Take in one message of the monitor plane, whatever it is."""
-        self.heard += 1
         try:
             message = strict.unpack(payload, LARGEST)
             kind = plain.text(message.get("kind"), 32)
-            parts = key.split("/")
+            run = plain.text(key.partition("/")[2].partition("/")[0], 200)
             with self._lock:
-                if not self._run["name"]:
-                    self._run["name"] = plain.text(parts[1], 200)
-                elif parts[1] != self._run["name"]:
-                    raise Odd("another run")
-                self._take(kind, message, now)
+                self._take(run, kind, message, now)
         except strict.WireError as error:
             self.ignored[error.reason] += 1
         except Odd as error:
             self.ignored[str(error)] += 1
+        self.heard += 1
 
-    def _take(self, kind: str, message: dict[str, Any], now: float) -> None:
-        if kind == "trajectories":
+    def _take(self, run: str, kind: str, message: dict[str, Any], now: float) -> None:
+        if kind == "learner":
+            told = readers.progress(message)
+            self._meet(run, now)
+            self._progress(told, now)
+        elif kind == "run":
+            told = readers.about(message)
+            self._meet(run, now)
+            self._begin(told)
+        elif run != self._run["name"]:
+            raise Odd("another run" if self._run["name"] else "no run yet")
+        elif kind == "trajectories":
             self._returned(message)
         elif kind == "episode":
             self._curves.drawn(plain.identity(message.get("identity")), message)
         elif kind == "worker":
             self._staff.beat(message, now)
-        elif kind == "learner":
-            self._progress(message, now)
-        elif kind == "run":
-            self._begin(message)
         elif kind == "event":
-            self._event(message, now)
+            self._event(readers.event(message), now)
         elif kind == "belief":
-            self._belief(message)
+            self._belief(readers.belief(message), now)
         else:
             raise Odd("unknown kind")
 
+    def _meet(self, run: str, now: float) -> None:
+        """The learner of ``run`` speaks: it is shown from now on, unless another is that is neither over nor long silent.
+
+        Raises Odd if it is not to be shown.
+        """
+        shown = self._run["name"]
+        if shown and run != shown:
+            left = self._run["state"] in _OVER or now - self._heard > _LEFT_S
+            if self._only or not left:
+                raise Odd("another run")
+            self.clear()
+        self._run["name"], self._heard = run, now
+
     def _returned(self, message: dict[str, Any]) -> None:
-        worker, time, odd = plain.text(message.get("worker")), plain.number(message.get("time")), None
+        worker, time, odd = plain.text(message.get("worker")), plain.when(message.get("time")), None
         for told in plain.listed(message.get("variations"), _VARIATIONS):
             try:
                 self._pace.produced(self._curves.returned(plain.mapped(told), worker, time))
@@ -107,63 +128,46 @@ class Picture:
         if odd:
             raise odd
 
-    def _progress(self, message: dict[str, Any], now: float) -> None:
+    def _progress(self, told: dict[str, Any], now: float) -> None:
         run = self._run
-        stage = plain.text(message.get("stage"), 32)
-        for name in ("round", "step", "steps", "version", "trajectories", "workers", "lag"):
-            run[name] = plain.integer(message.get(name), -1, 2**53)
-        run["phase"] = plain.text(message.get("phase"), 32)
-        run["drops"] = plain.counts(message.get("drops"))
-        run["doing"] = [plain.text(line, 200) for line in plain.listed(message.get("doing"), 64)]
-        loss = message.get("loss")
-        run["loss"] = plain.number(loss) if loss is not None else run.get("loss")
-        run["stage"] = stage
-        if run["state"] != "finished":  # an interrupted or failed run may go on
-            run["state"] = {"collect": "collecting", "fit": "fitting"}.get(stage, stage)
+        if run["state"] not in _OVER or told["time"] > run["ended"]:  # a run that was over may go on
+            run["state"] = {"collect": "collecting", "fit": "fitting"}[told["stage"]]
             run.pop("ended", None)
-        self._heard = now
+        run.update({name: value for name, value in told.items() if name != "time"})
         self._pace.progress(run, now)
 
-    def _begin(self, message: dict[str, Any]) -> None:
-        for name, longest in (("method", 32), ("problem", 64)):
-            self._run[name] = plain.text(message.get(name), longest)
-        for name in ("tasks", "variations", "rounds"):
-            self._run[name] = plain.integer(message.get(name), 0, 10**7)
-        self._run["began"] = plain.number(message.get("began"))
-        phases = [plain.listed(phase, 3) for phase in plain.listed(message.get("phases"), 4096)]
-        self._pace.phases = [
-            (plain.text(p[0], 32), plain.integer(p[1], 0), plain.integer(p[2], 0)) for p in phases if len(p) == 3
-        ]
+    def _begin(self, told: dict[str, Any]) -> None:
+        self._pace.phases, alerts = told.pop("phases"), told.pop("alerts")
+        if alerts is not None:  # the events tell of each once, if they arrive
+            self._alerts = {alert["name"]: alert for alert in alerts}
+        self._run.update(told)
 
-    def _event(self, message: dict[str, Any], now: float) -> None:
-        what, text = plain.text(message.get("what"), 32), plain.text(message.get("text"), 500)
-        time = plain.number(message.get("time"))
-        self._event_count += 1
-        self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
+    def _event(self, told: dict[str, Any], now: float) -> None:
+        what, text, time = told["what"], told["text"], told["time"]
         if what == "worker":
-            self._staff.came(plain.text(message.get("worker")), bool(message.get("alive")), now)
+            self._staff.came(told["worker"], told["alive"], now)
+            if not told["alive"]:
+                self._beliefs.pop(told["worker"], None)
         elif what == "alert":
-            name = plain.text(message.get("alert"))
-            if not message.get("active"):
+            name = told["alert"]
+            if not told["active"]:
                 self._alerts.pop(name, None)
-            elif len(self._alerts) < _EVENTS:
-                self._alerts[name] = {"name": name, "text": text, "since": time}
+            elif name in self._alerts or len(self._alerts) < readers.EVENTS:
+                since = self._alerts.get(name, {"since": time})["since"]
+                self._alerts[name] = {"name": name, "text": text, "since": since}
         elif what == "quarantine":
-            self._curves.quarantined(plain.text(message.get("identity"), 120), text)
+            self._curves.quarantined(told["identity"], text)
         elif what == "version":
-            self._run["version"] = plain.integer(message.get("version"), 0)
+            self._run["version"] = told["version"]
         elif what in _OVER:
             self._run["state"], self._run["ended"] = what, time
+        self._event_count += 1
+        self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
 
-    def _belief(self, message: dict[str, Any]) -> None:
-        identity, worker = plain.identity(message.get("identity")), plain.text(message.get("worker"))
-        size = plain.integer(message.get("size"), 2, 64)
-        goal = [plain.integer(c, 0, size - 1) for c in plain.listed(message.get("goal"), 2)]
-        laws = {name: plain.numbers(message.get(name), size * size) for name in ("implied", "exact")}
-        if any(len(law) != size * size for law in laws.values()) or len(goal) != 2:
-            raise Odd("schema")
+    def _belief(self, told: dict[str, Any], now: float) -> None:
+        worker = told.pop("worker")
         if worker in self._beliefs or len(self._beliefs) < _BELIEFS:
-            self._beliefs[worker] = {"identity": str(identity), "size": size, "goal": goal, **laws, "seq": self._seq + 1}
+            self._beliefs[worker] = {**told, "heard": now, "seq": self._seq + 1}
 
     # What the views call.
 
@@ -181,6 +185,7 @@ class Picture:
             steps_per_s, unstored = sum(row["steps_per_s"] for row in rows), sum(row["unstored"] for row in rows)
             self._pace.tick(now, self._seq, self._run, steps_per_s, unstored)
             self._curves.tick(self._seq)
+            self._beliefs = {w: b for w, b in self._beliefs.items() if now - b["heard"] <= _BELIEF_S}
 
     def snapshot(self, now: float, since: int = -1) -> dict[str, Any]:
         """All that is known, as plain values that JSON can hold; of what is large only that changed after ``since``.
@@ -214,6 +219,7 @@ class Picture:
                 "series": self._pace.series(since),
                 "events": [event for event in self._events if event["seq"] > since],
                 "alerts": list(self._alerts.values()),
+                "believers": list(self._beliefs),
                 "beliefs": {w: b for w, b in self._beliefs.items() if b["seq"] > since},
                 "heard": self.heard,
                 "ignored": dict(self.ignored),

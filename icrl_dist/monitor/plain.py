@@ -7,6 +7,9 @@ from typing import Any
 
 from icrl_dist.types import Identity
 
+_LATEST = 2.5e11
+"""Seconds from 1970, either way: what every calendar and clock can show, 7,900 years."""
+
 
 class Odd(Exception):  # noqa: N818
     """A message to be left out; says why in a word or two."""
@@ -32,6 +35,14 @@ def number(value: object) -> float:
     if type(value) not in (int, float) or not math.isfinite(value):  # type: ignore[arg-type]
         raise Odd("schema")
     return float(value)  # type: ignore[arg-type]
+
+
+def when(value: object) -> float:
+    """A moment, Unix seconds.  Raises Odd for anything else, and for one that no clock shows."""
+    found = number(value)
+    if abs(found) > _LATEST:
+        raise Odd("schema")
+    return found
 
 
 def listed(value: object, longest: int) -> list[Any]:

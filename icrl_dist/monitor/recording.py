@@ -11,7 +11,7 @@ import heapq
 import itertools
 import json
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -146,9 +146,7 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
     """The rows of a metrics file, up to a torn last line; none if there is no file."""
     if not path.is_file():
         return
-    waiting: deque[str] = deque(maxlen=1)
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        waiting.append(line)
         try:
             row = json.loads(line)
         except ValueError:

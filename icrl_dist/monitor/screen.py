@@ -137,12 +137,14 @@ class Screen(App[None]):
             self._fill_panes()
 
     def _fill_detail(self, page: Detail) -> None:
-        known = self._feed.picture.variation(page.variation) if self._frozen is None else None
-        sheet = page.query_one(Scroll)
+        if self._frozen is not None and page.filled == page.variation:
+            return
+        known, sheet = self._feed.picture.variation(page.variation), page.query_one(Scroll)
         if known is not None:
             sheet.fill(*detail.lines(known, sheet.size.width or self.size.width))
-        elif self._frozen is None:
+        else:
             sheet.fill([], [[(f" {page.variation}: not heard of at this time", DIM)]])
+        page.filled = page.variation
 
     def _fill_panes(self) -> None:
         seen = self._seen

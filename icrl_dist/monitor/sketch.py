@@ -10,6 +10,7 @@ A drawing is one of
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,8 @@ def _rounded(values: np.ndarray) -> list[float]:
 
 
 def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> float | None:
-    """The optimal undiscounted return of a Dark Room variation, over its start cells; None where nobody knows it."""
+    """The optimal undiscounted return of a Dark Room variation, over its start cells; None where nobody knows it
+    or what was told makes no finite number."""
     size, horizon = task.get("size"), task.get("horizon")
     if problem != "darkroom" or not isinstance(size, int) or not isinstance(horizon, int):
         return None
@@ -85,10 +87,13 @@ def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> fl
     try:
         others = {name: _value(value) for name, value in adversary.items() if name != "kind"}
         room = Task.of("darkroom", **{name: _value(value) for name, value in task.items()})
-        values = optimal_values(Hypotheses.of([Variation(room, Adversary.of(str(adversary.get("kind")), **others))]))[0]
+        law = Adversary.of(str(adversary.get("kind")), **others)
+        with np.errstate(all="ignore"):
+            values = optimal_values(Hypotheses.of([Variation(room, law)]))[0]
         start = task.get("start", "random")
-        return float(values.mean() if start == "random" else values[int(start[0]) * size + int(start[1])])
-    except (ValueError, KeyError, TypeError, IndexError):
+        best = float(values.mean() if start == "random" else values[int(start[0]) * size + int(start[1])])
+        return best if math.isfinite(best) else None
+    except (ValueError, KeyError, TypeError, IndexError, ArithmeticError):
         return None  # it comes from a message, and is no room
 
 

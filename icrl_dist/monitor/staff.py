@@ -74,6 +74,8 @@ class Staff:
     def tick(self, now: float) -> None:
         """Rates are taken from where the counts stood some seconds ago."""
         for row in self._rows.values():
+            while row.marks and row.marks[-1][0] >= now:  # a recording stands still, or a clock was set back
+                row.marks.pop()
             row.marks.append((now, row.said["steps"], row.said["episodes"]))
             while len(row.marks) > 2 and now - row.marks[1][0] >= _SPAN_S:
                 row.marks.popleft()

@@ -13,7 +13,10 @@ from icrl_dist.types import Identity
 
 
 class Tapped:
-    """Writes the trajectories that pass, until there are enough; a message that is none is left out."""
+    """Writes the trajectories that pass, until there are enough or they cannot be written.
+
+    A message that is none is left out.  In JSON, bytes are hexadecimal digits.
+    """
 
     def __init__(
         self,
@@ -32,6 +35,8 @@ class Tapped:
         self._every, self._format, self._left, self._enough = every, format, count, enough
         self._passed = 0
         self._over = False
+        self.error: OSError | None = None
+        """Why it could write no more, if so; BrokenPipeError once nobody reads."""
 
     def __call__(self, key: str, payload: bytes) -> None:
         """One message of the monitor plane."""
@@ -48,15 +53,27 @@ class Tapped:
         self._passed += 1
         if (self._passed - 1) % self._every:
             return
-        if self._format == "msgpack":
-            sys.stdout.buffer.write(wire.encode_message("trajectory", **one))
-        else:
-            sys.stdout.write(json.dumps(one) + "\n")
-        sys.stdout.flush()
+        try:
+            self._write(one)
+        except OSError as error:
+            self.error = error
+            self._end()
+            return
         self._left -= 1
         if self._left == 0:
-            self._over = True
-            self._enough()
+            self._end()
+
+    def _end(self) -> None:
+        self._over = True
+        self._enough()
+
+    def _write(self, one: dict[str, Any]) -> None:
+        if self._format == "msgpack":
+            fields = {name: value for name, value in one.items() if name not in ("v", "kind")}
+            sys.stdout.buffer.write(wire.encode_message("trajectory", **fields))
+        else:
+            sys.stdout.write(json.dumps(one, default=bytes.hex) + "\n")
+        sys.stdout.flush()
 
     def _passes(self, fields: dict[str, Any]) -> bool:
         """Raises ValueError for a message that names no trajectory."""

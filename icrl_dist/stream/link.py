@@ -70,6 +70,11 @@ class Keys:
         return f"icrl/{self.run}/alive/{_part(worker)}"
 
 
+def may_drop(key: str) -> bool:
+    """Whether messages on ``key`` are only looked at: a subscriber need not keep them all, whatever their sender says."""
+    return key.split("/", 3)[2:3] == ["mon"]
+
+
 def _part(name: str) -> str:
     if not name or any(c in "/*$?#" or not c.isprintable() for c in name):
         raise ValueError(f"{name!r} cannot be part of a key: it must not be empty nor hold any of / * $ ? #")

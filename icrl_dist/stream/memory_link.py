@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from icrl_dist.stream.link import Done, Link, LinkError, Outcome, Query, Refused, Unanswered, matches
+from icrl_dist.stream.link import Done, Link, LinkError, Outcome, Query, Refused, Unanswered, matches, may_drop
 from icrl_dist.stream.threads import Dispatcher, Mailbox, handle
 
 
@@ -82,7 +82,7 @@ class MemoryLink(Link):
             for link in self._hub._links:
                 for expr, mailbox in link._mailboxes:
                     if matches(expr, key):
-                        mailbox.put(key, payload, droppable=droppable)
+                        mailbox.put(key, payload, droppable=droppable or may_drop(key))
 
     def watched(self, key: str) -> bool:
         with self._hub._lock:

@@ -61,22 +61,26 @@ class Dispatcher:
 class Mailbox:
     """What a subscriber has not read yet, and the thread on which its handler reads it.
 
-    Droppable messages beyond ``capacity`` are dropped and counted, others always kept, so
-    whoever puts a message in never waits.
+    Droppable messages beyond ``capacity``, or ``room`` bytes, are dropped and counted, others
+    always kept, so whoever puts a message in never waits.
     """
 
-    def __init__(self, handler: Callable[..., None], capacity: int = 1024) -> None:
+    def __init__(self, handler: Callable[..., None], capacity: int = 1024, room: int = 32 << 20) -> None:
         self.dropped = 0
-        self._handler, self._capacity = handler, capacity
+        self._handler, self._capacity, self._room = handler, capacity, room
+        self._lock, self._bytes = threading.Lock(), 0
         self._waiting: deque[tuple[object, ...]] = deque()
         self._dispatcher = Dispatcher("subscriber")
         self._called = self._closed = False
 
     def put(self, *message: object, droppable: bool) -> None:
         """Leave a message, never waiting."""
-        if droppable and len(self._waiting) >= self._capacity:
-            self.dropped += 1
-            return
+        size = _bytes_in(message)
+        with self._lock:
+            if droppable and (len(self._waiting) >= self._capacity or self._bytes + size > self._room):
+                self.dropped += 1
+                return
+            self._bytes += size
         self._waiting.append(message)
         if not self._called:  # else it is being read, or about to be
             self._called = True
@@ -90,10 +94,17 @@ class Mailbox:
     def _read(self) -> None:
         self._called = False  # before looking: whoever puts a message in from now on calls again
         while self._waiting and not self._closed:
+            message = self._waiting.popleft()
+            with self._lock:
+                self._bytes -= _bytes_in(message)
             try:
-                self._handler(*self._waiting.popleft())
+                self._handler(*message)
             except Exception:
                 _log.exception("a subscriber's handler failed")
+
+
+def _bytes_in(message: tuple[object, ...]) -> int:
+    return sum(len(part) for part in message if isinstance(part, bytes))
 
 
 def handle(handler: Callable[[Query], None], query: Query) -> None:

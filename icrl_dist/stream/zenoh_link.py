@@ -30,6 +30,7 @@ from icrl_dist.stream.link import (
     Query,
     Refused,
     Unanswered,
+    may_drop,
 )
 from icrl_dist.stream.threads import Dispatcher, Mailbox, handle
 
@@ -145,8 +146,9 @@ class ZenohLink(Link):
         mailbox = self._mailbox(handler)
 
         def hear(sample: zenoh.Sample) -> None:
-            droppable = sample.congestion_control == CongestionControl.DROP
-            mailbox.put(str(sample.key_expr), sample.payload.to_bytes(), droppable=droppable)
+            key = str(sample.key_expr)
+            droppable = sample.congestion_control == CongestionControl.DROP or may_drop(key)
+            mailbox.put(key, sample.payload.to_bytes(), droppable=droppable)
 
         with self._errors():
             self._declared.append(self._session.declare_subscriber(key_expr, Callback(hear, indirect=False)))

@@ -216,6 +216,18 @@ class LinkBattery:
         eventually(lambda: len(heard) == 1500)
         assert heard == list(range(1500))
 
+    def test_a_sleeping_monitor_keeps_only_so_much_whatever_the_sender_says(self, links: Links) -> None:
+        tap, stranger, woken, heard = links.worker(), links.worker(), threading.Event(), list[int]()
+        tap.subscribe(KEYS.monitor_all, lambda key, payload: woken.wait(20) and heard.append(len(payload)))
+        links.settle()
+        for _ in range(1500):
+            stranger.publish(KEYS.monitor("event"), b"x", droppable=False)
+        time.sleep(0.2)
+        woken.set()
+        eventually(lambda: len(heard) > 1000)
+        time.sleep(0.1)
+        assert len(heard) <= 1025
+
     def test_a_sleeping_monitor_slows_nobody(self, links: Links) -> None:
         tap, worker, woken = links.worker(), links.worker(), threading.Event()
         tap.subscribe(KEYS.monitor_all, lambda key, payload: woken.wait(10) and None)

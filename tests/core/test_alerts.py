@@ -6,8 +6,8 @@ from icrl_dist.alerts import Alerts, AlertsConfig
 from icrl_dist.config import ConfigError, load, parse
 
 
-def told(alerts, silent=None):
-    return [(alert.name, alert.active) for alert in alerts.check(silent or {})]
+def told(alerts, silent=None, now=0.0):
+    return [(alert.name, alert.active) for alert in alerts.check(silent or {}, now)]
 
 
 def test_returns_that_collapse_after_an_update():
@@ -18,7 +18,7 @@ def test_returns_that_collapse_after_an_update():
         alerts.returned((0, 0, trial), 1, 0.1)
     assert told(alerts) == [], "19 pairs are too few"
     alerts.returned((0, 0, 19), 1, 0.1)
-    (alert,) = alerts.check({})
+    (alert,) = alerts.check({}, 0.0)
     assert (alert.name, alert.active) == ("collapse", True)
     assert "T^1 earns 0.1, T^0 10.5 in the same 20 trials" in alert.text
     assert told(alerts) == [], "it is told once"
@@ -45,11 +45,28 @@ def test_a_variation_that_is_stuck_at_zero():
     for variation in range(5):
         for trial in range(3):
             alerts.returned((1, variation, 5 + trial), 0, 0.0)
-    (alert,) = alerts.check({})
+    (alert,) = alerts.check({}, 0.0)
     assert alert.text == "stuck at zero for 3 episodes: variation 1/0, 1/1, 1/2 and 2 more"
     for variation in range(5):
         alerts.returned((1, variation, 9), 0, 1.0)
     assert told(alerts) == [("zero", False)]
+
+
+def test_what_changes_is_said_again_but_not_all_the_time_and_always_known():
+    alerts = Alerts(AlertsConfig(zero_episodes=1))
+    said = []
+    for second in range(65):
+        alerts.returned((1, second, 0), 0, 0.0)
+        said += [(second, alert.text) for alert in alerts.check({}, float(second))]
+        (on,) = alerts.on
+        assert on.since == 0.0 and f"1/{min(second, 2)}" in on.text, "it is known as it is now"
+    assert [second for second, _ in said] == [0, 30, 60]
+    assert said[1][1].endswith("variation 1/0, 1/1, 1/2 and 28 more")
+    assert [second for second in range(65, 200) if told(alerts, now=float(second))] == [90], "then nothing changed"
+    for second in range(65):
+        alerts.returned((1, second, 0), 0, 1.0)
+    (over,) = alerts.check({}, 200.0)
+    assert over.text == "over: stuck at zero for 1 episodes: variation 1/0, 1/1, 1/2 and 62 more" and not alerts.on
 
 
 def test_a_worker_that_is_silent_and_heard_of_again():
@@ -65,7 +82,7 @@ def test_ingest_that_falls_behind_the_workers():
         alerts.waited(float(second), {"w0": 0.8 * second, "w1": 0.6 * second})
     assert told(alerts) == [], "ten seconds have not passed"
     alerts.waited(10.0, {"w0": 8.0, "w1": 6.0})
-    (alert,) = alerts.check({})
+    (alert,) = alerts.check({}, 0.0)
     assert alert.text == "ingest below demand: workers wait 70% of their time for the learner to store what they sent"
     for second in range(11, 40):
         alerts.waited(float(second), {"w0": 8.0, "w1": 6.0})
@@ -86,7 +103,7 @@ def test_label_quality_that_falls_from_round_to_round():
     alerts.labels(1, 0.87)
     assert told(alerts) == []
     alerts.labels(2, 0.80)
-    (alert,) = alerts.check({})
+    (alert,) = alerts.check({}, 0.0)
     assert alert.text == "label quality falls: 80% of round 2's labels are optimal, 87% of round 1's"
 
 

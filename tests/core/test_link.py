@@ -19,7 +19,7 @@ from icrl_dist.stream import plane
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Link, LinkError, Unanswered, matches
 from icrl_dist.stream.memory_link import MemoryHub
-from icrl_dist.stream.threads import Dispatcher
+from icrl_dist.stream.threads import Dispatcher, Mailbox
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 from tests.contracts.link_battery import KEYS, LinkBattery, Links, eventually
@@ -275,3 +275,25 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
         "worker": "w0",
         "time": 5.0,
     }
+
+
+def test_what_waits_for_a_subscriber_is_bounded_in_bytes_too():
+    began, woken, heard = threading.Event(), threading.Event(), []
+
+    def slow(key, payload):
+        began.set()
+        woken.wait(10)
+        heard.append(len(payload))
+
+    mailbox = Mailbox(slow, capacity=10, room=100)
+    mailbox.put("k", bytes(90), droppable=True)
+    assert began.wait(10)  # it no longer waits
+    for size in (101, 60, 60, 40, 1):
+        mailbox.put("k", bytes(size), droppable=True)
+    mailbox.put("k", bytes(500), droppable=False)
+    woken.set()
+    eventually(lambda: len(heard) == 4)
+    mailbox.put("k", bytes(100), droppable=True)
+    eventually(lambda: len(heard) == 5)
+    mailbox.close()
+    assert heard == [90, 60, 40, 500, 100] and mailbox.dropped == 3

@@ -14,6 +14,7 @@ import pytest
 from icrl_dist.monitor import curves
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.monitor.page import showing
+from icrl_dist.monitor.sketch import optimum
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
@@ -28,6 +29,8 @@ QUIET = (
 )
 SHORT_S = 40
 MARKUP = '<img src=x onerror="window.__pwned=1;alert(1)">'
+ABOUT = {"method": "icaa", "problem": "darkroom", "rounds": 1, "tasks": 1, "variations": 1, "began": 0.0}
+ABOUT |= {"phases": [["adapt", 0, 10]]}
 CLEAR = "document.querySelector('#connection').textContent === 'live'"
 
 
@@ -63,6 +66,8 @@ class Plane:
         self.hub = MemoryHub()
         self.link, self.name = self.hub.link(), name
         self.feed = LiveFeed(self.hub.link())
+        self.progress()
+        wait_for(lambda: self.feed.picture.snapshot(0.0)["run"]["name"], "the run is known", SHORT_S)
 
     def put(self, payload, topic="any", run=None):
         self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
@@ -77,11 +82,11 @@ class Plane:
     def returned(self, *about, **fields):
         self.put(self.told(*about, **fields))
 
-    def told(self, variation, trial, earned, kind="uniform", problem="darkroom", **fields):
+    def told(self, variation, trial, earned, kind="uniform", problem="darkroom", round=0, p=0.25, **fields):
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
-        adversary = {"kind": kind} if kind == "null" else {"kind": kind, "p": 0.25}
+        adversary = {"kind": kind} if kind == "null" else {"kind": kind, "p": p}
         about = {"problem": problem, "task": room, "adversary": adversary, "weights": 0, "digest": "ab" * 32}
-        told = {"identity": f"adapt/0/{variation}", **about, "trials": [trial], "returns": [earned], "steps": [8]}
+        told = {"identity": f"adapt/{round}/{variation}", **about, "trials": [trial], "returns": [earned], "steps": [8]}
         return wire.encode_message("trajectories", **{"worker": "w0", "time": time.time(), "variations": [told], **fields})
 
     def close(self):
@@ -168,17 +173,8 @@ def test_hostile_messages_are_text_or_nothing(page):
         run.returned("0/0", 2**40, 1.0, kind=MARKUP, problem=MARKUP)
         run.say("event", what=MARKUP, text=MARKUP, time=1e300)
         run.say("event", what="alert", alert=MARKUP, active=True, text=MARKUP)
-        phases = [["adapt", 0, 10]]
-        about = {
-            "method": MARKUP,
-            "problem": MARKUP,
-            "phases": phases,
-            "rounds": 1,
-            "tasks": 1,
-            "variations": 1,
-            "began": 1e308,
-        }
-        run.say("run", **about)
+        run.say("run", **ABOUT | {"method": MARKUP, "problem": MARKUP})
+        run.say("run", **ABOUT | {"began": 1e308})
         run.put(b"\xff" * 100)
         run.put(msgpack.packb({"v": 1, "kind": "event", "text": "x" * (2 << 20)}))
         run.put(msgpack.packb({"v": 1, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
@@ -222,6 +218,41 @@ def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkey
             until(page, "document.querySelector('#variation-table tbody th').textContent === '0/0'")
 
 
+def test_every_round_is_over_its_own_optimum_and_many_alerts_leave_room_for_it(page):
+    with plane() as run, showing(run.feed, "127.0.0.1", 0) as url:
+        room = {"size": 3, "horizon": 8, "goal": [1, 1]}
+        strengths = {0: 0.1, 1: 0.7}
+        best = {n: optimum("darkroom", room, {"kind": "uniform", "p": p}) for n, p in strengths.items()}
+        for number, p in strengths.items():
+            run.returned("0/0", 0, 0.5 * best[number], round=number, p=p)
+        law = np.eye(9)[4].tolist()
+        for worker in ("w0", "w1"):
+            run.say("belief", worker=worker, identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=law, exact=law)
+        page.goto(url)
+        words = "document.querySelector('#adaptation-summary').textContent"
+        until(page, f"/^adapt.1: 0.50 in the first episode.*adapt.0 ended at 0.50[.] Shaded/.test({words})")
+        page.locator("#variation-table tbody tr").click()
+        page.locator("#detail-facts").get_by_text("uniform: p 0.1").wait_for()
+        told = re.findall(r"optimal ([\d.]+)", page.locator("#detail-summary").inner_text())
+        assert [float(one) for one in told] == pytest.approx([*best.values()], 0.02)
+        page.keyboard.press("Escape")
+        assert page.locator("#beliefs canvas").count() == 4
+        run.say("event", what="worker", text="w1 is gone", worker="w1", alive=False)
+        until(page, "document.querySelectorAll('#beliefs canvas').length === 2")
+
+        for number in range(100):
+            run.say("event", what="alert", alert=f"silent w{number}", active=True, text=f"worker w{number} is silent")
+        until(page, "document.querySelectorAll('#alerts p').length === 100")
+        alerts, table = page.locator("#alerts"), page.locator("#variation-table")
+        assert alerts.bounding_box()["height"] <= 900 / 4 and table.bounding_box()["height"] > 80
+        alerts.focus()
+        assert page.evaluate("document.activeElement.id") == "alerts"
+        page.keyboard.press("End")
+        until(page, "document.querySelector('#alerts').scrollTop > 1000")
+        run.say("run", **ABOUT, alerts=[])  # what the learner repeats is what is on
+        until(page, "document.querySelectorAll('#alerts p').length === 0")
+
+
 def test_a_recording_is_steered_by_keyboard(page):
     run = Run()
     run.recording = {"begin": 1000.0, "end": 1100.0, "at": 1010.0, "speed": 10.0, "paused": False}
@@ -233,8 +264,8 @@ def test_a_recording_is_steered_by_keyboard(page):
         page.keyboard.press("Enter")
         page.get_by_label("Speed").select_option("50")
         page.get_by_label("Moment in the recording").press("End")
-        wait_for(lambda: len(run.controlled) == 3, "three commands", page.patience)
-        assert run.controlled == [{"paused": True}, {"speed": 50}, {"at": 1100}]
+        wait_for(lambda: len(run.controls) == 3, "three commands", page.patience)
+        assert run.controls == [{"paused": True}, {"speed": 50}, {"at": 1100}]
         run.recording = {**run.recording, "paused": True}
         page.get_by_role("button", name="Play", exact=True).wait_for()
 
@@ -260,7 +291,9 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         until(page, f"{grown} > 0")
         before = page.evaluate(grown)
         until(page, f"{grown} !== {before}")
-        assert "mean of 14 variations" in page.locator("#adaptation-summary").inner_text()
+        # Of the newest round alone: those that have begun it, and whose optimum in it is known.
+        words = "document.querySelector('#adaptation-summary').textContent"
+        until(page, f"/mean of (8|9|1[0-4]) variations/.test({words})")
         assert page.locator("#adaptation canvas").count() == 1
 
         victim = workers_of(training)[0]

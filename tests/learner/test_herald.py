@@ -29,6 +29,7 @@ def said(small_run, tmp_path, monkeypatch):
 
         monkeypatch.setattr(MemoryLink, "publish", listen)
         monkeypatch.setattr(herald, "PERIOD_S", 0.0)
+        monkeypatch.setattr(herald, "_ABOUT_S", 0.0)
         monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
         run = dataclasses.replace(small_run, alerts=AlertsConfig(**thresholds))
         launch.prepare(run, tmp_path / "said", resume=False, overwrite=False)
@@ -65,5 +66,7 @@ def test_an_alert_reaches_terminal_monitors_and_metrics(said):
     assert [(row["what"], row["active"], row["text"]) for row in written] == [
         (a["alert"], a["active"], a["text"]) for a in alerts
     ]
+    (*_, last) = [fields["alerts"] for _, kind, fields in heard if kind == "run"]
+    assert {*last[0]} == {"name", "text", "since"} and last[0]["name"] == "zero", "a viewer that comes late is told, too"
     shown = [event["text"] for event in events if event["event"] == "alert"]
     assert shown[0].startswith("ALERT: stuck at zero for 1 episodes: variation ")

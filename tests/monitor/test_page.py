@@ -8,6 +8,7 @@ from importlib import resources
 
 import pytest
 
+from icrl_dist.monitor import page as page_module
 from icrl_dist.monitor import serve
 from icrl_dist.monitor.page import EVENT, Teller, showing
 from icrl_dist.monitor.serve import application, serving
@@ -103,7 +104,8 @@ def test_a_viewer_is_told_the_whole_and_then_only_what_changed(run, page):
     assert (delta["since"], delta["seq"]) == (whole["seq"], whole["seq"] + 1)
     assert [event["text"] for event in delta["events"]] == ["T^1 is fitted"]
     assert delta["run"]["version"] == 1
-    assert delta["variations"][-1]["phases"] == [{"name": "adapt/0", "trials": [0, 1], "returns": [2.0, 3.0]}]
+    (phase,) = delta["variations"][-1]["phases"]
+    assert (phase["name"], phase["trials"], phase["returns"]) == ("adapt/0", [0, 1], [2.0, 3.0])
     run.tick()
     page.tell()
     assert not view.next()["variations"]
@@ -161,6 +163,24 @@ def test_nothing_is_computed_for_nobody_and_who_returns_begins_anew(run, page):
     again = page.view()
     whole = again.next()
     assert whole["since"] == -1 and whole["epoch"] == before["epoch"] and len(whole["variations"]) == 1
+
+
+def test_what_cannot_be_told_is_logged_once_and_the_next_change_is_told(run, monkeypatch, caplog):
+    monkeypatch.setattr(page_module, "PUSH_S", 0.01)
+    with showing(run, "127.0.0.1", 0) as url:
+        view = View(Page(url, None, None))
+        view.next()
+        whole, asked = run.picture.snapshot, []
+        broken = lambda now, since=-1: asked.append(since) or {**whole(now, since), "time": float("nan")}  # noqa: E731
+        monkeypatch.setattr(run.picture, "snapshot", broken)
+        run.say("event", what="note", text="told in the end")
+        run.tick()
+        wait_for(lambda: len(asked) > 3)
+        monkeypatch.setattr(run.picture, "snapshot", whole)
+        while "told in the end" not in [event["text"] for event in view.known["events"]]:
+            view.next()
+        view.close()
+    assert [record.exc_info[0] for record in caplog.records] == [ValueError]
 
 
 def test_what_is_forgotten_is_forgotten_by_all(run, page):

@@ -24,19 +24,58 @@ def watch(picture, *trajectories, now=0.0):
 
 
 def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum():
-    picture = Picture()
+    picture = Picture("demo")
     watch(picture, *(trajectory(f"adapt/1/3/1/{trial}", earned=trial) for trial in (0, 2, 1)))
     picture.tick(1.0)
     (row,) = picture.snapshot(1.0)["variations"]
     assert (row["name"], row["problem"]) == ("3/1", "darkroom")
     assert row["parameters"] == {"goal": [2, 1], "size": 4, "horizon": 9, "start": [0, 0]}
     assert row["adversary"] == {"kind": "dirichlet", "p": 0.2, "alpha": [1.0] * 5}
-    assert row["phases"] == [{"name": "adapt/1", "trials": [0, 1, 2], "returns": [0.0, 1.0, 2.0]}]
+    (phase,) = row["phases"]
+    assert (phase["name"], phase["trials"], phase["returns"]) == ("adapt/1", [0, 1, 2], [0.0, 1.0, 2.0])
     assert row["optimum"] == pytest.approx(optimal_returns(Hypotheses.of([trajectory().variation]))[0])
 
 
+def test_every_round_has_its_own_adversary_and_optimum_and_the_newest_phase_is_the_last():
+    picture = Picture("demo")
+    rounds = {f"adapt/{n}": PUSHY.replace(p=p) for n, p in ((1, 0.6), (0, 0.1))}  # what is late comes in its place
+    for name, adversary in rounds.items():
+        watch(picture, trajectory(f"{name}/3/1/0", adversary=adversary))
+    row = picture.variation("3/1")
+    assert (row["optimum"], [phase["optimum"] for phase in row["phases"]]) == (None, [None, None]), "nobody knows it yet"
+    picture.tick(1.0)
+    (row,) = picture.snapshot(1.0)["variations"]
+    best = {name: optimal_returns(Hypotheses.of([trajectory(adversary=one).variation]))[0] for name, one in rounds.items()}
+    assert [phase["name"] for phase in row["phases"]] == ["adapt/0", "adapt/1"]
+    for phase in row["phases"]:
+        assert phase["optimum"] == pytest.approx(best[phase["name"]]) and best["adapt/0"] > best["adapt/1"] + 1
+        assert phase["adversary"]["p"] == dict(rounds[phase["name"]].params)["p"]
+    assert (row["optimum"], row["adversary"]["p"]) == (pytest.approx(best["adapt/1"]), 0.6)
+    watch(picture, trajectory("adapt/2/3/1/0", adversary=PUSHY))
+    row = picture.variation("3/1")
+    assert (row["optimum"], row["adversary"]["p"]) == (None, 0.2), "not that of the round before"
+
+
+def test_a_quarantine_is_of_its_phase_and_known_though_nothing_was_earned_in_it():
+    picture = Picture("demo")
+    hear(picture, "event", event("quarantine", "it crashes", identity="adapt/0/3/1"))
+    watch(picture, trajectory("adapt/1/4/0/0"))
+    hear(picture, "event", event("quarantine", "stuck", identity="adapt/1/4/0"))
+    hear(picture, "event", event("quarantine", "long ago", identity="adapt/0/5/0"))
+    watch(picture, trajectory("adapt/1/5/0/0"))
+    picture.tick(1.0)
+    rows = {row["name"]: row for row in picture.snapshot(1.0)["variations"]}
+    assert {name: row["quarantine"] for name, row in rows.items()} == {"3/1": "it crashes", "4/0": "stuck", "5/0": ""}
+    assert rows["3/1"]["phases"][0]["returns"] == [] and rows["3/1"]["adversary"] == {}
+    watch(picture, trajectory("adapt/0/3/1/0"))
+    assert picture.variation("3/1")["adversary"]["kind"] == "dirichlet" and picture.variation("3/1")["quarantine"]
+    for name in ("3/1", "4/0"):
+        watch(picture, trajectory(f"adapt/2/{name}/0"))
+        assert picture.variation(name)["quarantine"] == "", "it is another variation now"
+
+
 def test_from_random_starts_the_optimum_is_the_mean_over_the_cells():
-    picture = Picture()
+    picture = Picture("demo")
     random_start = ROOM.replace(start="random")
     watch(picture, trajectory(task=random_start))
     picture.tick(1.0)
@@ -47,7 +86,7 @@ def test_from_random_starts_the_optimum_is_the_mean_over_the_cells():
 
 
 def test_a_variation_tells_where_it_came_from_and_shows_its_newest_episode():
-    picture = Picture()
+    picture = Picture("demo")
     watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/3/1/1", earned=3.0, worker="w1"), now=5.0)
     found = picture.variation("3/1")
     assert [line["identity"] for line in found["lineage"]] == ["adapt/0/3/1/0", "adapt/0/3/1/1"]
@@ -62,7 +101,7 @@ def test_a_variation_tells_where_it_came_from_and_shows_its_newest_episode():
 
 
 def test_a_later_snapshot_has_only_what_changed():
-    picture = Picture()
+    picture = Picture("demo")
     watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/4/0/0"))
     hear(picture, "event", event("note", "one"))
     picture.tick(1.0)
@@ -83,7 +122,7 @@ def test_a_later_snapshot_has_only_what_changed():
 
 def test_every_change_is_told_of_however_many_there_are(monkeypatch):
     monkeypatch.setattr(curves, "_TOLD", 3)
-    picture, told, since = Picture(), [], -1
+    picture, told, since = Picture("demo"), [], -1
     picture.tick(0.0)
     since = picture.snapshot(0.0)["seq"]
     watch(picture, *(trajectory(f"adapt/0/{task}/0/0") for task in range(8)))
@@ -96,7 +135,7 @@ def test_every_change_is_told_of_however_many_there_are(monkeypatch):
 
 
 def test_workers_work_wait_fall_silent_go_and_come_again():
-    picture = Picture()
+    picture = Picture("demo")
     hear(picture, "worker/w0", beat(steps=0, episodes=4, trajectories=3), 0.0)
     hear(picture, "worker/w1", beat("w1", job=""), 0.0)
     for second in range(1, 5):
@@ -116,8 +155,21 @@ def test_workers_work_wait_fall_silent_go_and_come_again():
     assert [row["state"] for row in picture.snapshot(6.0)["workers"]] == ["done", "done"]
 
 
+def test_a_recording_that_stands_still_grows_nothing_and_rates_go_on_from_there():
+    picture = Picture("demo", recorded=True)
+    for second in range(5):
+        hear(picture, "worker/w0", beat(steps=100 * second), float(second))
+        picture.tick(float(second))
+    for _ in range(1000):
+        picture.tick(4.0)
+    picture.tick(3.5)  # a clock is set back
+    (row,) = picture._staff._rows.values()
+    assert len(row.marks) < 8
+    assert picture.snapshot(4.0)["workers"][0]["steps_per_s"] == pytest.approx(100.0, rel=0.3)
+
+
 def test_the_next_life_of_a_worker_takes_its_row():
-    picture = Picture()
+    picture = Picture("demo")
     hear(picture, "worker/w0", beat("w0"), 0.0)
     hear(picture, "worker/w1", beat("w1"), 0.0)
     for now, name in ((1.0, "w1"), (2.0, "w1-1")):
@@ -130,7 +182,7 @@ def test_the_next_life_of_a_worker_takes_its_row():
 
 
 def test_a_workers_lag_is_that_of_the_weights_that_act_in_its_job():
-    picture = Picture()
+    picture = Picture("demo")
     hear(picture, "learner", progress(version=3))
     for worker, said in {
         "w0": {"weights": 1},
@@ -143,7 +195,7 @@ def test_a_workers_lag_is_that_of_the_weights_that_act_in_its_job():
 
 
 def test_the_run_goes_through_its_states():
-    picture = Picture()
+    picture = Picture("demo")
     assert picture.snapshot(0.0)["run"]["state"] == "waiting"
     hear(picture, "run", about())
     hear(picture, "learner", progress(step=10, trajectories=10), 0.0)
@@ -180,7 +232,7 @@ def test_the_time_left_is_that_of_the_stage_the_fit_and_the_phases_to_come():
 
 
 def test_rates_are_counted_once_a_second():
-    picture = Picture()
+    picture = Picture("demo")
     hear(picture, "learner", progress(trajectories=10), 0.0)
     picture.tick(0.0)
     watch(picture, *(trajectory(f"adapt/0/0/0/{n}") for n in range(6)), now=1.0)
@@ -193,8 +245,8 @@ def test_rates_are_counted_once_a_second():
     assert (series["loss"], series["lag"]) == ([None, None], [1, 1])
 
 
-def test_alerts_are_shown_while_they_are_on_and_a_quarantine_for_good():
-    picture = Picture()
+def test_alerts_are_shown_while_they_are_on_and_a_quarantine_in_its_phase():
+    picture = Picture("demo")
     watch(picture, trajectory("adapt/0/3/1/0"))
     hear(picture, "event", event("alert", "stuck at zero", alert="zero", active=True))
     hear(picture, "event", event("quarantine", "it crashes", identity="adapt/0/3/1"))
@@ -208,33 +260,86 @@ def test_alerts_are_shown_while_they_are_on_and_a_quarantine_for_good():
     assert picture.ignored["schema"] == 4 and picture.snapshot(1.0)["variations"][0]["quarantine"] == "it crashes"
 
 
+def test_the_alerts_that_are_on_are_those_the_learner_repeats():
+    on = [{"name": "zero", "text": "stuck", "since": 2.0}, {"name": "silent w0", "text": "w0 is silent", "since": 3.0}]
+    late = Picture("demo")
+    hear(late, "run", about(alerts=on))
+    assert late.snapshot(9.0)["alerts"] == on, "the events were before its time"
+    hear(late, "event", event("alert", "stuck in more", alert="zero", active=True, time=8.0))
+    assert late.snapshot(9.0)["alerts"][0] == {"name": "zero", "text": "stuck in more", "since": 2.0}
+    hear(late, "run", about(alerts=on[1:]))  # that it is over was dropped, or the learner began anew
+    hear(late, "run", about())  # a recording does not say
+    for odd in ([1], [{"name": "x", "text": "x"}], "x", [{"name": "x", "text": "x", "since": 1e300}]):
+        hear(late, "run", about(alerts=odd))
+    hear(late, "run", about(alerts=on * 2000))
+    assert late.snapshot(9.0)["ignored"] == {"schema": 4} and len(late.snapshot(9.0)["alerts"]) == 2
+    hear(late, "run", about(alerts=[]))
+    assert late.snapshot(9.0)["alerts"] == []
+
+
 def test_memory_is_bounded_whatever_comes(monkeypatch):
     monkeypatch.setattr(curves, "VARIATIONS", 5)
     monkeypatch.setattr(curves, "_EPISODES", 12)
+    monkeypatch.setattr(curves, "_OPTIMA", 0)
     monkeypatch.setattr(staff, "_MOST", 3)
-    picture = Picture()
+    picture = Picture("demo")
     for n in range(300):
         watch(picture, trajectory(f"adapt/0/{n % 9}/0/{n}"))
         hear(picture, f"worker/w{n}", beat(f"w{n}"))
         hear(picture, "event", event("note", f"{n}"))
-    for n in range(10):
+    for n in range(20):
         watch(picture, *(trajectory(f"adapt/{n}/0/0/{m}") for m in range(15)))
+    assert len(picture._curves._unsolved) == 5 * 3
     picture.tick(1.0)
     shown = picture.snapshot(1.0)
     assert (len(shown["variations"]), shown["variation_count"], shown["variations_left_out"]) == (5, 9, 4)
     assert len(shown["workers"]) == 3 and len(shown["events"]) == 200 and len(shown["episodes"]) <= 48
     phases = shown["variations"][0]["phases"]
-    assert [phase["name"] for phase in phases] == ["adapt/7", "adapt/8", "adapt/9"]
+    assert [phase["name"] for phase in phases] == ["adapt/17", "adapt/18", "adapt/19"]
     assert all(len(phase["returns"]) == 12 and phase["trials"][-1] == 14 for phase in phases)
     assert shown["ignored"] == {"too many variations": 132, "too many workers": 297}
 
 
 def test_one_run_is_shown_and_another_at_the_same_place_left_out():
     picture = Picture()
+    for kind, message in (("event", event("note", "x")), ("x", wire.encode_message("x")), ("learner", progress(phase=None))):
+        hear(picture, kind, message, run="stray")
+    assert picture.snapshot(0.0)["run"]["name"] == "", "only a learner's word says which run is on"
     hear(picture, "learner", progress())
-    hear(picture, "learner", progress(version=9), run="other")
+    hear(picture, "learner", progress(version=9), 14.0, run="other")
+    hear(picture, "event", event("finished", "x"), 14.0, run="other")
     shown = picture.snapshot(0.0)
-    assert (shown["run"]["name"], shown["run"]["version"], shown["ignored"]) == ("demo", 0, {"another run": 1})
+    assert (shown["run"]["name"], shown["run"]["version"], shown["run"]["state"]) == ("demo", 0, "collecting")
+    assert shown["ignored"] == {"no run yet": 2, "schema": 1, "another run": 2}
+
+
+@pytest.mark.parametrize("over", [True, False])
+def test_the_next_run_at_the_same_place_is_shown_once_this_one_is_over_or_long_silent(over):
+    picture, named = Picture(), Picture("demo")
+    for one in (picture, named):
+        hear(one, "learner", progress(version=4))
+        watch(one, trajectory())
+        if over:
+            hear(one, "event", event("finished", "x"), 1.0)
+        hear(one, "learner", progress(), 2.0 if over else 20.0, run="next")
+        hear(one, "event", event("note", "of the next"), 20.0, run="next")
+    shown = picture.snapshot(20.0)
+    assert (shown["run"]["name"], shown["run"]["version"], shown["variations"], shown["ignored"]) == ("next", 0, [], {})
+    assert [one["text"] for one in shown["events"]] == ["of the next"] and shown["epoch"] != named.snapshot(20.0)["epoch"]
+    assert named.snapshot(20.0)["run"]["name"] == "demo", "it was asked for"
+
+
+@pytest.mark.parametrize("how", ["finished", "interrupted", "failed"])
+def test_a_run_that_was_over_may_go_on(how):
+    picture = Picture()
+    hear(picture, "learner", progress(), 0.0)
+    hear(picture, "event", event(how, "x", time=5.0), 5.0)
+    hear(picture, "learner", progress(time=4.9), 5.1)
+    run = picture.snapshot(6.0)["run"]
+    assert (run["state"], run["ended"]) == (how, 5.0), "that was said before"
+    hear(picture, "learner", progress(time=9.0), 9.0)
+    run = picture.snapshot(9.0)["run"]
+    assert run["state"] == "collecting" and "ended" not in run
 
 
 MESSAGES = {
@@ -266,7 +371,7 @@ ODD = [
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_no_field_of_any_message_can_break_it(kind):
-    picture = Picture()
+    picture = Picture("demo")
     whole = msgpack.unpackb(MESSAGES[kind])
     for name in whole:
         hear(picture, "x", msgpack.packb({k: v for k, v in whole.items() if k != name}))
@@ -287,10 +392,45 @@ def test_no_field_of_any_message_can_break_it(kind):
     assert picture.heard > sum(picture.ignored.values()), "some were taken in"
 
 
+IMPOSSIBLE = [
+    ("learner", progress, {"phase": None}),
+    ("learner", progress, {"phase": "x"}),
+    ("learner", progress, {"stage": "finished"}),
+    ("learner", progress, {"doing": [1]}),
+    ("run", about, {"began": -1.7e308}),
+    ("run", about, {"began": 3e11}),
+    ("run", about, {"phases": [["pretrain", 0, -1]]}),
+    ("event", lambda **odd: event("finished", "x", **odd), {"time": 1.7e308}),
+    ("event", lambda **odd: event("finished", "x", **odd), {"time": -3e11}),
+    ("event", lambda **odd: event("version", "x", **odd), {"version": -1}),
+    ("event", lambda **odd: event("quarantine", "x", **odd), {"identity": "3/1"}),
+]
+
+
+@pytest.mark.parametrize(("kind", "message", "odd"), IMPOSSIBLE)
+def test_of_a_message_with_one_odd_field_nothing_is_believed(kind, message, odd):
+    picture = Picture("demo")
+    hear(picture, "learner", progress())
+    before = picture.snapshot(2.0)
+    hear(picture, kind, message(**odd), 1.0)
+    after = picture.snapshot(2.0)
+    assert after.pop("ignored") == {"schema": 1} and after.pop("heard") == before.pop("heard") + 1
+    assert after == {name: value for name, value in before.items() if name != "ignored"}
+
+
+@pytest.mark.parametrize("alpha", [1e5, 1e308, 0.0])
+def test_where_a_law_makes_no_numbers_nobody_knows_the_optimum(alpha):
+    picture = Picture("demo")
+    watch(picture, trajectory(adversary=PUSHY.replace(alpha=(alpha,) * 5)))
+    picture.tick(1.0)
+    (row,) = picture.snapshot(1.0)["variations"]
+    assert row["optimum"] is None and json.dumps(row, allow_nan=False)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.binary(max_size=200), st.text(max_size=20))
 def test_no_bytes_can_break_it(payload, topic):
-    picture = Picture()
+    picture = Picture("demo")
     picture.hear(f"icrl/{topic}/mon/x", payload, 0.0)
     picture.hear(topic, payload, 0.0)
     picture.tick(1.0)
@@ -298,13 +438,13 @@ def test_no_bytes_can_break_it(payload, topic):
 
 
 def test_a_huge_message_is_left_out():
-    picture = Picture()
+    picture = Picture("demo")
     hear(picture, "event", event("note", "x" * (2 << 20)))
     assert picture.snapshot(0.0)["ignored"] == {"oversized": 1}
 
 
 def test_a_belief_is_kept_a_worker():
-    picture = Picture()
+    picture = Picture("demo")
     law = [1 / 16] * 16
     said = {"identity": "adapt/0/3/1/7", "worker": "w0", "size": 4, "goal": [2, 1], "implied": law, "exact": law}
     hear(picture, "belief/w0", wire.encode_message("belief", time=0.0, **said))
@@ -312,4 +452,15 @@ def test_a_belief_is_kept_a_worker():
     shown = picture.snapshot(0.0)
     assert shown["beliefs"]["w0"]["goal"] == [2, 1] and shown["beliefs"]["w0"]["exact"] == law
     assert shown["ignored"] == {"schema": 1}
-    assert PUSHY.kind == "dirichlet"
+    for number in range(1, 20):
+        hear(picture, "belief", wire.encode_message("belief", time=0.0, **said | {"worker": f"w{number}"}), 30.0)
+    picture.tick(50.0)
+    assert picture.snapshot(50.0)["believers"] == [f"w{number}" for number in range(16)], "so many at once"
+    hear(picture, "event", event("worker", "w1 is gone", worker="w1", alive=False), 61.0)
+    hear(picture, "belief", wire.encode_message("belief", time=0.0, **said | {"worker": "w2"}), 61.0)
+    picture.tick(61.0)
+    shown = picture.snapshot(61.0, picture.seq - 1)
+    assert shown["believers"] == [f"w{number}" for number in range(2, 16)] and [*shown["beliefs"]] == ["w2"]
+    picture.tick(100.0)
+    hear(picture, "belief", wire.encode_message("belief", time=0.0, **said | {"worker": "w17"}), 100.0)
+    assert picture.snapshot(100.0)["believers"] == ["w2", "w17"], "there is room again"

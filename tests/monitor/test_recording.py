@@ -1,19 +1,25 @@
 """A run from its folder: the picture at the end is that of the run as it was watched."""
 
+import contextlib
 import json
+import os
 import time
 
 import pytest
 
-from icrl_dist import launch
+from icrl_dist import files, launch
+from icrl_dist.cli import main
 from icrl_dist.config import ConfigError
+from icrl_dist.monitor import page
 from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
 from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.recording import Recording
 from icrl_dist.store import Store
 from icrl_dist.stream.memory_link import MemoryLink
+from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import service
 from tests.monitor.messages import progress
+from tests.monitor.watched import run_folder
 
 METRICS = service.Metrics
 
@@ -50,7 +56,7 @@ def played(folder):
 
 def test_it_ends_in_the_picture_that_was_seen_live(watched):
     folder, heard = watched
-    live = Picture()
+    live = Picture(folder.name)
     for key, payload in heard:
         live.hear(key, payload, 0.0)
     live.tick(0.0)
@@ -129,11 +135,52 @@ def test_a_folder_with_nothing_to_play_says_so(tmp_path, watched):
 
 def test_a_live_feed_hears_what_is_published(hub):
     link = hub()
-    with LiveFeed(hub()) as feed:
+    with LiveFeed(hub()) as feed, LiveFeed(hub(), "other") as other:
         link.publish("icrl/demo/mon/learner", progress(), droppable=True)
         deadline = time.monotonic() + 10
-        while feed.picture.snapshot(feed.now())["run"]["name"] != "demo":
+        while name_in(feed.picture) != "demo":
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        assert feed.replay() is None
+        assert feed.replay() is None and other.picture.heard == 0
         feed.control(speed=2.0, paused=True, at=0.0)
+
+
+def name_in(picture):
+    return picture.snapshot(0.0)["run"]["name"]
+
+
+@pytest.mark.parametrize("link", [False, True])
+@pytest.mark.parametrize(("endpoint", "there"), [(False, False), (True, False), (True, True)])
+def test_a_folder_is_watched_while_its_learner_holds_it_and_played_when_it_is_gone(
+    hub, tmp_path, monkeypatch, capsys, endpoint, there, link
+):
+    folder, feeds = run_folder(tmp_path / "night"), []
+    if link:
+        (tmp_path / "latest").symlink_to("night")
+    if endpoint:
+        (folder / "endpoint").write_text("tcp/127.0.0.1:1\n")
+    monkeypatch.setattr(ZenohLink, "connect", lambda *_: hub())
+    monkeypatch.setattr(
+        page, "serve", lambda feed, *_: feeds.append((type(feed), feed.picture.snapshot(0.0)["run"]["name"])) or 0
+    )
+    with files.hold(folder) if there else contextlib.nullcontext():
+        assert main(["monitor", str(tmp_path / ("latest" if link else "night")), "--web", "0"]) == 0
+    ((kind, name),) = feeds
+    assert kind is (LiveFeed if there else ReplayFeed)
+    assert name in (("" if link else "night") if there else ("", "latest", "night"))
+    assert ("its learner is gone" in capsys.readouterr().out) == (endpoint and not there)
+
+
+def test_without_a_folder_the_newest_run_is_meant_whose_learner_lives(hub, tmp_path, monkeypatch):
+    found = []
+    for number, name in enumerate(("older", "crashed")):
+        folder = run_folder(tmp_path / "runs" / name)
+        (folder / "endpoint").write_text(f"tcp/127.0.0.1:{number}\n")
+        os.utime(folder / "endpoint", (1000.0 + number, 1000.0 + number))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ZenohLink, "connect", lambda endpoint, *_: found.append(endpoint) or hub())
+    monkeypatch.setattr(page, "serve", lambda feed, *_: found.append(name_in(feed.picture)) or 0)
+    with files.hold(tmp_path / "runs" / "older"):
+        assert main(["monitor", "--web", "0"]) == 0
+    assert main(["monitor", "--web", "0"]) == 0
+    assert found == ["tcp/127.0.0.1:0", "older", "tcp/127.0.0.1:1", "crashed"]

@@ -17,6 +17,7 @@ from icrl_dist.monitor.recording import Recording
 from icrl_dist.monitor.screen import Screen
 from icrl_dist.monitor.seen import duration, matches
 from icrl_dist.monitor.tables import Table
+from icrl_dist.stream import wire
 from tests.monitor.watched import BEGAN, Watched, episode, run_folder
 
 
@@ -202,7 +203,9 @@ HOSTILE = "[bold red]x[/] [/nope] \x1b[2J\x07\u202e\ud7ff 名前 e\u0301\u0301 $
 @pytest.mark.parametrize("size", [(80, 24), (130, 44)])
 def test_names_from_the_network_are_only_ever_text(size):
     feed = Watched()
+    feed.progress(phase=None)  # the first that is heard of the run
     feed.busy()
+    feed.picture.hear("icrl/demo/mon/event", wire.encode_message("event", what="x", text="x", time=1e300), feed.time)
     feed.beat(HOSTILE, job=HOSTILE, doing=HOSTILE)
     feed.say("event", what="[red]", text=HOSTILE * 5)
     feed.say("event", what="alert", alert="[/]", active=True, text=HOSTILE)
@@ -243,7 +246,16 @@ def test_p_freezes_a_run_that_is_on_and_shows_it_as_it_is_afterwards():
         feed.pass_time(1.0)
         await press()
         assert "30 of 120" in text(app, "header")
-        await press("p")
+        await press("enter")
+        assert "VARIATION 0/0" in text(app, "sheet") and "6 episodes" in text(app, "sheet"), "first asked for while frozen"
+        feed.store(episode(0, 0, 6))
+        await press()
+        assert "6 episodes" in text(app, "sheet")
+        await press("right_square_bracket")
+        assert "VARIATION 0/1" in text(app, "sheet") and "adapt/0/0/0/" not in text(app, "sheet")
+        await press("left_square_bracket")
+        assert "VARIATION 0/0" in text(app, "sheet") and "7 episodes" in text(app, "sheet")
+        await press("escape", "p")
         assert "90 of 120" in text(app, "header") and "FROZEN" not in text(app, "header")
 
     drive(feed, script)

@@ -2,14 +2,19 @@
 
 import io
 import json
+import os
+import signal
 import sys
+import threading
 
 import msgpack
 import pytest
 
+from icrl_dist.cli import main
 from icrl_dist.config import ConfigError
 from icrl_dist.monitor.tap import Tapped
 from icrl_dist.stream import plane, wire
+from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import NULL
 from tests.monitor.messages import progress, trajectory
 
@@ -61,6 +66,59 @@ def test_as_messages_of_their_own(monkeypatch):
     written, _ = tapped(monkeypatch, tasks=(1,), form="msgpack")
     found = list(msgpack.Unpacker(io.BytesIO(written)))
     assert len(found) == 8 and found[0]["identity"] == "adapt/0/1/0/0" and found[0]["v"] == 1
+
+
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_a_field_that_json_cannot_hold_costs_no_trajectory(monkeypatch, form):
+    out = Out()
+    monkeypatch.setattr(sys, "stdout", out)
+    of = {"trials": [0], "returns": [1.0], "steps": [9]}
+    told = [
+        {
+            "identity": "adapt/0/0/0",
+            "adversary": {"kind": "x", "more": b"\xff\x01"},
+            "kind": "a name of the message's own",
+            **of,
+        },
+        {"identity": "adapt/0/0/1", "adversary": {}, **of},
+    ]
+    Tapped((), (), 1, form, 0, lambda: None)("key", wire.encode_message("trajectories", worker="w0", variations=told))
+    written = out.buffer.getvalue()
+    found = [*msgpack.Unpacker(io.BytesIO(written))] if form == "msgpack" else [*map(json.loads, written.decode().splitlines())]
+    assert [one["identity"] for one in found] == ["adapt/0/0/0/0", "adapt/0/0/1/0"]
+    assert found[0]["adversary"]["more"] == ("ff01" if form == "json" else b"\xff\x01")
+
+
+FULL = "icrl-dist: tap: standard output cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize(("full", "code", "told"), [(False, 128 + signal.SIGPIPE, ""), (True, 1, FULL)])
+def test_it_ends_when_nobody_reads_it_or_nothing_can_be_written(hub, monkeypatch, capfd, full, code, told):
+    """As ``icrl-dist tap | head -1`` does, without a word and with the exit code of other commands."""
+    link, over = hub(), threading.Event()
+    reader, writer = os.pipe()
+    os.close(reader)
+    if full:
+        os.close(writer)
+        writer = os.open("/dev/full", os.O_WRONLY)
+    out = os.fdopen(writer, "w")
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(ZenohLink, "connect", lambda *_: hub())
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+
+    def run():
+        while not over.wait(0.01):
+            link.publish("icrl/demo/mon/trajectories/w0", plane.trajectories([trajectory()], 0.0), droppable=True)
+
+    running = threading.Thread(target=run)
+    running.start()
+    try:
+        assert main(["tap", "--connect", "tcp/127.0.0.1:1"]) == code
+    finally:
+        over.set()
+        running.join()
+    out.close()  # as the interpreter does at its end
+    assert capfd.readouterr().err == told
 
 
 @pytest.mark.parametrize("odd", [{"every": 0}, {"count": -1}, {"tasks": (-3,)}])

@@ -48,7 +48,7 @@ class Watched:
     """A feed of what the test says."""
 
     def __init__(self, replay=None):
-        self.picture, self.time, self.recording, self.controls = Picture(), BEGAN, replay, []
+        self.picture, self.time, self.recording, self.controls = Picture("demo"), BEGAN, replay, []
 
     def now(self):
         return self.time

@@ -13,19 +13,25 @@ const DASHES = [[], [7, 4], [2, 3]];
 let chart = null;
 let shown = { rows: [], newest: "", scaled: true, x: [] };
 
-/** Returns over the optimum where one is known for any of the rows, else as they are. */
-export const scaling = (rows) => (rows.some((row) => row.optimum > 0) ? (row) => (row.optimum > 0 ? row.optimum : null) : () => 1);
+/** What a phase's returns are divided by: its own optimum where one is known for any of the rows, else 1; null if unknown. */
+export function scaling(rows) {
+  const scaled = rows.some((row) => row.phases.some((phase) => phase.optimum > 0));
+  return { scaled, scale: (phase) => (scaled ? (phase.optimum > 0 ? phase.optimum : null) : 1) };
+}
+
+/** A row's phase of that name, if it has returns that can be drawn. */
+const drawable = (row, name, scale) => row.phases.find((phase) => phase.name === name && phase.trials.length && scale(phase) !== null);
 
 export function drawAdaptation(rows) {
-  const scale = scaling(rows);
-  const scaled = rows.some((row) => row.optimum > 0);
-  const known = rows.filter((row) => row.phases.length && scale(row) !== null);
-  const phases = [...new Set(known.flatMap((row) => row.phases.map((phase) => phase.name)))];
+  const { scaled, scale } = scaling(rows);
+  const phases = [...new Set(rows.flatMap((row) => row.phases.filter((phase) => drawable(row, phase.name, scale)).map((phase) => phase.name)))];
   phases.sort((one, other) => (one === other ? 0 : later(one, other) === one ? -1 : 1)).splice(PHASES);
   const newest = phases[0];
   say(byId("adaptation-unit"), `${scaled ? "return over the optimal return" : "return"}, by episode`);
   if (!newest) return;
-  const columns = phases.map((name) => means(known, name, scale));
+  const begun = rows.filter((row) => row.phases.some((phase) => phase.name === newest && phase.trials.length));
+  const known = begun.filter((row) => drawable(row, newest, scale));
+  const columns = phases.map((name) => means(rows, name, scale));
   const trials = ordered(columns[0]).slice(-LONGEST);
   const x = trials.map((trial) => trial + 1);
   const [low, high] = spread(known, newest, scale, trials);
@@ -34,17 +40,17 @@ export function drawAdaptation(rows) {
   shown.phases = phases;
   const lines = columns.map((column) => trials.map((trial) => column.get(trial) ?? null));
   chart.draw([x, high, low, ...lines.toReversed()], [scaled, x.length < 2, ...phases].join());
-  describe(columns, phases, known.length, rows.length, scaled);
+  describe(columns, phases, known.length, begun.length, scaled);
 }
 
 /** Mean over variations by trial; any numbers may be trials. */
 function means(rows, name, scale) {
   const sums = new Map();
   for (const row of rows) {
-    const phase = row.phases.find((each) => each.name === name);
+    const phase = drawable(row, name, scale);
     phase?.trials.forEach((trial, index) => {
       const [sum, count] = sums.get(trial) ?? [0, 0];
-      sums.set(trial, [sum + phase.returns[index] / scale(row), count + 1]);
+      sums.set(trial, [sum + phase.returns[index] / scale(phase), count + 1]);
     });
   }
   return new Map(Array.from(sums, ([trial, [sum, count]]) => [trial, sum / count]));
@@ -61,8 +67,8 @@ function sample(rows) {
 function spread(rows, name, scale, trials) {
   const values = new Map(trials.map((trial) => [trial, []]));
   for (const row of sample(rows)) {
-    const phase = row.phases.find((each) => each.name === name);
-    phase?.trials.forEach((trial, index) => values.get(trial)?.push(phase.returns[index] / scale(row)));
+    const phase = drawable(row, name, scale);
+    phase?.trials.forEach((trial, index) => values.get(trial)?.push(phase.returns[index] / scale(phase)));
   }
   const quantile = (q) => [...values.values()].map((of) => (of.sort((a, b) => a - b), of.length ? of[Math.round(q * (of.length - 1))] : null));
   return [quantile(0.1), quantile(0.9)];
@@ -93,11 +99,11 @@ function singles(plot) {
   ctx.strokeStyle = faint("--series-1", shown.rows.length > 60 ? 0.07 : 0.2);
   ctx.lineWidth = devicePixelRatio;
   for (const row of shown.rows) {
-    const phase = row.phases.find((each) => each.name === shown.newest);
+    const phase = drawable(row, shown.newest, shown.scale);
     if (!phase) continue;
     ctx.beginPath();
     phase.trials.forEach((trial, index) => {
-      const [x, y] = [plot.valToPos(trial + 1, "x", true), plot.valToPos(phase.returns[index] / shown.scale(row), "y", true)];
+      const [x, y] = [plot.valToPos(trial + 1, "x", true), plot.valToPos(phase.returns[index] / shown.scale(phase), "y", true)];
       if (index) ctx.lineTo(x, y);
       else ctx.moveTo(x, y);
     });

@@ -7,6 +7,14 @@ import { factsOf } from "./monitor-panels.js";
 
 const INKS = ["--series-1", "--series-4", "--series-6"];
 
+/** The phases whose own optimum is known: each round has another adversary. */
+const solved = (row) => row.phases.filter((phase) => phase.optimum !== null);
+
+function phaseWords(phase) {
+  const optimal = phase.optimum === null ? "" : `, optimal ${brief(phase.optimum)}`;
+  return `${phase.name}: ${plural(phase.returns.length, "episode")}, last ${brief(phase.returns.at(-1))}${optimal}`;
+}
+
 export class Detail {
   constructor(store, episodes) {
     this.store = store;
@@ -69,15 +77,11 @@ export class Detail {
       const returns = new Map(phase.trials.map((trial, index) => [trial, phase.returns[index]]));
       return trials.map((trial) => returns.get(trial) ?? null);
     });
-    const bound = row.optimum === null ? [] : [trials.map(() => row.optimum)];
+    const during = (phase, trial) => trial >= phase.trials[0] && trial <= phase.trials.at(-1);
+    const bounds = solved(row).map((phase) => trials.map((trial) => (during(phase, trial) ? phase.optimum : null)));
     const x = trials.map((trial) => trial + 1);
-    this.chart.draw([x, ...bound, ...columns], JSON.stringify([row.name, row.optimum, row.phases.map((phase) => phase.name)]));
-    const last = row.phases.at(-1);
-    say(
-      byId("detail-summary"),
-      `${row.phases.map((phase) => `${phase.name}: ${plural(phase.returns.length, "episode")}, last ${brief(phase.returns.at(-1))}`).join("; ")}` +
-        (last && row.optimum !== null ? `; optimal ${brief(row.optimum)}` : ""),
-    );
+    this.chart.draw([x, ...bounds, ...columns], JSON.stringify([row.name, row.phases.map((phase) => [phase.name, phase.optimum])]));
+    say(byId("detail-summary"), row.phases.map(phaseWords).join("; "));
     if (row.episode && row.episode.identity !== this.tile.episode?.identity) {
       byId("detail-episode").replaceChildren(this.tile.element);
       this.tile.show(row.episode);
@@ -88,13 +92,16 @@ export class Detail {
 
   #options() {
     const { row } = this;
-    const bound = row.optimum === null ? [] : [line("optimum, expected", "--ok", { width: 1.5, dash: [6, 4] })];
     const newest = row.phases.length - 1;
+    const bounds = solved(row).map((phase) => {
+      const now = phase === row.phases[newest];
+      return line(now ? "optimum, expected" : `optimum, ${phase.name}`, "--ok", { width: now ? 1.5 : 1, dash: now ? [6, 4] : [2, 4] });
+    });
     const lines = row.phases.map((phase, index) => line(phase.name, INKS[newest - index] ?? INKS[2], { width: index === newest ? 2.5 : 1.5, points: { show: phase.returns.length < 40, size: 5 } }));
     return {
       scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), (high ?? 1) * 1.06 || 1] } },
       axes: [axis({ size: 22, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis()],
-      series: [{ label: "episode" }, ...bound, ...lines],
+      series: [{ label: "episode" }, ...bounds, ...lines],
     };
   }
 

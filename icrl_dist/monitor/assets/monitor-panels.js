@@ -31,9 +31,14 @@ export function drawHeader({ run, replay }) {
 export function drawAlerts({ alerts }) {
   const place = byId("alerts");
   const words = alerts.map((alert) => `${alert.text} (since ${clock(alert.since)})`);
-  if (place.dataset.words === words.join("\n")) return;
-  place.dataset.words = words.join("\n");
-  place.replaceChildren(...words.map((text) => el("p", {}, el("strong", {}, "Alert: "), text)));
+  if (place.dataset.words !== words.join("\n")) {
+    place.dataset.words = words.join("\n");
+    const at = place.scrollTop;
+    place.replaceChildren(...words.map((text) => el("p", {}, el("strong", {}, "Alert: "), text)));
+    place.scrollTop = at;
+  }
+  if (words.length > 1) place.tabIndex = place.scrollHeight > place.clientHeight ? 0 : -1; // keys scroll it where it scrolls
+  else place.removeAttribute("tabindex");
 }
 
 const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 500];
@@ -166,9 +171,12 @@ export class Events {
   }
 }
 
+const against = (adversary) => [String(adversary.kind ?? "?"), parameters(adversary, ["kind"])].filter(Boolean).join(": ");
+
 export const factsOf = (row) => [
   ["Task", parameters(row.parameters) || "–"],
-  ["Adversary", [String(row.adversary.kind ?? "?"), parameters(row.adversary, ["kind"])].filter(Boolean).join(": ")],
+  ["Adversary", against(row.adversary)],
+  ...row.phases.slice(0, -1).map((phase) => [`Adversary of ${phase.name}`, against(phase.adversary)]).filter(([, words]) => words !== against(row.adversary)),
   ["Optimal return, expected", brief(row.optimum)],
   ...(row.quarantine ? [["Quarantined", row.quarantine]] : []),
 ];

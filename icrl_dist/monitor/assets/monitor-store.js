@@ -49,7 +49,8 @@ export function apply(store, told) {
     store.episodes.delete(name);
   }
   append(store, told);
-  Object.assign(store.beliefs, told.beliefs);
+  const believe = { ...store.beliefs, ...told.beliefs };
+  store.beliefs = Object.fromEntries(told.believers.filter((worker) => Object.hasOwn(believe, worker)).map((worker) => [worker, believe[worker]]));
   return true;
 }
 
@@ -66,15 +67,7 @@ function append(store, told) {
   if (store.events.length > EVENTS) store.events.splice(0, store.events.length - EVENTS);
 }
 
-/** The phase that goes on now: of the newest returns. */
-export function newestPhase(store) {
-  const last = (row) => row.phases.at(-1)?.name ?? "";
-  let newest = "";
-  for (const row of store.variations.values()) newest = later(newest, last(row));
-  return newest;
-}
-
-const ORDER = ["pretrain", "practice", "adapt"];
+const ORDER = ["pretrain", "adapt", "evaluate"];
 
 /** The later of two phases, by stage and round. */
 export function later(one, other) {

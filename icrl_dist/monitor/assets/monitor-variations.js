@@ -110,7 +110,7 @@ export class Variations {
   }
 
   #offerKinds() {
-    const kinds = [...new Set([...this.store.variations.values()].map((row) => String(row.adversary.kind)))].sort().slice(0, 50);
+    const kinds = [...new Set([...this.store.variations.values()].filter((row) => row.adversary.kind).map((row) => String(row.adversary.kind)))].sort().slice(0, 50);
     if (kinds.join("\n") === this.kinds) return;
     this.kinds = kinds.join("\n");
     const select = byId("adversary-filter");

@@ -136,7 +136,7 @@ function showRoom() {
 
 /** Show the game's value, unless this control is being moved. */
 function settle(control, value) {
-  if (document.activeElement !== control || control.dataset.idle) control.value = value;
+  if (document.activeElement !== control) control.value = value;
 }
 
 // Surprise: a scale with its two landmarks.
