@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -195,6 +195,7 @@ def train_ray(
                     working = fleet.watch(lambda text: report({"event": "note", "text": text}), stored + given_up)
                 except FleetFailed as error:
                     raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
+                learner.excuse(fleet.lost)
                 if not working:
                     raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
     if interrupted.is_set():  # while everything was closed
@@ -225,6 +226,7 @@ class _Learner:
         self._queue: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._error = ""
         self._finished = False
+        self._excused: list[str] = []
         self.deaths = 0
         """Times that it was killed and started again."""
         self._start()
@@ -232,7 +234,8 @@ class _Learner:
     def _start(self) -> None:
         command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
         self._log = (self._folder / "learner.err").open("ab")
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, start_new_session=True)
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True)
         threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:
@@ -258,6 +261,17 @@ class _Learner:
                 self._finished = True
             yield event
 
+    def excuse(self, workers: Sequence[str]) -> None:
+        """Tell it of the workers, of all so far, that were lost with their machines: their jobs are not to blame."""
+        if new := workers[len(self._excused) :]:
+            self._excused += new
+            self._tell(new)
+
+    def _tell(self, workers: Sequence[str]) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has died, and the next one is told
+            os.write(self._process.stdin.fileno(), json.dumps(workers).encode() + b"\n")
+
     def watch(self, report: Report) -> None:
         """Start the learner again from its checkpoint if it was killed.
 
@@ -279,8 +293,9 @@ class _Learner:
         self._budget -= 1
         self.deaths += 1
         report({"event": "note", "text": f"the learner died (exit code {code}); starting it again from its checkpoint"})
-        self._log.close()
+        self._let_go()
         self._start()
+        self._tell(self._excused)
 
     def interrupt(self, report: Report) -> None:
         """Ask it to write a checkpoint and end."""
@@ -299,6 +314,11 @@ class _Learner:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
         self._log.close()
 
 
