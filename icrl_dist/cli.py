@@ -45,7 +45,9 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     if isinstance(found, arguments.Train) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
         base = load(found.run or str(parse_source(found.source or "")[0] / "run.toml"))
-        return tyro.cli(kind, prog=prog, args=list(words), default=arguments.Train(run=found.run, config=base))
+        return tyro.cli(
+            kind, prog=prog, args=list(words), default=arguments.Train(run=found.run, given=tuple(words), config=base)
+        )
     return found
 
 

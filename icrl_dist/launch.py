@@ -7,6 +7,7 @@ neither Ray nor Zenoh.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import platform
@@ -45,7 +46,7 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
     """Make the run folder: ``run.toml``, ``env.json``, and with ``source`` what another run's version stands on.
 
     Raises ConfigError if the folder exists and is neither to be resumed nor overwritten, or
-    is to be resumed with other numbers.
+    is to be resumed with other numbers; where its learner listens and is reached may have changed.
     """
     try:
         Keys(folder.name)
@@ -58,17 +59,28 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
         raise ConfigError(f"{folder} exists: use --resume to go on with it, --overwrite to begin anew, or another --out")
     if resume and not file.exists():
         raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to begin one")
-    if resume and load(str(file)) != run:
+    before = load(str(file)) if resume else None
+    if before is not None and _elsewhere(before, run) != run:
         raise ConfigError(f"--resume: {file} has other numbers than asked for; resume with the run's own, or use another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if source is not None and not resume:
             _fork(*source, run, folder)
-        if not resume:
+        if before is None:
             file.write_text(dumps(run))
+        elif before != run:
+            began = file.stat()
+            atomic_write(file, lambda to: to.write(dumps(run).encode()))
+            os.utime(file, ns=(began.st_atime_ns, began.st_mtime_ns))  # when the run began
         atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+def _elsewhere(run: Run, other: Run) -> Run:
+    """The run with the other's places, which are the head's and no part of a result: another head may go on."""
+    there = {name: getattr(other.stream, name) for name in ("endpoint", "connect", "certificates")}
+    return dataclasses.replace(run, stream=dataclasses.replace(run.stream, **there))
 
 
 def _fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
@@ -156,18 +168,15 @@ def train_ray(
         stack.enter_context(_on_signals(interrupted.set))
         if address is None:  # both start at once; on a cluster nothing does before its machines are known to fit
             learner = stack.enter_context(_learner(run, folder))
-        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least)
-        stack.callback(fleet.close)
-        stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
+        note = lambda text: report({"event": "note", "text": text})  # noqa: E731
+        with _unmade_if_refused(folder) if address is not None else contextlib.nullcontext():
+            fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least)
+            stack.callback(fleet.close)
+            stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
+            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
+            if address is not None and interrupted.is_set():
+                raise TrainInterrupted
         if address is not None:
-            note = lambda text: report({"event": "note", "text": text})  # noqa: E731
-            try:
-                fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
-                if interrupted.is_set():
-                    raise TrainInterrupted
-            except (ConfigError, TrainInterrupted):
-                _unmake(folder)
-                raise
             learner = stack.enter_context(_learner(run, folder))
         result: dict[str, Any] | None = None
         started = False
@@ -192,9 +201,9 @@ def train_ray(
             learner.watch(report)
             if started:
                 try:
-                    working = fleet.watch(lambda text: report({"event": "note", "text": text}), stored + given_up)
+                    working = fleet.watch(note, stored + given_up)
                 except FleetFailed as error:
-                    raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
+                    raise TrainFailed(f"{error}; the same command with --resume goes on from the last checkpoint") from None
                 learner.excuse(fleet.lost)
                 if not working:
                     raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
@@ -203,10 +212,15 @@ def train_ray(
     return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
 
 
-def _unmake(folder: Path) -> None:
-    """Remove a run folder in which nothing has happened yet, so that the same command can be given again."""
-    if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
-        shutil.rmtree(folder)
+@contextlib.contextmanager
+def _unmade_if_refused(folder: Path) -> Iterator[None]:
+    """Removes a run folder in which nothing has happened yet, so that the same command can be given again."""
+    try:
+        yield
+    except (ConfigError, TrainInterrupted):
+        if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
+            shutil.rmtree(folder)
+        raise
 
 
 @contextlib.contextmanager

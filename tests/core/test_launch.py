@@ -1,4 +1,4 @@
-"""The learner as a child process: what it is told, and a child that dies."""
+"""Run folders that are taken up or refused, and the learner as a child process: what it is told, and one that dies."""
 
 import os
 import time
@@ -6,7 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from actors import fleet
 from icrl_dist import launch
+from icrl_dist.config import ConfigError, load, override
 from learner.__main__ import _listen
 
 
@@ -48,3 +50,28 @@ def test_what_it_is_told_goes_to_the_desk():
     _listen(SimpleNamespace(desk=SimpleNamespace(excuse=heard.append)), read)
     os.close(read)
     assert heard == [["w0"], ["w1", "w2"]]
+
+
+def test_a_run_goes_on_where_another_head_listens_and_with_no_other_number(small_run, tmp_path):
+    folder = tmp_path / "run"
+    launch.prepare(small_run, folder, resume=False, overwrite=False)
+    file = folder / "run.toml"
+    os.utime(file, (1e9, 1e9))
+    elsewhere = override(small_run, ["stream.endpoint=tls/10.0.0.9:7447", "stream.certificates=/c"], "--set")
+    launch.prepare(elsewhere, folder, resume=True, overwrite=False)
+    assert load(str(file)) == elsewhere and file.stat().st_mtime == 1e9
+    with pytest.raises(ConfigError, match="has other numbers"):
+        launch.prepare(override(elsewhere, ["seed=7"], "--set"), folder, resume=True, overwrite=False)
+    with pytest.raises(ConfigError, match="has other numbers"):
+        launch.prepare(override(elsewhere, ["stream.credits=3"], "--set"), folder, resume=True, overwrite=False)
+
+
+def test_a_cluster_that_is_not_there_leaves_no_folder(small_run, tmp_path, monkeypatch):
+    def absent(*_):
+        raise ConfigError("--address auto: nobody there")
+
+    monkeypatch.setattr(fleet, "Fleet", absent)
+    launch.prepare(small_run, tmp_path / "run", resume=False, overwrite=False)
+    with pytest.raises(ConfigError, match="nobody there"):
+        launch.train_ray(small_run, tmp_path / "run", None, "auto", print)
+    assert not (tmp_path / "run").exists()
