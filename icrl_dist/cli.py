@@ -90,7 +90,7 @@ def _code(error: Exception) -> int | None:
 
     if isinstance(error, (ConfigError, LinkError)):
         return USAGE
-    from icrl_dist.launch import TrainFailed
+    from icrl_dist.child import TrainFailed
 
     return FAILED if isinstance(error, (TrainFailed, StoreError, Unanswered)) else None
 

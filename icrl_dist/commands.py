@@ -253,7 +253,7 @@ def chaos(arguments: Chaos, console: Console) -> int:
     """``icrl-dist chaos``: exit code 1 if a fault did not land or changed a digest."""
     from icrl_dist.chaos.campaign import Campaign
     from icrl_dist.chaos.training import Broken
-    from icrl_dist.launch import TrainFailed
+    from icrl_dist.child import TrainFailed
 
     given = arguments
     if given.seeds < 1 or given.actors < 1:
