@@ -149,6 +149,7 @@ def test_killed_raylets_a_killed_learner_and_a_machine_that_joins_midway(cluster
         assert process.wait(timeout=200) == 0, printed()
     result = cluster.result("killed")
     same(result, inline())
+    assert result["worker_deaths"] == 0, "raylets were lost, and with them their workers"
     assert result["learner_deaths"] == 1 and "the learner died (exit code -9)" in printed()
     assert re.search(r"late \(10.0.0.5\): w\d", printed()), printed()
     assert set(cluster.workers_of("killed")) - {"w0", "w1"}, "nobody was needed but those that were killed"
