@@ -10,10 +10,12 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from actors.cluster import Cluster
+from actors.cluster import Cluster, brief
+from actors.host import _Host
 from actors.placement import Machine, Placement
 from icrl_dist.config import ConfigError
 
@@ -26,27 +28,19 @@ JOIN_S = 600.0
 """Seconds that the machines of a cluster have to join it; the first time they install everything."""
 SHORT_S = 45.0
 """Seconds after which a run says which machines are missing, and why."""
+PROBES_S = 10.0
+"""Seconds that a run, when it has enough machines, waits for those that have not said yet whether they are fit."""
 NOTE_S = 5.0
 """Seconds after which a run says that it waits."""
+DOUBT_S = 6.0
+"""How a worker ended that was on a machine which does not answer is looked at again so often."""
+SOON_S = 60.0
+"""A worker that died so shortly before its machine did not die by itself."""
 _PAUSE_S = 0.25
 
 
 class FleetFailed(RuntimeError):  # noqa: N818
     """Workers keep dying; the message names the last cause."""
-
-
-def _work(endpoint: str, run_name: str, name: str, folder: str | None, certificates: str) -> None:
-    """A worker's whole life, in a process that Ray made."""
-    import torch
-
-    from actors import router
-    from actors.worker import Worker
-    from icrl_dist.stream.zenoh_link import ZenohLink
-
-    torch.set_num_threads(1)
-    where, settings = router.reached(endpoint, certificates)
-    with ZenohLink.connect(where, timeout_s=30.0, config=settings) as link:
-        Worker(link, run_name, name, folder=Path(folder) if folder else None).run()
 
 
 def check_cores(actors: int) -> None:
@@ -109,7 +103,12 @@ class Fleet:
             self._placement.join(Machine("", "127.0.0.1", "", actors or 1))
         self._budget: dict[int, int] = {}
         self._at_death: dict[int, int] = {}
+        self.lost: list[str] = []
+        """Names of those, in the order in which it became known: nothing that they did is to blame."""
         self._running: dict[Any, tuple[int, Any, str]] = {}
+        self._doubtful: list[_Doubt] = []
+        self._recent: list[tuple[float, int, str, str]] = []
+        """Deaths that counted: when, whose, on which machine, and under which name."""
         self._spare: Any = None
         self._lives: dict[int, int] = {}
         self._endpoint = self._run_name = self._certificates = ""
@@ -129,13 +128,17 @@ class Fleet:
             return
         self._cluster.look_for(endpoint, connect, certificates)
         began, noted, told = time.monotonic(), False, False
+        since: float | None = None
         with self._cluster.listening(endpoint, connect):
             while not stopped():
                 unfit = self._cluster.refresh(note)
                 if unfit:
                     raise ConfigError("; ".join(unfit))
                 waited, room, wanted = time.monotonic() - began, self._placement.room, self._placement.wanted
-                if room >= self._at_least and (wanted is not None or not self._cluster.absent()) and room >= (wanted or 1):
+                enough = room >= self._at_least and (wanted is not None or not self._cluster.absent()) and room >= (wanted or 1)
+                since = None if not enough else since or time.monotonic()
+                # Nobody listens for some seconds after this: who was asked should have tried by then.
+                if since and (not self._cluster.undecided or time.monotonic() - since >= PROBES_S):
                     return
                 text = f"the cluster at {self._address} has {room} cores for {wanted or 'its'} workers"
                 if waited >= NOTE_S and not noted:
@@ -192,33 +195,58 @@ class Fleet:
         if self._cluster is not None:
             for line in self._cluster.refresh(note):
                 note(f"{line}; no worker is placed there")
-            self._forget_those_that_went_with_their_machine()
         elif progress and self._restarts and self._spare is None:
             self._spare = self._host(0)  # a cluster has no place that costs nothing
         ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0) if self._running else ([], [])
+        due = [doubt for doubt in self._doubtful if time.monotonic() >= doubt.due]
+        self._doubtful = [doubt for doubt in self._doubtful if doubt not in due]
         for done in ready:
-            index, _host, node = self._running.pop(done)
+            index, host, node = self._running.pop(done)
             try:
                 self._ray.get(done)
             except Exception as error:
-                self._ended(index, node, error, note, progress)
+                due.append(_Doubt(index, host, node, error))
             else:
                 self._leaves_its_place(index)
+        for doubt in due:
+            self._ended(doubt, note, progress)
+        if self._cluster is not None:  # before anyone is launched anew: names are of one life
+            self._forget_those_that_went_with_their_machine()
         settled = self._placement.settle()
         for index, machine in settled:
             self._launch(index, machine.node)
         if settled and self._cluster is not None:
             note(f"workers: {self._placement.landed(self._name)}")
         self._not_alone()
-        return len(self._running) + len(self._placement.waiting)
+        return len(self._running) + len(self._doubtful) + len(self._placement.waiting)
 
     def _forget_those_that_went_with_their_machine(self) -> None:
-        for work, (index, host, node) in list(self._running.items()):
-            if node not in self._placement.machines:
-                del self._running[work]
-                self._lives[index] = self._lives.get(index, 0) + 1
-                with contextlib.suppress(Exception):  # it may be alive, cut off for good
-                    self._ray.kill(host)
+        gone = {work: one for work, one in self._running.items() if one[2] not in self._placement.machines}
+        for work, (index, host, _) in gone.items():
+            del self._running[work]
+            self._went(index, host)
+        for doubt in [doubt for doubt in self._doubtful if doubt.node not in self._placement.machines]:
+            self._doubtful.remove(doubt)
+            self._went(doubt.index, doubt.host)
+        self._recent = [one for one in self._recent if time.monotonic() - one[0] < SOON_S]
+        for death in [one for one in self._recent if one[2] not in self._placement.machines]:
+            self._recent.remove(death)  # a machine that is shut down ends its workers before Ray's own process
+            self._uncount(death[1], death[3])
+
+    def _uncount(self, index: int, name: str) -> None:
+        self.lost.append(name)
+        self.deaths -= 1
+        self._budget[index] = min(self._restarts, self._budget[index] + 1)
+
+    def _went(self, index: int, host: Any) -> None:
+        """A worker is lost with its machine: that is no fault of its own."""
+        self.lost.append(self._name(index))
+        self._lives[index] = self._lives.get(index, 0) + 1
+        self._kill(host)  # it may be alive, cut off for good
+
+    def _kill(self, host: Any) -> None:
+        with contextlib.suppress(Exception):
+            self._ray.kill(host)
 
     def _leaves_its_place(self, index: int) -> None:
         """It was told to stop: nobody stands where it stood, and nobody comes."""
@@ -226,13 +254,25 @@ class Fleet:
             machine.workers.discard(index)
             machine.cores -= 1
 
-    def _ended(self, index: int, node: str, error: Exception, note: Callable[[str], None], progress: int) -> None:
-        """A worker died: with its machine, or by itself, which counts."""
+    def _ended(self, doubt: _Doubt, note: Callable[[str], None], progress: int) -> None:
+        """A worker died: with its machine, or by itself, which counts.
+
+        Ray calls a machine alive for a quarter of a minute and more after its end, but knows of a
+        broken connection at once: while a machine does not answer, nothing is decided.
+        """
+        index, host, node, error = doubt.index, doubt.host, doubt.node, doubt.error
+        if self._cluster is not None:
+            if self._cluster.lost(node, note):
+                self._went(index, host)
+                return
+            if isinstance(error, self._ray.exceptions.RayActorError) and not self._cluster.answers(node):
+                self._doubtful.append(_Doubt(index, host, node, error, time.monotonic() + DOUBT_S))
+                return
+            self._kill(host)  # it may be alive, and nobody would see its end
+            self._recent.append((time.monotonic(), index, node, self._name(index)))
         self._lives[index] = self._lives.get(index, 0) + 1
-        if self._cluster is not None and self._cluster.lost(node, note):
-            return
         self.deaths += 1
-        cause = _cause(error)
+        cause = brief(error)
         if progress > self._at_death.get(index, -1):
             self._budget[index] = self._restarts
         self._at_death[index] = progress
@@ -258,27 +298,17 @@ class Fleet:
     def close(self) -> None:
         """End every worker, and Ray if it was started here."""
         for host in [host for _, host, _ in self._running.values()] + [self._spare] * (self._spare is not None):
-            with contextlib.suppress(Exception):
-                self._ray.kill(host)
+            self._kill(host)
         self._running.clear()
         self._ray.shutdown()
 
 
-class _Host:
-    """The Ray actor: a process for one worker.
+@dataclass(frozen=True, eq=False)
+class _Doubt:
+    """A worker that has ended, by itself or with its machine."""
 
-    A spare one waits with everything imported, so that a worker that dies is replaced at once
-    and not after the seconds that a new process takes.
-    """
-
-    def __init__(self) -> None:
-        import actors.worker  # noqa: F401 (and torch, which takes the longest)
-        import icrl_dist.stream.zenoh_link  # noqa: F401
-
-    def work(self, endpoint: str, run_name: str, name: str, folder: str | None, certificates: str) -> None:
-        _work(endpoint, run_name, name, folder, certificates)
-
-
-def _cause(error: BaseException) -> str:
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    return lines[-1].strip()[:200] if lines else type(error).__name__
+    index: int
+    host: Any
+    node: str
+    error: Exception
+    due: float = 0.0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import re
+import socket
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,11 +50,20 @@ def expected(bootstrap: Path | None = None) -> Expected:
 
 def report(promised: Expected, here: Collection[str], logs: Path | None = None) -> list[str]:
     """A line for each machine that is not among the addresses ``here``: which, and the end of what the log says of it."""
-    absent = [address for address in promised.addresses if address not in here]
+    absent = [address for address in promised.addresses if not {address, *_resolved(address)} & set(here)]
     if promised.addresses:
         return [f"{address} has not joined: {_said(logs or LOGS, address)}" for address in absent]
     lacking = promised.count - len(here)
     return [f"{lacking} of {promised.count} machines have not joined: {_said(logs or LOGS, '')}"] if lacking > 0 else []
+
+
+@functools.lru_cache
+def _resolved(name: str) -> frozenset[str]:
+    """The addresses that a name in a cluster file stands for, as Ray's machines go by theirs."""
+    try:
+        return frozenset(str(found[4][0]) for found in socket.getaddrinfo(name, None))
+    except OSError:
+        return frozenset()
 
 
 def _said(logs: Path, address: str) -> str:

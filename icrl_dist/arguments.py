@@ -47,6 +47,8 @@ class Train:
     """Delete the run in the folder first."""
     json: bool = False
     """Print the result as one JSON object on the last line."""
+    given: tyro.conf.Suppress[tuple[str, ...]] = ()
+    """The words of the command."""
     config: Annotated[Run, tyro.conf.arg(name="")] = field(default_factory=Run)
 
 

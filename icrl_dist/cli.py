@@ -6,6 +6,7 @@ checkpoint written.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -45,13 +46,16 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     if isinstance(found, arguments.Train) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
         base = load(found.run or str(parse_source(found.source or "")[0] / "run.toml"))
-        return tyro.cli(kind, prog=prog, args=list(words), default=arguments.Train(run=found.run, config=base))
+        return tyro.cli(
+            kind, prog=prog, args=list(words), default=arguments.Train(run=found.run, given=tuple(words), config=base)
+        )
     return found
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """The ``icrl-dist`` command.  Returns its exit code."""
     words = list(sys.argv[1:] if words is None else words)
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's threads, here and in what is started: see docs/decisions.md
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
@@ -88,7 +92,7 @@ def _code(error: Exception) -> int | None:
 
     if isinstance(error, (ConfigError, LinkError)):
         return USAGE
-    from icrl_dist.launch import TrainFailed
+    from icrl_dist.child import TrainFailed
 
     return FAILED if isinstance(error, (TrainFailed, StoreError, Unanswered)) else None
 

@@ -48,6 +48,7 @@ def findings(config: dict[str, Any], root: Path) -> list[Finding]:
         *_provider(config),
         *(_node_configs(cloud, config) if cloud in _REQUIRED else ()),
         *_head(config),
+        _workers(config),
         *_mounts(config, root),
         *_commands(config),
         *_container(config),
@@ -143,14 +144,26 @@ def _head(config: dict[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "head", None, "is a spot instance: the run stops when it is taken", "pay for the head; spot is for workers"
         )
-    workers = {n: t for n, t in types.items() if n != config.get("head_node_type")}
-    low, high = (sum(int(t.get(key, 0)) for t in workers.values()) for key in ("min_workers", "max_workers"))
+
+
+def _workers(config: dict[str, Any]) -> Finding:
+    """How many machines there will be: as many as there are at least, for a run waits for machines and asks for none."""
+    name = "workers"
     if config["provider"]["type"] == "local":
-        low = high = len(config["provider"].get("worker_ips") or [])
-    if not high:
-        yield Finding("workers", False, "none", "say min_workers and max_workers of a node type that is not the head's")
-    else:
-        yield Finding("workers", True, f"{low} machines" if low == high else f"{low} to {high} machines")
+        count = len(config["provider"].get("worker_ips") or [])
+        return Finding(name, count > 0, f"{count} machines", "" if count else "name some in provider.worker_ips")
+    types = config.get("available_node_types") or {}
+    kinds = [kind for other, kind in types.items() if other != config.get("head_node_type")]
+    most = int(config.get("max_workers", 2))  # Ray's, for the cluster and for a type that does not say
+    low = sum(int(kind.get("min_workers", 0)) for kind in kinds)
+    high = min(most, sum(int(kind.get("max_workers", most)) for kind in kinds))
+    if not low:
+        remedy = "say min_workers and max_workers of a node type that is not the head's"
+        return Finding(name, False, f"none; up to {high} if anything asked for them" if high else "none", remedy)
+    if low < high:
+        said = f"{low} machines, and nothing asks for the {high - low} more that max_workers allows"
+        return Finding(name, None, said, "say min_workers as many as you want")
+    return Finding(name, True, f"{low} machines")
 
 
 def _mounts(config: dict[str, Any], root: Path) -> Iterator[Finding]:
@@ -195,7 +208,7 @@ def _commands(config: dict[str, Any]) -> Iterator[Finding]:
             yield Finding(
                 "open files", None, f"{name}_start_ray_commands leave the limit as it is", "begin with ulimit -n $(ulimit -Hn);"
             )
-    if "RAY_AUTH_MODE=token" not in json.dumps(config):
+    if "RAY_AUTH_MODE=token" not in json.dumps(config) and not config.get("docker"):  # the image sets it
         yield Finding(
             "Ray's token", False, "no command sets RAY_AUTH_MODE=token", "export it in ~/.bashrc, as in deploy/clusters/"
         )
@@ -216,6 +229,13 @@ def _container(config: dict[str, Any]) -> Iterator[Finding]:
     docker = config.get("docker") or {}
     if not docker:
         return
+    commands = {name: " ".join(config.get(name) or []) for name in ("setup_commands", "head_setup_commands")}
+    used = [name for name, words in commands.items() if ".venv/" in words]
+    remedy = "leave both empty, as in setup_commands: [], for deploy/Dockerfile has what they install"
+    if "-m venv" in commands["setup_commands"]:
+        yield Finding("container", None, f"{' and '.join(used)} install once more what its image has", remedy)
+    elif used:
+        yield Finding("container", False, f"{used[0]} call .venv/bin/pip, which is not in the image", remedy)
     options = " ".join(docker.get("run_options") or [])
     for option in ("--shm-size", "--ulimit nofile"):
         if option not in options:
@@ -228,7 +248,7 @@ def _filled_in(config: dict[str, Any]) -> Finding:
     """Whether every example value has been changed; an example is never a machine's or an account's own."""
     left = sorted({value for value in _texts(config) if _example(value)})
     if left:
-        return Finding("values", None, f"still the example's: {', '.join(left)}", "fill them in before ray up")
+        return Finding("values", False, f"still the example's: {', '.join(left)}", "fill them in before ray up")
     return Finding("values", True, "no example value is left")
 
 

@@ -6,10 +6,12 @@ import contextlib
 import dataclasses
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,9 +73,9 @@ def train(arguments: Train, console: Console) -> int:
                     save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
                     results = heldout.online(run, folder, display)
     except launch.TrainInterrupted:
-        given = arguments.run or f"--from {arguments.source}"
-        resume = f"`icrl-dist train {given} --resume` goes on from the checkpoint"
-        console.print(f"interrupted; {resume if folder.exists() else 'nothing had been done yet'}", markup=False)
+        resume = f"`{_resuming(arguments.given)}` goes on from the checkpoint"
+        told = f"interrupted; {resume if folder.exists() else 'nothing had been done yet'}"
+        console.print(told, highlight=False, markup=False, soft_wrap=True)
         return INTERRUPTED
     result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
     if run.method == "experts":
@@ -94,6 +96,13 @@ def train(arguments: Train, console: Console) -> int:
     if arguments.json:
         print(json.dumps(result))
     return FAILED if result["quarantined"] else OK
+
+
+def _resuming(given: Sequence[str]) -> str:
+    """The command that goes on with what ``icrl-dist train`` was given, for a shell."""
+    words = [word for word in given if word not in ("--overwrite", "--resume")]
+    where = 1 if words and not words[0].startswith("-") else len(words)  # behind RUN, or at the end
+    return shlex.join(["icrl-dist", "train", *words[:where], "--resume", *words[where:]])
 
 
 def evaluate(arguments: Evaluate, console: Console) -> int:
@@ -280,7 +289,7 @@ def chaos(arguments: Chaos, console: Console) -> int:
     """``icrl-dist chaos``: exit code 1 if a fault did not land or changed a digest."""
     from icrl_dist.chaos.campaign import Campaign
     from icrl_dist.chaos.training import Broken
-    from icrl_dist.launch import TrainFailed
+    from icrl_dist.child import TrainFailed
 
     given = arguments
     if given.seeds < 1 or given.actors < 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import errno
 import io
 import logging
 import os
@@ -232,21 +233,44 @@ def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Fin
     """A live cluster, asked through Ray: every machine's versions, clock, shared memory, certificates and the ports it needs.
 
     ``endpoint``: where the learner would listen on this machine, which is taken to be the head.
-    Raises ConfigError if the cluster does not answer.
+    Raises ConfigError if the cluster does not answer, or if that is no endpoint.
     """
     import ray as module
 
     ray: Any = module
+    try:
+        where = endpoints.parse(endpoint)
+    except ValueError as error:
+        raise ConfigError(f"--endpoint {endpoint}: {error}") from None
     need_ray_token(address)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(f"--address {address}: {error}; `ray status` there says whether a cluster is up") from None
     try:
-        where = endpoints.parse(endpoint)
-        with nodes.listening(where.host, where.port) as port:
-            return machines.examine(ray, (where.host, port), certificates)
-    except OSError as error:
-        return [Finding("stream endpoint", False, f"{endpoint}: {error}", "choose an address of the head and a free port")]
+        with _reachable(where, endpoint, len([node for node in ray.nodes() if node["Alive"]])) as (learner, findings):
+            return [*findings, *machines.examine(ray, learner, certificates)]
     finally:
         ray.shutdown()
+
+
+@contextlib.contextmanager
+def _reachable(
+    where: endpoints.Endpoint, endpoint: str, count: int
+) -> Iterator[tuple[tuple[str, int] | None, tuple[Finding, ...]]]:
+    """Host and port where somebody listens now, None if machines are not to try that; and what there is to say of it."""
+    name = "stream endpoint"
+    if where.loopback and count > 1:
+        remedy = "say where the learner will listen, as in --endpoint tls/HEAD_IP:7447"
+        yield None, (Finding(name, None, f"{endpoint} is this machine's alone, so no other tries to reach it", remedy),)
+        return
+    with contextlib.ExitStack() as stack:
+        try:
+            port = stack.enter_context(nodes.listening(where.host, where.port))
+        except OSError as error:
+            taken = error.errno == errno.EADDRINUSE  # by whom a machine can try to reach as well
+            remedy = "wait for the run that is on, or choose a free port" if taken else "choose an address of the head"
+            found = Finding(name, None if taken else False, f"{endpoint}: {error.strerror or error}", remedy)
+            yield (where.host, where.port) if taken else None, (found,)
+        else:
+            yield (where.host, port), ()

@@ -7,34 +7,26 @@ neither Ray nor Zenoh.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import platform
-import queue
 import shutil
 import signal
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from icrl_dist import endpoints
+from icrl_dist import child, endpoints
+from icrl_dist.child import Report, TrainFailed
 from icrl_dist.config import ConfigError, Run, dumps, load
 from icrl_dist.doctor import need_ray_token
 from icrl_dist.files import atomic_write
 from icrl_dist.lineage import fork
 from icrl_dist.stream import security
 from icrl_dist.stream.link import Keys
-
-Report = Callable[[dict[str, Any]], None]
-
-
-class TrainFailed(RuntimeError):  # noqa: N818
-    """The run failed; one line for the user."""
 
 
 class TrainInterrupted(Exception):  # noqa: N818
@@ -45,7 +37,7 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
     """Make the run folder: ``run.toml``, ``env.json``, and with ``source`` what another run's version stands on.
 
     Raises ConfigError if the folder exists and is neither to be resumed nor overwritten, or
-    is to be resumed with other numbers.
+    is to be resumed with other numbers; where its learner listens and is reached may have changed.
     """
     try:
         Keys(folder.name)
@@ -58,17 +50,28 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
         raise ConfigError(f"{folder} exists: use --resume to go on with it, --overwrite to begin anew, or another --out")
     if resume and not file.exists():
         raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to begin one")
-    if resume and load(str(file)) != run:
+    before = load(str(file)) if resume else None
+    if before is not None and _elsewhere(before, run) != run:
         raise ConfigError(f"--resume: {file} has other numbers than asked for; resume with the run's own, or use another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if source is not None and not resume:
             _fork(*source, run, folder)
-        if not resume:
+        if before is None:
             file.write_text(dumps(run))
+        elif before != run:
+            began = file.stat()
+            atomic_write(file, lambda to: to.write(dumps(run).encode()))
+            os.utime(file, ns=(began.st_atime_ns, began.st_mtime_ns))  # when the run began
         atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+
+
+def _elsewhere(run: Run, other: Run) -> Run:
+    """The run with the other's places, which are the head's and no part of a result: another head may go on."""
+    there = {name: getattr(other.stream, name) for name in ("endpoint", "connect", "certificates")}
+    return dataclasses.replace(run, stream=dataclasses.replace(run.stream, **there))
 
 
 def _fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
@@ -155,20 +158,17 @@ def train_ray(
     with contextlib.ExitStack() as stack:
         stack.enter_context(_on_signals(interrupted.set))
         if address is None:  # both start at once; on a cluster nothing does before its machines are known to fit
-            learner = stack.enter_context(_learner(run, folder))
-        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least)
-        stack.callback(fleet.close)
-        stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
+            learner = stack.enter_context(child.running(run, folder))
+        note = lambda text: report({"event": "note", "text": text})  # noqa: E731
+        with _unmade_if_refused(folder) if address is not None else contextlib.nullcontext():
+            fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least)
+            stack.callback(fleet.close)
+            stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
+            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
+            if address is not None and interrupted.is_set():
+                raise TrainInterrupted
         if address is not None:
-            note = lambda text: report({"event": "note", "text": text})  # noqa: E731
-            try:
-                fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
-                if interrupted.is_set():
-                    raise TrainInterrupted
-            except (ConfigError, TrainInterrupted):
-                _unmake(folder)
-                raise
-            learner = stack.enter_context(_learner(run, folder))
+            learner = stack.enter_context(child.running(run, folder))
         result: dict[str, Any] | None = None
         started = False
         stored = given_up = 0
@@ -192,9 +192,10 @@ def train_ray(
             learner.watch(report)
             if started:
                 try:
-                    working = fleet.watch(lambda text: report({"event": "note", "text": text}), stored + given_up)
+                    working = fleet.watch(note, stored + given_up)
                 except FleetFailed as error:
-                    raise TrainFailed(f"{error}; `icrl-dist train --resume` goes on from the last checkpoint") from None
+                    raise TrainFailed(f"{error}; the same command with --resume goes on from the last checkpoint") from None
+                learner.excuse(fleet.lost)
                 if not working:
                     raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
     if interrupted.is_set():  # while everything was closed
@@ -202,104 +203,15 @@ def train_ray(
     return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
 
 
-def _unmake(folder: Path) -> None:
-    """Remove a run folder in which nothing has happened yet, so that the same command can be given again."""
-    if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
-        shutil.rmtree(folder)
-
-
 @contextlib.contextmanager
-def _learner(run: Run, folder: Path) -> Iterator[_Learner]:
-    learner = _Learner(folder, run.stream.endpoint, run.learner.restarts)
+def _unmade_if_refused(folder: Path) -> Iterator[None]:
+    """Removes a run folder in which nothing has happened yet, so that the same command can be given again."""
     try:
-        yield learner
-    finally:
-        learner.end()
-
-
-class _Learner:
-    """The learner process: its events, its restarts, its end."""
-
-    def __init__(self, folder: Path, endpoint: str, restarts: int) -> None:
-        self._folder, self.endpoint, self._budget = folder, endpoint, restarts
-        self._queue: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self._error = ""
-        self._finished = False
-        self.deaths = 0
-        """Times that it was killed and started again."""
-        self._start()
-
-    def _start(self) -> None:
-        command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
-        self._log = (self._folder / "learner.err").open("ab")
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, start_new_session=True)
-        threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
-
-    def _read(self, process: subprocess.Popen[bytes]) -> None:
-        assert process.stdout is not None
-        with process.stdout:
-            for line in process.stdout:
-                self._queue.put(json.loads(line))
-
-    def events(self) -> Iterator[dict[str, Any]]:
-        """What happened since the last call; waits a tenth of a second at most for the first."""
-        wait = 0.1
-        while True:
-            try:
-                event = self._queue.get(timeout=wait)
-            except queue.Empty:
-                return
-            wait = 0.001
-            if event["event"] == "listening":
-                self.endpoint = event["endpoint"]
-            elif event["event"] == "error":
-                self._error = event["text"]
-            elif event["event"] == "finished":
-                self._finished = True
-            yield event
-
-    def watch(self, report: Report) -> None:
-        """Start the learner again from its checkpoint if it was killed.
-
-        Raises ConfigError or TrainFailed with its own words if it gave up, TrainFailed if it
-        was killed more often than the budget allows.
-        """
-        code = self._process.poll()
-        if code is None or self._finished:
-            return
-        time.sleep(0.1)
-        for event in self.events():
-            report(event)
-        if self._finished:
-            return
-        if self._error:
-            raise (ConfigError if code == 2 else TrainFailed)(self._error)
-        if self._budget == 0:
-            raise TrainFailed(f"the learner died too often (exit code {code}); its last words are in {self._log.name}")
-        self._budget -= 1
-        self.deaths += 1
-        report({"event": "note", "text": f"the learner died (exit code {code}); starting it again from its checkpoint"})
-        self._log.close()
-        self._start()
-
-    def interrupt(self, report: Report) -> None:
-        """Ask it to write a checkpoint and end."""
-        self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=60)
-        for event in self.events():
-            report(event)
-
-    def end(self) -> None:
-        """Wait for a finished learner, end any other, and leave nothing behind."""
-        try:
-            if not self._finished:
-                self._process.terminate()
-            self._process.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._log.close()
+        yield
+    except (ConfigError, TrainInterrupted):
+        if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
+            shutil.rmtree(folder)
+        raise
 
 
 def interruptible() -> contextlib.AbstractContextManager[None]:

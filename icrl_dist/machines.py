@@ -15,14 +15,14 @@ _ANSWER_S = 60.0
 _GIB = 1 << 30
 
 
-def examine(ray: Any, learner: tuple[str, int], certificates: str) -> list[Finding]:
-    """What every machine answers; somebody listens at ``learner`` now, for them to reach."""
+def examine(ray: Any, learner: tuple[str, int] | None, certificates: str) -> list[Finding]:
+    """What every machine answers; somebody listens at ``learner`` now, for them to reach, unless that is None."""
     found = [node for node in ray.nodes() if node["Alive"]]
     return [finding for node in found for finding in _machine(ray, node, found, learner, certificates)]
 
 
 def _machine(
-    ray: Any, node: dict[str, Any], machines: list[dict[str, Any]], learner: tuple[str, int], certificates: str
+    ray: Any, node: dict[str, Any], machines: list[dict[str, Any]], learner: tuple[str, int] | None, certificates: str
 ) -> Iterator[Finding]:
     """What one machine answers, or that it does not."""
     address = str(node["NodeManagerAddress"])
@@ -35,7 +35,9 @@ def _machine(
     try:
         ray.get(asked.remote(), timeout=_ANSWER_S)  # a new process of Ray's takes seconds, so the clock is asked next
         began = time.time()
-        there = ray.get(asked.remote(certificates, [learner, (gcs[0], int(gcs[2])), *ports]), timeout=_ANSWER_S)
+        there = ray.get(
+            asked.remote(certificates, [*filter(None, [learner]), (gcs[0], int(gcs[2])), *ports]), timeout=_ANSWER_S
+        )
     except Exception as error:
         said = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         yield Finding(
@@ -65,7 +67,8 @@ def _machine(
         Finding(f"{name} ports", False, said, "open it between the machines of the cluster") for said in there["unreached"]
     )
     if not there["unreached"]:
-        yield Finding(f"{name} ports", True, f"reaches the learner's, Ray's and {len(ports)} of the other machines")
+        whose = "the learner's, Ray's" if learner else "Ray's"
+        yield Finding(f"{name} ports", True, f"reaches {whose} and {len(ports)} of the other machines")
 
 
 def _shared_memory_of(name: str, free: int) -> Finding:

@@ -89,10 +89,10 @@ def _certificates(folder: str) -> str:
     return ""
 
 
-def reach(host: str, port: int) -> str:
+def reach(host: str, port: int, timeout_s: float = REACH_S) -> str:
     """Why nothing is reached there from here; empty if something is."""
     try:
-        with socket.create_connection((host, port), timeout=REACH_S):
+        with socket.create_connection((host, port), timeout=timeout_s):
             return ""
     except OSError as error:
         return f"{host}:{port}: {error}"

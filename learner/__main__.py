@@ -1,11 +1,13 @@
 """The learner process: ``python -m learner RUN_DIR``.  Events go to stdout, a JSON line each.
 
-Started and supervised by ``icrl-dist train``; ends by itself if that parent dies.
+Started and supervised by ``icrl-dist train``, which names workers that were lost with their machines
+on stdin, a JSON list a line; ends by itself if that parent dies.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
 import os
@@ -63,6 +65,7 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
         for name in (signal.SIGINT, signal.SIGTERM):
             signal.signal(name, lambda *_: service.stop())
         _end_with_parent(service)
+        threading.Thread(target=_listen, args=(service,), name="stdin", daemon=True).start()
         where = folder / "endpoint"
         where.write_text(link.endpoints[0] + "\n")
         place = {"endpoint": link.endpoints[0], "host": socket.gethostname(), "device": service.device}
@@ -89,6 +92,15 @@ def _end_with_parent(service: Service) -> None:
         service.stop()
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+def _listen(service: Service, stdin: int = 0) -> None:
+    with (
+        contextlib.suppress(OSError),
+        open(stdin, "rb", buffering=0, closefd=False) as told,
+    ):  # nothing buffered is locked at exit
+        for line in told:
+            service.desk.excuse(json.loads(line))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,19 @@ class Desk:
         while any(self.workers.values()) and time.monotonic() < deadline:
             time.sleep(0.02)
         crashes.sweep(self._folder)
+
+    def excuse(self, workers: Collection[str]) -> None:
+        """These workers went with their machines: what was held against their jobs, and is still open, is taken back."""
+        with self._lock:
+            before = set(self._board.quarantined)
+            for worker in workers:
+                self._board.excuse(worker)
+            again = before - set(self._board.quarantined)
+            self._told -= again
+        for key in sorted(again):
+            name = "/".join(map(str, key))
+            text = f"variation {name} is tried again: its workers went with their machines"
+            self._report({"event": "note", "text": text})
 
     def close(self) -> None:
         """Write no more crash records; the link stays open."""

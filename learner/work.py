@@ -48,6 +48,9 @@ class _Slot:
     """How far the work is of whoever has the job now, and at most was of those before."""
     before: int = 0
     pinned: bool = False
+    given_up: set[int] = field(default_factory=set)
+    """What was missing when it was quarantined."""
+    split_into: list[_Slot] = field(default_factory=list)
 
     def number(self, identity: Identity) -> int:
         """Place among the job's of a trajectory in its variations; -1 for a trial that it has not."""
@@ -96,6 +99,7 @@ class Board:
         self._phases: dict[tuple[str, int], _Phase] = {}
         self._holding: dict[str, _Slot] = {}
         self._deaths: dict[str, _Slot] = {}
+        self._excused: set[str] = set()
         self._longest: dict[str, float] = {}
         self.quarantined: dict[tuple[str, int, int, int], str] = {}
         """Variations given up, as (stage, round, task, variation), and why."""
@@ -221,10 +225,11 @@ class Board:
         slot = self._holding.get(worker)
         if slot is None or not self._release(worker):
             return []
-        self._deaths[worker] = slot
         if slot.reached > slot.before:
             slot.blame = 0
-        self._accuse(slot, cause)
+        if worker not in self._excused:
+            self._deaths[worker] = slot
+            self._accuse(slot, cause)
         return [slot.job] if slot.missing and not slot.worker else []
 
     def back(self, worker: str) -> None:
@@ -237,6 +242,17 @@ class Board:
             slot.blame -= 1
             slot.worker = slot.worker or worker
             self._holding[worker] = slot
+
+    def excuse(self, worker: str) -> None:
+        """The worker went, or is about to go, with its machine: no job is to blame for that.
+
+        Its death is taken back even from the parts of a job that it has split, and from a variation
+        that it has quarantined, as long as their phase is open.
+        """
+        self._excused.add(worker)
+        slot = self._deaths.pop(worker, None)
+        for one in (slot.split_into or [slot]) if slot else ():
+            self._pardon(one)
 
     def failed(self, worker: str, name: tuple[str, int, int, int], cause: str) -> None:
         """The worker reports that its job raised; one that it does not hold (any more) is no news."""
@@ -273,13 +289,22 @@ class Board:
             return
         phase = self._phases[slot.job.stage, slot.job.round]
         phase.expected -= len(slot.missing)
-        slot.missing.clear()
+        slot.given_up, slot.missing = slot.missing, set()
         del phase.slots[slot.job.name]
         self.quarantined[slot.job.name] = cause
 
+    def _pardon(self, slot: _Slot) -> None:
+        slot.blame = max(0, slot.blame - 1)
+        phase = self._phases.get((slot.job.stage, slot.job.round))
+        if slot.given_up and phase is not None and phase.slot_of.get((slot.job.task, slot.job.first)) is slot:
+            slot.missing, slot.given_up = slot.given_up, set()
+            phase.expected += len(slot.missing)
+            phase.slots[slot.job.name] = slot
+            del self.quarantined[slot.job.name]
+
     def _split(self, phase: _Phase, slot: _Slot) -> _Slot:
         """The job in parts, behind everything else; returns the first part."""
-        parts = list(slot.parts())
+        parts = slot.split_into = list(slot.parts())
         del phase.slots[slot.job.name]
         for part in parts:
             phase.put(part)

@@ -10,13 +10,16 @@ from actors import cluster, fleet, missing
 from icrl_dist import nodes
 from icrl_dist.config import ConfigError
 
+REACH = nodes.reach
 OURS, HEADS = "tcp/127.0.0.1:0", "tls/localtest:7447"
 
 
 class AccountingRay:
     """A cluster of machines, each with the cores that ``cores`` says; ``answers`` change what a machine says of itself."""
 
-    exceptions = SimpleNamespace(AuthenticationError=PermissionError)
+    exceptions = SimpleNamespace(
+        AuthenticationError=PermissionError, RayActorError=ChildProcessError, RayTaskError=ModuleNotFoundError
+    )
     util = SimpleNamespace(
         scheduling_strategies=SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, soft: (node, soft))
     )
@@ -25,16 +28,25 @@ class AccountingRay:
         self.cores = dict(enumerate(cores))
         self.placed, self.ended, self.killed = [], {}, []
         self.answers = {}
+        self.silent, self.slow = set(), set()
+        """Numbers of machines whose Ray is not reached, and of those that have yet to answer what they were asked."""
 
     def init(self, address=None, **options):
         if address == "192.0.2.99:6379":
             raise ConnectionError("nobody there")
 
     def nodes(self):
+        where = {"NodeManagerPort": 1}
         return [
             {"NodeID": f"n{i}", "Alive": cores is not None, "NodeManagerAddress": f"10.0.0.{i}", "Resources": {"CPU": cores}}
+            | where
             for i, cores in self.cores.items()
         ]
+
+    def reach(self, host, port, timeout_s=3.0):
+        if not host.startswith("10.0.0."):
+            return REACH(host, port, timeout_s)
+        return "timed out" if int(host.split(".")[-1]) in self.silent else ""
 
     def remote(self, num_cpus, scheduling_strategy, **options):
         node, soft = ("", False) if scheduling_strategy == "SPREAD" else scheduling_strategy
@@ -50,7 +62,8 @@ class AccountingRay:
         return made
 
     def wait(self, under_way, **_):
-        return [one for one in under_way if one[0] == "facts" or one in self.ended], []
+        answered = lambda node: node not in {f"n{i}" for i in self.slow}  # noqa: E731
+        return [one for one in under_way if one in self.ended or (one[0] == "facts" and answered(one[1]))], []
 
     def get(self, one):
         if one[0] == "work":
@@ -76,6 +89,9 @@ def join(monkeypatch):
     monkeypatch.setattr(fleet, "_SETTINGS", {})  # this process goes on to other tests
     monkeypatch.setattr(fleet, "_PAUSE_S", 0.001)
     monkeypatch.setattr(cluster, "LOOK_S", 0.0)
+    monkeypatch.setattr(cluster, "AGAIN_S", 0.0)
+    monkeypatch.setattr(cluster, "SILENT_S", 0.0)
+    monkeypatch.setattr(fleet, "DOUBT_S", 0.0)
     promised = missing.Expected()
     monkeypatch.setattr(cluster.missing, "expected", lambda: promised)
     for name, value in (("NOTE_S", -1.0), ("SHORT_S", 1e9), ("JOIN_S", 1e9)):
@@ -85,6 +101,7 @@ def join(monkeypatch):
         nonlocal promised
         promised = missing.Expected(*options.pop("promised", ((), 0)))
         monkeypatch.setitem(sys.modules, "ray", ray)
+        monkeypatch.setattr(cluster.nodes, "reach", ray.reach)
         return fleet.Fleet(actors, restarts, address, **options)
 
     return joined
@@ -192,6 +209,58 @@ def test_death_and_departure_at_once_are_a_departure(join, local_name, monkeypat
     assert made.watch(notes.append, 0) == 1 and made.deaths == 0 and "n1 (10.0.0.1) is gone" in notes[-1]
 
 
+GONE = ChildProcessError("The actor is temporarily unavailable")
+
+
+def test_nothing_is_decided_while_a_machine_does_not_answer(join, local_name):
+    """Ray calls a machine alive for a while after its end."""
+    ray, notes = AccountingRay(0, 1, 1), []
+    made = join(ray, 2, restarts=0)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    ray.silent.add(1)
+    ray.ended["work", "n1", "w0"] = GONE
+    for _ in range(3):
+        assert made.watch(notes.append, 0) == 2 and len(ray.placed) == 2 and not made.lost
+    ray.cores[1], ray.cores[3] = None, 1
+    made.watch(notes.append, 0)
+    made.watch(notes.append, 0)
+    assert made.deaths == 0 and made.lost == ["w0"] and notes[-1].endswith("n3 (10.0.0.3): w0-1")
+
+
+def test_a_worker_whose_machine_answers_again_or_still_died_by_itself(join, local_name):
+    ray, notes = AccountingRay(0, 1), []
+    made = join(ray, 1, restarts=2)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    ray.silent.add(1)
+    ray.ended["work", "n1", "w0"] = GONE
+    made.watch(notes.append, 0)
+    ray.silent.clear()
+    assert made.watch(notes.append, 0) == 1 and made.deaths == 1 and len(ray.placed) == 2
+    ray.ended["work", "n1", "w0-1"] = GONE
+    assert made.watch(notes.append, 0) == 1 and made.deaths == 2 and len(ray.placed) == 3, "at once"
+    ray.cores[1] = None
+    made.watch(notes.append, 0)
+    assert made.deaths == 0 and made.lost == ["w0-2", "w0", "w0-1"], "they were the beginning of its machine's end"
+
+
+def test_a_name_is_one_life_although_one_of_a_machine_that_died_is_heard_of_first(join, local_name, monkeypatch):
+    ray, notes = AccountingRay(0, 2, 2), []
+    made = join(ray, 2)
+    gather(made, notes)
+    ray.cores[2] = None
+    made.watch(notes.append, 0)
+    ray.cores[3] = 2  # there is room for both at once
+    made.watch(notes.append, 0)
+    assert names(ray) == ["n1", "n1"]
+    monkeypatch.setattr(cluster, "LOOK_S", 1e9)
+    ray.ended["work", "n1", "w1"] = GONE
+    ray.cores[1] = None
+    made.watch(notes.append, 0)
+    assert notes[-1] == "workers: n3 (10.0.0.3): w0-1 w1-1" and sorted(made.lost) == ["w0", "w1"]
+
+
 def test_missing_machines_are_named_and_it_begins_with_what_there_is_if_that_is_enough(join, local_name, monkeypatch):
     monkeypatch.setattr(fleet, "SHORT_S", 0.01)
     ray, notes = AccountingRay(0, 2), []
@@ -242,6 +311,67 @@ def test_one_that_joins_later_and_does_not_fit_is_left_out(join, local_name):
     ray.cores[2], ray.answers["n2"] = 4, {"code": "0" * 64}
     assert [made.watch(notes.append, 0) for _ in range(3)] == [1, 1, 1]
     assert len([n for n in notes if n.endswith("no worker is placed there")]) == 1
+
+
+def test_nobody_begins_while_a_machine_is_still_trying_to_reach_the_learner(join, local_name, monkeypatch):
+    ray, notes = AccountingRay(0, 2, 2), []
+    ray.slow.add(2)
+    made = join(ray, 2)
+    turns = iter(range(20))
+    made.gather("tls/localtest:0", "", "", notes.append, lambda: next(turns, None) is None)
+    assert next(turns, None) is None, "it began"
+    monkeypatch.setattr(fleet, "PROBES_S", 0.01)
+    gather(made, notes)
+    assert list(made._placement.machines) == ["n1"]
+    ray.slow.clear()
+    for _ in range(2):  # it found nobody, and then the learner
+        made.watch(notes.append, 0)
+    assert list(made._placement.machines) == ["n1", "n2"]
+
+
+def test_a_machine_that_found_nobody_at_the_port_is_asked_again(join, local_name):
+    """The learner may be just starting; if it goes on, that is said once."""
+    ray, notes = AccountingRay(0, 1), []
+    made = join(ray, None)
+    gather(made, notes)
+    made.watch(notes.append, 0)
+    ray.cores[2], ray.answers["n2"] = 1, {"unreached": ["10.0.0.9:7447: refused"]}
+    assert [made.watch(notes.append, 0) for _ in range(2)] == [1, 1] and "n2" not in "".join(notes)
+    for _ in range(3):
+        made.watch(notes.append, 0)
+    (line,) = [note for note in notes if "n2" in note]
+    assert "cannot reach the learner's port, 10.0.0.9:7447: refused" in line
+    ray.answers.clear()
+    assert made.watch(notes.append, 0) == 2
+
+
+def test_a_machine_that_ends_while_it_is_asked_does_not_stop_a_run(join, local_name):
+    ray, notes = AccountingRay(0, 2, 2), []
+    ray.answers["n2"] = RuntimeError("the worker died unexpectedly")
+    ray.silent.add(2)
+    made = join(ray, 2)
+    gather(made, notes, turns=20)
+    ray.cores[2] = None
+    gather(made, notes)
+    assert made.watch(notes.append, 0) == 2 and names(ray) == ["n1", "n1"]
+
+
+def test_a_machine_on_which_ray_keeps_failing_is_refused(join, local_name):
+    ray = AccountingRay(0, 2, 2)
+    ray.answers["n2"] = RuntimeError("the worker died unexpectedly")
+    with pytest.raises(ConfigError, match=r"10.0.0.2: the worker died unexpectedly; run `ray up` again"):
+        gather(join(ray, 4), [])
+
+
+def test_one_that_joins_a_run_that_only_its_own_machine_reaches_is_left_out(join):
+    ray, notes = AccountingRay(2), []
+    made = join(ray, None)
+    gather(made, notes, OURS)
+    made.watch(notes.append, 0)
+    ray.cores[1] = 4
+    assert [made.watch(notes.append, 0) for _ in range(3)] == [2, 2, 2]
+    (line,) = [note for note in notes if "other machines cannot reach it" in note]
+    assert line.startswith("10.0.0.1: stream.endpoint = 'tcp/127.0.0.1:0'") and line.endswith("no worker is placed there")
 
 
 def test_other_machines_are_not_sent_to_a_learner_that_only_this_one_reaches(join):

@@ -76,6 +76,20 @@ def test_a_machine_that_is_missing_is_named_with_the_end_of_its_log(logs):
     assert missing.report(promised, promised.addresses, logs) == []
 
 
+def test_a_machine_that_the_file_has_by_name_is_known_by_its_address(logs, monkeypatch):
+    addresses = {"one": "10.0.0.2", "10.0.0.3": "10.0.0.3"}
+
+    def resolve(name, port):
+        if name not in addresses:
+            raise OSError(name)
+        return [(2, 1, 6, "", (addresses[name], 0))]
+
+    monkeypatch.setattr(missing.socket, "getaddrinfo", resolve)
+    promised = missing.Expected(("one", "10.0.0.3", "nobody"), 3)
+    (line,) = missing.report(promised, {"10.0.0.2", "10.0.0.3"}, logs)
+    assert line.startswith("nobody has not joined")
+
+
 def test_clouds_name_no_machines_so_they_are_counted(logs):
     (line,) = missing.report(missing.Expected((), 4), {"172.16.0.9"}, logs)
     assert line.startswith("3 of 4 machines have not joined: ") and "MaxSpotInstanceCountExceeded" in line

@@ -52,6 +52,15 @@ def shipped(name):
     return yaml.safe_load((ROOT / "deploy" / "clusters" / f"{name}.yaml").read_text())
 
 
+def filled_in(value):
+    """The same without example values."""
+    if isinstance(value, dict):
+        return {key: filled_in(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [filled_in(inner) for inner in value]
+    return "10.0.0.1" if isinstance(value, str) and clusterfile._example(value) else value
+
+
 def with_value(config, path, value):
     changed = copy.deepcopy(config)
     table = changed
@@ -64,28 +73,41 @@ def with_value(config, path, value):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_what_is_shipped_passes_and_asks_to_be_filled_in(asked, name):
     stops, warns = asked(shipped(name))
-    assert not stops
-    assert len(warns) == 1 and "still the example's" in warns[0], warns
+    assert not warns
+    assert len(stops) == 1 and "still the example's" in stops[0], stops
+    assert asked(filled_in(shipped(name))) == ([], [])
 
 
-@pytest.mark.parametrize("name", ("aws", "gcp"))
-def test_two_places_are_to_be_edited(name):
-    """Everything marked lies under provider or available_node_types."""
+@pytest.mark.parametrize(("name", "user"), [("aws", {"auth"}), ("gcp", set())])
+def test_two_places_are_to_be_edited(name, user):
+    """Everything marked lies under provider or available_node_types; AWS's images also say which user there is."""
     text = (ROOT / "deploy" / "clusters" / f"{name}.yaml").read_text()
     marked = [m.start() for m in re.finditer(r"# .*<--|# <--", text)][1:]  # the first explains the mark
     sections = [re.findall(r"^(\w+):", text[:place], re.MULTILINE)[-1] for place in marked]
-    assert len(marked) > 5 and set(sections) == {"provider", "available_node_types"}
+    assert len(marked) > 5 and set(sections) == {"provider", "available_node_types"} | user
 
 
 @pytest.mark.parametrize("name", ("aws", "gcp"))
 def test_the_container_that_is_commented_out_passes_too(asked, name):
     text = (ROOT / "deploy" / "clusters" / f"{name}.yaml").read_text()
     container = re.search(r"^# docker:\n(#   .*\n)+", text, re.MULTILINE)[0]
-    config = yaml.safe_load(text.replace(container, re.sub(r"^# ", "", container, flags=re.MULTILINE)))
+    config = filled_in(yaml.safe_load(text.replace(container, re.sub(r"^# ", "", container, flags=re.MULTILINE))))
     assert config["docker"]["image"]
-    assert not asked(config)[0]
+    stops, warns = asked(config)
+    assert not stops and any("install once more what its image has" in line for line in warns)
+    config["setup_commands"] = []
+    assert any("head_setup_commands call .venv/bin/pip, which is not in the image" in line for line in asked(config)[0])
+    config["head_setup_commands"] = []
+    assert asked(config) == ([], [])
     config["docker"]["run_options"] = []
     assert any("--shm-size" in line for line in asked(config)[1])
+
+
+def test_the_image_has_what_the_head_would_install():
+    image = (ROOT / "deploy" / "Dockerfile").read_text()
+    for name in ("aws", "gcp"):
+        (command,) = shipped(name)["head_setup_commands"]
+        assert all(package in image for package in command.split("--quiet ")[1].split())
 
 
 SLIPS = [
@@ -112,6 +134,8 @@ SLIPS = [
     ("aws", ("provider", "availability_zone"), "eu-west-1a", "zone eu-west-1a is not in region us-west-2"),
     ("gcp", ("provider", "project_id"), "", "gcp without project_id"),
     ("aws", ("file_mounts", "~/icrl-dist/dist"), "wheels", r"no wheels in"),
+    ("aws", (*WORKER[:2], "min_workers"), 0, r"none; up to 4 if anything asked.*min_workers"),
+    ("aws", (*WORKER[:2], "max_workers"), "four", r"Ray's schema"),
     ("onprem", ("file_mounts",), {}, r"file_mounts has no ~/.ray/auth_token"),
     ("onprem", ("head_start_ray_commands",), ["ray stop"], "start no head"),
     ("onprem", ("setup_commands",), ["true"], "no command sets RAY_AUTH_MODE=token"),
@@ -128,6 +152,7 @@ def test_a_slip_is_refused_by_name(asked, name, path, value, message):
     ("name", "path", "value", "message"),
     [
         ("aws", ("available_node_types", "head", "node_config", "InstanceMarketOptions"), {"MarketType": "spot"}, "is a spot"),
+        ("gcp", (*WORKER[:2], "min_workers"), 3, "3 machines, and nothing asks for the 1 more that max_workers allows"),
         ("aws", ("provider", "availability_zone"), "us-west-2a, us-west-2b", "name one"),
         ("onprem", ("worker_start_ray_commands",), ["ray start --address=$RAY_HEAD_IP:6379"], "ulimit"),
         (
@@ -139,8 +164,14 @@ def test_a_slip_is_refused_by_name(asked, name, path, value, message):
     ],
 )
 def test_what_starts_but_goes_short_is_a_warning(asked, name, path, value, message):
-    stops, warns = asked(with_value(shipped(name), path, value))
+    stops, warns = asked(with_value(filled_in(shipped(name)), path, value))
     assert not stops and any(message in line for line in warns), (stops, warns)
+
+
+def test_a_type_that_does_not_say_how_many_at_most_has_the_clusters_number(asked):
+    config = filled_in(shipped("aws"))
+    del config["available_node_types"]["worker"]["max_workers"]
+    assert asked(config) == ([], [])
 
 
 def test_a_wheel_of_other_code_is_refused(asked, checkout):
@@ -166,7 +197,10 @@ def test_what_is_no_cluster_file_is_bad_usage(tmp_path, capsys, text, message):
 
 def test_the_command_says_by_its_exit_code_whether_a_run_could_start(checkout, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(checkout)
-    assert cli.main(["doctor", "--cluster", str(ROOT / "deploy/clusters/gcp.yaml")]) == cli.OK
+    assert cli.main(["doctor", "--cluster", str(ROOT / "deploy/clusters/gcp.yaml")]) == cli.FAILED
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump(filled_in(shipped("gcp"))))
+    assert cli.main(["doctor", "--cluster", str(file)]) == cli.OK
     assert "n2-highcpu-16" in capsys.readouterr().out
     file = tmp_path / "slip.yaml"
     file.write_text(yaml.safe_dump(with_value(shipped("gcp"), (*WORKER, "machineType"), 16)))

@@ -1,11 +1,14 @@
 """The doctor's questions to a live cluster, against machines that answer badly."""
 
 import re
+import socket
+import sys
 from types import SimpleNamespace
 
 import pytest
 
-from icrl_dist import machines, nodes
+from icrl_dist import doctor, endpoints, machines, nodes
+from icrl_dist.config import ConfigError
 from icrl_dist.findings import table
 
 HERE = nodes.facts()
@@ -20,6 +23,14 @@ class Answering:
 
     def __init__(self, answer):
         self.answer, self.asked = answer, {}
+
+    exceptions = SimpleNamespace(AuthenticationError=PermissionError)
+
+    def init(self, **options):
+        pass
+
+    def shutdown(self):
+        pass
 
     def nodes(self):
         ports = {"NodeManagerPort": 1, "ObjectManagerPort": 2}
@@ -44,6 +55,48 @@ class Answering:
             raise changed
         now = machines.time.time() + changed.get("ahead_s", 0.0)
         return {**HERE, "time": now, "host": node, "unreached": (), "certificates": "", **changed}
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """``asked(endpoint)``: what the doctor says of a healthy cluster, and the ports that machine b was to reach."""
+    ray = Answering({})
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(doctor, "need_ray_token", lambda address: None)
+
+    def ask(endpoint):
+        return doctor.diagnose_cluster("auto", endpoint, ""), ray.asked.get("b")
+
+    return ask
+
+
+OTHERS = [("10.0.0.a", 6379), ("10.0.0.a", 1), ("10.0.0.a", 2)]
+
+
+def test_a_learner_that_only_the_head_reaches_is_not_looked_for_by_others(asked):
+    findings, ports = asked("tcp/127.0.0.1:0")
+    assert ports == OTHERS and all(finding.ok is not False for finding in findings)
+    assert re.search(r"warn +stream endpoint +tcp/127.0.0.1:0 is this machine's alone.*-> .*--endpoint tls/", table(findings))
+    assert len(findings) == 11 and "reaches Ray's and 2 of the other" in table(findings)
+
+
+def test_every_machine_is_examined_although_a_run_has_the_port(asked, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        monkeypatch.setattr(endpoints.Endpoint, "loopback", False)
+        findings, ports = asked(f"tls/127.0.0.1:{port}")
+    assert ports == [("127.0.0.1", port), *OTHERS] and all(finding.ok is not False for finding in findings)
+    assert "Address already in use" in findings[0].value and len(findings) == 11
+
+
+def test_an_address_that_is_not_the_heads_is_a_fault_and_every_machine_is_examined(asked):
+    findings, ports = asked("tls/192.0.2.1:7447")
+    assert ports == OTHERS and [f.name for f in findings if f.ok is False] == ["stream endpoint"] and len(findings) == 11
+
+
+def test_an_endpoint_that_is_none_is_bad_usage(asked):
+    with pytest.raises(ConfigError, match=r"--endpoint tcp://x:1: write it as"):
+        asked("tcp://x:1")
 
 
 def found(answer, certificates="folder"):

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -12,7 +13,7 @@ from importlib import metadata
 
 import pytest
 
-from icrl_dist import agent, cli, heldout, launch
+from icrl_dist import agent, cli, commands, heldout, launch
 
 
 def refused(capsys, *arguments):
@@ -180,8 +181,22 @@ def test_an_evaluation_that_is_stopped_says_how_to_go_on(monkeypatch, tmp_path, 
     monkeypatch.setattr(agent, "checkpoint_file", lambda folder: folder / "none")
     monkeypatch.setattr(heldout, "calibrate", stopped)
     assert cli.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
-    assert "interrupted; `icrl-dist train smoke --resume` goes on" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` goes on" in printed
     assert (tmp_path / "run" / "run.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "printed"),
+    [
+        ("smoke", "smoke --resume"),
+        ("smoke --overwrite", "smoke --resume"),
+        ("smoke --resume --seed 3", "smoke --resume --seed 3"),
+        ("--from runs/demo@0 --out '~/my runs/x'", "--from runs/demo@0 --out '~/my runs/x' --resume"),
+    ],
+)
+def test_the_command_that_goes_on_is_the_one_that_was_given(given, printed):
+    assert commands._resuming(shlex.split(given)) == f"icrl-dist train {printed}"
 
 
 def test_a_run_stopped_before_it_began_promises_no_checkpoint(monkeypatch, tmp_path, capsys):

@@ -242,6 +242,23 @@ def test_the_cause_of_a_quarantine_by_death_says_who_and_where(office, worker):
     assert office.wait("quarantine")[0]["cause"] == "worker w2 died: Fatal Python error: Segmentation fault"
 
 
+def test_workers_that_went_with_their_machines_quarantine_nothing(office, worker):
+    alone = dataclasses.replace(office.jobs[0], variations=office.jobs[0].variations[:1], tasks=1)
+    office.board.open([alone], lambda job: ())
+    keep = office.jobs[1]
+    office.board.open([dataclasses.replace(keep, stage="adapt")], lambda job: ())
+    office.desk.excuse(["w0"])
+    for life in range(4):
+        link = worker(f"w{life}")
+        assert wire.decode_job(office.ask(f"w{life}")[1]["job"]) == alone
+        link.close()
+        office.wait("crash", life + 1)
+    office.wait("quarantine")
+    office.desk.excuse(["w1", "w2", "w3"])
+    assert office.wait("note")[0]["text"].startswith("variation pretrain/0/0/0 is tried again")
+    assert wire.decode_job(office.ask("w4")[1]["job"]) == alone and not office.board.quarantined
+
+
 def test_a_run_in_which_everything_fails_ends_with_the_cause(office):
     while not office.failures:
         kind, fields = office.ask("w0")

@@ -419,6 +419,57 @@ def test_a_death_that_was_taken_back_can_come_again(board, jobs):
     assert len(leased(board, "c").variations) == 1
 
 
+def test_a_worker_that_went_with_its_machine_blames_nobody(board, jobs):
+    for worker in "abc":
+        assert leased(board, worker) == jobs[0]
+        assert kill(board, worker) == [jobs[0]]
+        board.excuse(worker)
+        board.excuse(worker)
+    board.excuse("d")  # the fleet may know it first
+    assert leased(board, "d") == jobs[0] and kill(board, "d") == [jobs[0]]
+    board.excuse("stranger")
+    assert board.lease("e", 0.0).deadline_s == LEASE, "nor is its next lease longer"
+
+
+def test_the_loss_of_a_machine_is_taken_back_from_the_parts_of_a_job_too(board, jobs):
+    split_first(board)
+    part = leased(board, "a")
+    board.excuse("x")
+    assert kill(board, "a") == [part], "its second death"
+    for name in ("b", "c"):
+        finish(board, leased(board, name))
+    while (again := leased(board, "d")) != part:
+        finish(board, again)
+    kill(board, "d")
+    assert list(board.quarantined) == [part.name]
+
+
+def test_a_variation_given_up_for_losses_of_machines_is_tried_again(board, jobs):
+    split_first(board)
+    part = leased(board, "a")
+    board.received(next(iter(part.identities())), 0.0)
+    kill(board, "a")
+    assert list(board.quarantined) == [part.name] and board.progress(*PHASE) == (1, 35)
+    board.excuse("a")
+    assert not board.quarantined and board.progress(*PHASE) == (1, 36) and not board.done(*PHASE)
+    assert board.wants(list(part.identities())[1]) == part
+    while (job := leased(board, "b")) is not None:
+        finish(board, job)
+    assert board.done(*PHASE)
+
+
+def test_a_quarantine_of_a_phase_that_is_over_stays(board, jobs):
+    split_first(board)
+    part = leased(board, "a")
+    kill(board, "a")
+    board.close(*PHASE)
+    board.excuse("a")
+    assert list(board.quarantined) == [part.name]
+    board.open(jobs, nothing)
+    board.excuse("x")
+    assert leased(board, "b") == jobs[0]
+
+
 def test_blame_is_listed_in_canonical_order(jobs, later):
     board = Board(LEASE)
     one = [
@@ -441,7 +492,7 @@ def test_blame_is_listed_in_canonical_order(jobs, later):
 
 EVENTS = st.lists(
     st.tuples(
-        st.sampled_from(["lease", "lease", "lease", "store", "store", "die", "fail", "back", "wait"]),
+        st.sampled_from(["lease", "lease", "lease", "store", "store", "die", "die", "fail", "back", "excuse", "wait"]),
         st.integers(0, 3),
         st.integers(0, 35),
     ),
@@ -455,7 +506,7 @@ def test_whatever_happens_nothing_is_lost_and_nobody_is_blamed_for_less_than_thr
     board = Board(LEASE, floor_s=1.0, factor=4.0)
     board.open(jobs, nothing)
     everything = [i for job in jobs for i in job.identities()]
-    stored, held, lost, now = set(), {}, {}, 0.0
+    stored, held, lost, excused, now = set(), {}, {}, set(), 0.0
     accused = collections.Counter()
     ends = {}
 
@@ -498,8 +549,10 @@ def test_whatever_happens_nothing_is_lost_and_nobody_is_blamed_for_less_than_thr
                 stored.add(identity)
                 ends.update(dict.fromkeys(held, 0.0))  # their time runs anew; the tests above look at that
         elif what == "die" and worker in held:
-            lost[worker] = held.pop(worker)
-            accuse(lost[worker], 1)
+            gone = held.pop(worker)
+            if worker not in excused:
+                lost[worker] = gone
+                accuse(gone, 1)
             board.lost(worker, now)
         elif what == "fail" and worker in held:
             accuse(held[worker], 1)
@@ -510,6 +563,11 @@ def test_whatever_happens_nothing_is_lost_and_nobody_is_blamed_for_less_than_thr
             ends[worker] = 0.0
             accuse(held[worker], -1)
             board.back(worker)
+        elif what == "excuse" and which % 3 == 0:
+            excused.add(worker)
+            board.excuse(worker)
+            if (death := lost.pop(worker, None)) is not None:
+                accuse(death, -1)
         elif what == "wait":
             now += which / 5
         check()
