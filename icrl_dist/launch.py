@@ -180,8 +180,8 @@ def train_ray(
                     started = True
                 elif event["event"] == "progress":
                     stored = event["trajectories"]
-                elif event["event"] == "quarantine":
-                    given_up += 1
+                elif event["event"] in ("quarantine", "released"):
+                    given_up += 1 if event["event"] == "quarantine" else -1
                 elif event["event"] == "finished":
                     result = {name: value for name, value in event.items() if name != "event"}
             if interrupted.is_set():

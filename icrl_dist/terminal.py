@@ -59,7 +59,7 @@ class Display:
             where = f"learner on {event['host']} ({event['device']})"
             told = f"{where} listens at {event['endpoint']}, weights version {event['version']}"
             self.console.print(told, highlight=False, markup=False)
-        elif kind in ("note", "worker", "alert", "crash", "quarantine", "repaired", "interrupted"):
+        elif kind in ("note", "worker", "alert", "crash", "quarantine", "released", "repaired", "interrupted"):
             self.console.print(event["text"], highlight=False, markup=False)
 
     def _stage(self, event: dict[str, Any]) -> None:

@@ -112,7 +112,7 @@ class Desk:
         for key in sorted(again):
             name = "/".join(map(str, key))
             text = f"variation {name} is tried again: its workers went with their machines"
-            self._report({"event": "note", "text": text})
+            self._report({"event": "released", "identity": name, "text": text})
 
     def close(self) -> None:
         """Write no more crash records; the link stays open."""

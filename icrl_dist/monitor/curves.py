@@ -141,7 +141,10 @@ class Curves:
             self._dirty.append(curve)
 
     def quarantined(self, identity: Identity, cause: str) -> None:
-        """In that phase the run goes on without the variation of which this is a trial, and which it may never have begun."""
+        """In that phase the run goes on without the variation of which this is a trial, and which it may never have begun.
+
+        Without a ``cause`` it goes on with it after all.
+        """
         curve = self._curve((identity.task, identity.variation))
         curve.part(identity).quarantine = cause
         self._touch(curve)

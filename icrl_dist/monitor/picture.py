@@ -155,8 +155,8 @@ class Picture:
             elif name in self._alerts or len(self._alerts) < readers.EVENTS:
                 since = self._alerts.get(name, {"since": time})["since"]
                 self._alerts[name] = {"name": name, "text": text, "since": since}
-        elif what == "quarantine":
-            self._curves.quarantined(told["identity"], text)
+        elif what in ("quarantine", "released"):
+            self._curves.quarantined(told["identity"], text if what == "quarantine" else "")
         elif what == "version":
             self._run["version"] = told["version"]
         elif what in _OVER:

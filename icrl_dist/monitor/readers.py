@@ -61,7 +61,7 @@ def event(message: dict[str, Any]) -> dict[str, Any]:
         found |= {"worker": plain.text(message.get("worker")), "alive": bool(message.get("alive"))}
     elif what == "alert":
         found |= {"alert": plain.text(message.get("alert")), "active": bool(message.get("active"))}
-    elif what == "quarantine":
+    elif what in ("quarantine", "released"):
         found["identity"] = plain.identity(f"{plain.text(message.get('identity'), 120)}/0")
     elif what == "version":
         found["version"] = plain.integer(message.get("version"), 0)

@@ -255,7 +255,7 @@ def test_workers_that_went_with_their_machines_quarantine_nothing(office, worker
         office.wait("crash", life + 1)
     office.wait("quarantine")
     office.desk.excuse(["w1", "w2", "w3"])
-    assert office.wait("note")[0]["text"].startswith("variation pretrain/0/0/0 is tried again")
+    assert office.wait("released")[0]["text"].startswith("variation pretrain/0/0/0 is tried again")
     assert wire.decode_job(office.ask("w4")[1]["job"]) == alone and not office.board.quarantined
 
 

@@ -258,6 +258,8 @@ def test_alerts_are_shown_while_they_are_on_and_a_quarantine_in_its_phase():
     for name in ("adapt/0/3", "adapt/0/3/-1", "3/1", "nowhere/0/3/1"):
         hear(picture, "event", event("quarantine", "what?", identity=name))
     assert picture.ignored["schema"] == 4 and picture.snapshot(1.0)["variations"][0]["quarantine"] == "it crashes"
+    hear(picture, "event", event("released", "it is tried again", identity="adapt/0/3/1"))
+    assert picture.snapshot(1.0)["variations"][0]["quarantine"] == ""
 
 
 def test_the_alerts_that_are_on_are_those_the_learner_repeats():
