@@ -11,8 +11,8 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
 	$(BIN)/icrl-dist train demo --overwrite
 
-test: env ## every test, file by file in four processes: many of them wait
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+test: env ## every test, file by file in three processes: many of them wait
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 check: env ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

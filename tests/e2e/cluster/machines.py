@@ -73,6 +73,30 @@ class Cluster:
         """How many processes of that name every worker machine has."""
         return [len(worker.processes(word)) for worker in self.workers]
 
+    @contextlib.contextmanager
+    def held(self):
+        """Every worker stands still: no run gets on, however busy this machine is."""
+        held = [process for machine in self.workers for process in machine.processes("_Host.work")]
+        for process in held:
+            process.suspend()
+        try:
+            yield
+        finally:
+            for process in held:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    process.resume()
+
+    @contextlib.contextmanager
+    def cut_off(self):
+        """No worker machine has a link."""
+        try:
+            for machine in self.workers:
+                machine.run("ip", "link", "set", "eth0", "down")
+            yield
+        finally:
+            for machine in self.workers:
+                machine.run("ip", "link", "set", "eth0", "up")
+
     def train(self, name, *options):
         """The command of a run on the head, by every worker that the cluster has."""
         words = ["icrl-dist", *TRAIN, "--address", "auto", "--out", f"~/runs/{name}", *options]

@@ -3,6 +3,7 @@
 One cluster serves all of it: `ray up` takes longer than a run.
 """
 
+import contextlib
 import json
 import re
 import shutil
@@ -117,21 +118,20 @@ class TestJobs:
         """Both workers are cut off in the middle of a round, so that the run cannot go on without them."""
         words = jobs.job("submit", "--submission-id", "stopped", "--", *jobs.train("stopped").split())
         with underway(tmp_path, words) as (process, printed):
-            wait_until(lambda: "listens at" in printed() or process.poll() is not None, "the learner")
-            subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=100)
-            process.wait(timeout=60)
+            wait_until(lambda: jobs.running("_Host.work") == [1, 1] or process.poll() is not None, "workers")
+            with jobs.held():
+                subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=100)
+                process.wait(timeout=60)
             assert re.search(r"interrupted; `icrl-dist train smoke --resume .*` goes on", printed()), printed()
             assert "was stopped" in printed(), printed()
         assert not jobs.head.processes("learner") and not jobs.head.processes("icrl-dist train")
         with underway(tmp_path, jobs.exec(jobs.train("stopped", "--resume"))) as (process, printed):
-            wait_until(lambda: "round 1" in printed() or process.poll() is not None, "a round")
-            began = time.monotonic()
-            for worker in jobs.workers:
-                worker.run("ip", "link", "set", "eth0", "down")
-            time.sleep(max(0.0, CUT_S - (time.monotonic() - began)))
-            assert process.poll() is None, printed()
-            for worker in jobs.workers:
-                worker.run("ip", "link", "set", "eth0", "up")
+            wait_until(lambda: "round 0" in printed() or process.poll() is not None, "a round")
+            with contextlib.ExitStack() as cut:
+                with jobs.held():
+                    cut.enter_context(jobs.cut_off())
+                time.sleep(CUT_S)
+                assert process.poll() is None, printed()
             assert process.wait(timeout=150) == 0, printed()
         same(jobs.result("stopped"), inline())
 
