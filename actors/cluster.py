@@ -21,7 +21,7 @@ LOOK_S = 1.0
 ANSWER_S = 60.0
 """A machine that has not answered after so long does not fit: a process of Ray's takes seconds to start."""
 AGAIN_S = 2.0
-"""A machine that does not fit is asked again after so long, then twice as long, and so on up to"""
+"""A machine that does not fit is asked again after so long, then twice as long, and so on up to ``_SELDOM_S``."""
 _SELDOM_S = 60.0
 TRIES = 3
 """A machine on which Ray fails so often before a run begins, though it answers, does not fit."""
@@ -113,10 +113,14 @@ class Cluster:
                 self._ask(one)
         return [*unfit, *self._answers()]
 
+    def _alive(self) -> dict[str, dict[str, Any]]:
+        """Ray's machines, by name, as far as Ray knows."""
+        return {str(node["NodeID"]): node for node in self._ray.nodes() if node["Alive"]}
+
     def _look(self, note: Callable[[str], None]) -> list[str]:
         """Who is here; returns what is to be said of those that have come in vain."""
         self._looked = time.monotonic()
-        alive = {str(node["NodeID"]): node for node in self._ray.nodes() if node["Alive"]}
+        alive = self._alive()
         for gone in set(self._placement.machines) - set(alive):
             self._gone(gone, note)
         self._known &= set(alive)
@@ -197,15 +201,15 @@ class Cluster:
         """
         if time.monotonic() - self._silent.get(node, -SILENT_S) < SILENT_S:
             return False
-        found = [one for one in self._ray.nodes() if one["NodeID"] == node and one["Alive"]]
-        if found and not nodes.reach(str(found[0]["NodeManagerAddress"]), int(found[0]["NodeManagerPort"]), timeout_s=1.0):
+        there = self._alive().get(node)
+        if there and not nodes.reach(str(there["NodeManagerAddress"]), int(there["NodeManagerPort"]), timeout_s=1.0):
             return True
         self._silent[node] = time.monotonic()
         return False
 
     def lost(self, node: str, note: Callable[[str], None]) -> bool:
         """Whether a worker ended because its machine did; its place is given up then."""
-        if any(one["NodeID"] == node and one["Alive"] for one in self._ray.nodes()):
+        if node in self._alive():
             return False
         self._gone(node, note)
         return True

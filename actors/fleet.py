@@ -229,14 +229,13 @@ class Fleet:
             self._doubtful.remove(doubt)
             self._went(doubt.index, doubt.host)
         self._recent = [one for one in self._recent if time.monotonic() - one[0] < SOON_S]
-        for death in [one for one in self._recent if one[2] not in self._placement.machines]:
-            self._recent.remove(death)  # a machine that is shut down ends its workers before Ray's own process
-            self._uncount(death[1], death[3])
-
-    def _uncount(self, index: int, name: str) -> None:
-        self.lost.append(name)
-        self.deaths -= 1
-        self._budget[index] = min(self._restarts, self._budget[index] + 1)
+        for death in list(self._recent):
+            _, index, node, name = death
+            if node not in self._placement.machines:
+                self._recent.remove(death)  # a machine that is shut down ends its workers before Ray's own process
+                self.lost.append(name)
+                self.deaths -= 1
+                self._budget[index] = min(self._restarts, self._budget[index] + 1)
 
     def _went(self, index: int, host: Any) -> None:
         """A worker is lost with its machine: that is no fault of its own."""

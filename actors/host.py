@@ -5,20 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 
-def _work(endpoint: str, run_name: str, name: str, folder: str | None, certificates: str) -> None:
-    """A worker's whole life, in a process that Ray made."""
-    import torch
-
-    from actors import router
-    from actors.worker import Worker
-    from icrl_dist.stream.zenoh_link import ZenohLink
-
-    torch.set_num_threads(1)
-    where, settings = router.reached(endpoint, certificates)
-    with ZenohLink.connect(where, timeout_s=30.0, config=settings) as link:
-        Worker(link, run_name, name, folder=Path(folder) if folder else None).run()
-
-
 class _Host:
     """The Ray actor: a process for one worker.
 
@@ -31,4 +17,14 @@ class _Host:
         import icrl_dist.stream.zenoh_link  # noqa: F401
 
     def work(self, endpoint: str, run_name: str, name: str, folder: str | None, certificates: str) -> None:
-        _work(endpoint, run_name, name, folder, certificates)
+        """A worker's whole life."""
+        import torch
+
+        from actors import router
+        from actors.worker import Worker
+        from icrl_dist.stream.zenoh_link import ZenohLink
+
+        torch.set_num_threads(1)
+        where, settings = router.reached(endpoint, certificates)
+        with ZenohLink.connect(where, timeout_s=30.0, config=settings) as link:
+            Worker(link, run_name, name, folder=Path(folder) if folder else None).run()

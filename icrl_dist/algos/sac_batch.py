@@ -209,13 +209,17 @@ def train(
     experts = SACBatch(seeds, env.spec, config, device, products, min(config.replay, steps), by=by)
     if state is not None:
         experts.load(state)
+
+    def learns(step: int) -> bool:
+        return step > config.warmup and step % config.update_every == 0
+
     if experts.steps % horizon:
         raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon}: take it in `progress`")
     while experts.steps < steps:
         first, total = experts.steps, np.zeros(experts.experts)
         last = min(first + horizon, steps)
-        learning = [step for step in range(first + 1, last + 1) if step > config.warmup and step % config.update_every == 0]
-        drawn = Chance(seeds, first // horizon, env.spec, config, len(learning), experts.device)
+        count = sum(map(learns, range(first + 1, last + 1)))
+        drawn = Chance(seeds, first // horizon, env.spec, config, count, experts.device)
         updates = iter(drawn.updates)
         seen = np.asarray(env.reset(drawn.starts), np.float32)
         for number in range(last - first):
@@ -226,7 +230,7 @@ def train(
                 _need_numbers(action, experts.steps)
             step = env.step(action)
             experts.remember(seen, action, step)
-            if experts.steps in learning:
+            if learns(experts.steps):
                 experts.learn(*next(updates))
             seen, total = step.observation, total + step.reward
         _need_numbers(experts.arrays["actor"].cpu().numpy(), experts.steps)

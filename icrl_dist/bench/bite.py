@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import itertools
 import json
 from collections.abc import Callable
 from importlib import metadata
@@ -17,16 +16,16 @@ from typing import Any
 
 import torch
 
-from icrl_dist import bites, envs, histories
+from icrl_dist import bites, envs
 from icrl_dist.bench import disturbance
 from icrl_dist.bench.disturbance import Make, Report, Setting, Sizes, lost, measure, settings
 from icrl_dist.config import ConfigError
 from icrl_dist.envs import pick_place, problems
-from icrl_dist.experts import ExpertPolicy, train_expert
+from icrl_dist.experts import ExpertPolicy
 from icrl_dist.files import atomic_write
 from icrl_dist.games import SACConfig
 from icrl_dist.tables import nearest
-from icrl_dist.types import Job, Task, Variation
+from icrl_dist.types import Task, Variation
 
 KNOWN = ("dmc-cartpole-balance", pick_place.KIND)
 """Problems whose experts are known to be competent with their laptop numbers."""
@@ -180,16 +179,7 @@ def _expert(kind: str, config: SACConfig, report: Report) -> Make:
     if kind == pick_place.KIND:
         return disturbance.ToldTheGoal
     variations = tuple(Variation(task) for task in problems.grid(kind, 2))
-    told = itertools.count(1)
-
-    def tell(text: str, note: bool = False, reached: int = 0) -> None:
-        if note or next(told) % 10 == 0:
-            report(f"{kind}: {text}")
-
-    asked = (*histories.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
-    for _ in train_expert(Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, asked, len(variations)), "bench", tell):
-        pass  # what is wanted is in the cache
-    found = [history for one in variations if (history := histories.any_kept(one, config, 0)) is not None]
+    found = disturbance.trained(kind, variations, config, report)
     if len(found) < len(variations):
         raise ConfigError(f"sac.cache = {config.cache!r}: the experts that were trained are not there; name a folder")
     return lambda env: ExpertPolicy([one for one in found for _ in range(env.batch // len(found))], config)

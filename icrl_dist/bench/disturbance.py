@@ -130,22 +130,26 @@ def expert(kind: str, config: SACConfig, report: Report) -> History:
     found = histories.any_kept(variation, config, 0)
     if found is None:
         report(f"{kind}: an expert trains for {config.steps:,} steps")
-        told = itertools.count(1)
-
-        def tell(text: str, note: bool = False, reached: int = 0) -> None:
-            if note or next(told) % 10 == 0:
-                report(f"{kind}: {text}")
-
-        asked = (*histories.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
-        job = Job("train_expert", "pretrain", 0, 0, (variation,), 1, -1, 0, asked)
-        for _ in train_expert(job, "bench", tell):
-            pass  # what is wanted is in the cache
-        found = histories.any_kept(variation, config, 0)
+        found = next(iter(trained(kind, (variation,), config, report)), None)
     if found is None:
         raise ConfigError(
             f"sac.cache = {config.cache!r}: the expert that was trained is not there; name a folder that keeps it"
         )
     return found
+
+
+def trained(kind: str, variations: tuple[Variation, ...], config: SACConfig, report: Report) -> list[History]:
+    """Undisturbed experts, one a task, from the cache or of a training; those that the cache does not keep are missing."""
+    told = itertools.count(1)
+
+    def tell(text: str, note: bool = False, reached: int = 0) -> None:
+        if note or next(told) % 10 == 0:
+            report(f"{kind}: {text}")
+
+    asked = (*histories.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
+    for _ in train_expert(Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, asked, len(variations)), "bench", tell):
+        pass  # what is wanted is in the cache
+    return [history for one in variations if (history := histories.any_kept(one, config, 0)) is not None]
 
 
 class ToldTheGoal:

@@ -37,6 +37,14 @@ def run(small_run, tmp_path):
     )
 
 
+@pytest.fixture
+def trained(monkeypatch):
+    """How many experts were trained each time."""
+    batches, real = [], sac_batch.train
+    monkeypatch.setattr(sac_batch, "train", lambda env, *rest, **more: batches.append(env.batch) or real(env, *rest, **more))
+    return batches
+
+
 def asked(run, method="icag"):
     return METHODS[method].ask(run, METHODS[method].phases(run)[0])
 
@@ -85,10 +93,7 @@ def test_the_same_job_gives_the_same_bytes_with_or_without_a_cache(run, tmp_path
     assert digests(jobs.do(asked(other)[0], None, "w")) != here
 
 
-def test_nothing_is_trained_that_is_in_the_cache(run, monkeypatch, caplog):
-    trained = []
-    real = sac_batch.train
-    monkeypatch.setattr(sac_batch, "train", lambda env, *rest, **more: trained.append(env.batch) or real(env, *rest, **more))
+def test_nothing_is_trained_that_is_in_the_cache(run, trained, caplog):
     job = asked(run)[0]
     first = digests(jobs.do(job, None, "w"))
     assert trained == [4]
@@ -101,10 +106,8 @@ def test_nothing_is_trained_that_is_in_the_cache(run, monkeypatch, caplog):
     assert trained == [4, 1, 1] and "made anew" in caplog.text and file.read_bytes() == whole
 
 
-def test_what_one_method_trained_another_takes_and_ends_with_the_bytes_of_its_own(run, monkeypatch, tmp_path):
+def test_what_one_method_trained_another_takes_and_ends_with_the_bytes_of_its_own(run, trained, tmp_path):
     """DPT has the undisturbed ones of ICAG's experts, in other company."""
-    trained, real = [], sac_batch.train
-    monkeypatch.setattr(sac_batch, "train", lambda env, *rest, **more: trained.append(env.batch) or real(env, *rest, **more))
     alone = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=str(tmp_path / "other")))
     own = [digests(jobs.do(job, None, "w")) for job in asked(alone, "dpt")]
     assert trained == [2, 2]
