@@ -259,15 +259,17 @@ def test_a_recording_is_steered_by_keyboard(page):
     run.tick()
     with showing(run, "127.0.0.1", 0) as url:
         page.goto(url)
-        pause = page.get_by_role("button", name="Pause", exact=True).first
-        pause.focus()
+        button = page.locator("#pause")
+        button.focus()
         page.keyboard.press("Enter")
+        until(page, "document.querySelector('#pause').textContent === 'Play'")
         page.get_by_label("Speed").select_option("50")
         page.get_by_label("Moment in the recording").press("End")
-        wait_for(lambda: len(run.controls) == 3, "three commands", page.patience)
-        assert run.controls == [{"paused": True}, {"speed": 50}, {"at": 1100}]
-        run.recording = {**run.recording, "paused": True}
-        page.get_by_role("button", name="Play", exact=True).wait_for()
+        until(page, "document.querySelector('#pause').textContent === 'Play again'")
+        button.press("Enter")
+        until(page, "document.querySelector('#pause').textContent === 'Pause'")
+        paused, hurried, wound = {"paused": True}, {"speed": 50}, {"at": 1100}
+        assert run.controls == [paused, hurried, wound, {"at": 1000, "paused": False}]
 
 
 @pytest.mark.timeout(300)
