@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from actors import local
 from actors.cluster import Cluster, brief
 from actors.host import _Host
 from actors.placement import Machine, Placement
@@ -40,7 +41,7 @@ _PAUSE_S = 0.25
 
 
 class FleetFailed(RuntimeError):  # noqa: N818
-    """Workers keep dying; the message names the last cause."""
+    """Workers keep dying, or Ray does not start; the message names the last cause."""
 
 
 def check_cores(actors: int) -> None:
@@ -64,13 +65,16 @@ class Fleet:
         address: str | None = None,
         oversubscribe: bool = False,
         at_least: int | None = None,
+        note: Callable[[str], None] = lambda text: None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Starts Ray here, or joins the cluster at ``address``.
 
         ``actors``: how many workers, on a cluster as many as it has cores if None.  ``at_least``: so
         many are enough to begin with, when others have not joined for ``SHORT_S``; ``actors`` of
         them, or one, if None.  Raises ConfigError if this machine has fewer cores than workers, unless
-        they may share them (``oversubscribe``): they would wait for ever.
+        they may share them (``oversubscribe``): they would wait for ever; FleetFailed if Ray does not
+        start here, of which ``note`` is told each time, or did not and ``stopped``.
         """
         os.environ.update(_SETTINGS)
         import ray
@@ -82,14 +86,10 @@ class Fleet:
             actors = actors or 1
             if not oversubscribe:
                 check_cores(actors)
-            ray.init(
-                num_cpus=actors,
-                object_store_memory=100 << 20,
-                _node_ip_address="127.0.0.1",
-                include_dashboard=False,
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-            )
+            try:
+                local.begin(ray, actors, note, stopped)
+            except RuntimeError as error:
+                raise FleetFailed(str(error)) from error
         else:
             try:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)

@@ -161,7 +161,10 @@ def train_ray(
             learner = stack.enter_context(child.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
         with _unmade_if_refused(folder) if address is not None else contextlib.nullcontext():
-            fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least)
+            try:
+                fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
+            except FleetFailed as error:
+                raise (TrainInterrupted if interrupted.is_set() else _failed(error)) from None
             stack.callback(fleet.close)
             stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
             fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
@@ -194,13 +197,17 @@ def train_ray(
                 try:
                     working = fleet.watch(note, stored + given_up)
                 except FleetFailed as error:
-                    raise TrainFailed(f"{error}; the same command with --resume goes on from the last checkpoint") from None
+                    raise _failed(error) from None
                 learner.excuse(fleet.lost)
                 if not working:
                     raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
     if interrupted.is_set():  # while everything was closed
         raise TrainInterrupted
     return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
+
+
+def _failed(error: Exception) -> TrainFailed:
+    return TrainFailed(f"{error}; the same command with --resume goes on from the last checkpoint")
 
 
 @contextlib.contextmanager

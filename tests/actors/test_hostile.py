@@ -1,6 +1,7 @@
 """Real worker processes and an environment that is hostile to them: in one variation it raises, dies or hangs."""
 
 import contextlib
+import gc
 import json
 import os
 import subprocess
@@ -9,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from actors.fleet import Fleet, FleetFailed
@@ -193,12 +195,18 @@ def fleet():
     """``fleet(actors, restarts)``: a real one, on as many cores as there are."""
     with contextlib.ExitStack() as stack:
 
-        def made(actors, restarts):
-            one = Fleet(actors, restarts, oversubscribe=True)
+        def made(actors, restarts, **options):
+            one = Fleet(actors, restarts, oversubscribe=True, **options)
             stack.callback(one.close)
             return one
 
         yield made
+
+
+def kill_rays_node_once():
+    """As soon as there is one in this process's family."""
+    family = lambda: psutil.Process().children(recursive=True)  # noqa: E731
+    wait_for(lambda: [p.kill() for p in family() if p.name() == "raylet"], "Ray's node")
 
 
 def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_others_finish(learner, hostile, fleet):
@@ -217,10 +225,16 @@ def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_ot
     assert sorted(record["job"] for record in learner.records()) == ["pretrain/0/0", "pretrain/0/0", CULPRIT]
 
 
-def test_a_fleet_gives_up_on_a_worker_that_keeps_dying_while_nothing_gets_on(learner, hostile, fleet):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Ray forgets what it had started
+def test_a_fleet_comes_up_though_rays_node_died_and_gives_up_on_a_worker_that_keeps_dying(learner, hostile, fleet):
     hostile("exit")
-    learner, fleet, notes = learner(60.0), fleet(1, 1), []
+    killer, notes = threading.Thread(target=kill_rays_node_once), []
+    killer.start()
+    learner, fleet = learner(60.0), fleet(1, 1, note=notes.append)
+    killer.join()
+    gc.collect()
+    assert [note.partition(":")[2] for note in notes] == [" starting it again, 2 of 3"]
     fleet.start(learner.endpoint, "test", learner.folder)
     with pytest.raises(FleetFailed, match="worker w0 died 2 times without progress"):
         wait_for(lambda: fleet.watch(notes.append, 7) and False, "giving up", 100)
-    assert (fleet.deaths, len(notes)) == (2, 1)
+    assert (fleet.deaths, len(notes)) == (2, 2)
