@@ -36,7 +36,9 @@ def begin(ray: Any, cores: int, note: Callable[[str], None], stopped: Callable[[
             _end(set(psutil.Process().children()) - set(before))  # it does not end what it had started by then
             said = f"Ray did not start on this machine ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
             if stopped() or number == TRIES:
-                raise RuntimeError(f"{said}, tried {number} times; its own words are in /tmp/ray/session_latest/logs") from error
+                raise RuntimeError(
+                    f"{said}, tried {number} times; its own words are in /tmp/ray/session_latest/logs"
+                ) from error
             note(f"{said}: starting it again, {number + 1} of {TRIES}")
 
 

@@ -1,20 +1,28 @@
-"""The watchdog: a worker stuck in an environment says where, and ends.
+"""The watchdog: a worker stuck in an environment says where, and ends, although the learner is away.
 
-It is a thread of C (``faulthandler``), so it barks although the interpreter's lock is held for
-ever, and although the learner is away.
+There are two.  A thread of Python's barks first: it holds the interpreter's lock meanwhile, so that
+the stacks that it writes stand still.  Where that lock is held for ever, a thread of C barks
+(``faulthandler``) ``GRACE_S`` later: then no other thread can run, and the stacks stand still too.
+While others run, the thread of C might read a stack that is just changing, and crash.
 """
 
 from __future__ import annotations
 
 import contextlib
+import datetime
 import faulthandler
 import os
 import tempfile
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
 from icrl_dist import crashes
+
+GRACE_S = 2.0
+"""Seconds that the thread of Python's has to get the interpreter's lock and to write."""
 
 
 class Watchdog:
@@ -32,15 +40,24 @@ class Watchdog:
         """
         self._file: IO[str] | None = None
         self._deadline_s = 0.0
+        self._changed = threading.Condition()
+        self._due: float | None = None
+        """When it barks, by ``time.monotonic``; None while nothing is to be watched."""
+        self._over = False
         if run is not None:
             self._file = _open(run, worker)
             faulthandler.enable(self._file)
+            threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     @contextlib.contextmanager
     def over(self, deadline_s: float) -> Iterator[None]:
         """Work for at most so many seconds."""
+        sooner = not 0 < self._deadline_s <= deadline_s
         self._deadline_s = deadline_s
         self._arm()
+        if sooner:
+            with self._changed:
+                self._changed.notify()
         try:
             yield
         finally:
@@ -59,6 +76,9 @@ class Watchdog:
         """Let go of the file, and leave none behind in which nothing stands."""
         if self._file is None:
             return
+        with self._changed:
+            self._over = True
+            self._changed.notify()
         faulthandler.disable()
         empty = not os.fstat(self._file.fileno()).st_size
         self._file.close()
@@ -67,11 +87,32 @@ class Watchdog:
 
     def _arm(self) -> None:
         if self._file is not None:
-            faulthandler.dump_traceback_later(self._deadline_s, exit=True, file=self._file)
+            with self._changed:
+                self._due = time.monotonic() + self._deadline_s
+            faulthandler.dump_traceback_later(self._deadline_s + GRACE_S, exit=True, file=self._file)
 
     def _disarm(self) -> None:
         if self._file is not None:
             faulthandler.cancel_dump_traceback_later()
+            with self._changed:
+                self._due = None
+
+    def _watch(self) -> None:
+        """Sleeps as long as nothing can be due, and is woken only for a deadline shorter than those before."""
+        with self._changed:
+            while not self._over:
+                left = self._deadline_s or None if self._due is None else self._due - time.monotonic()
+                if left is None or left > 0:
+                    self._changed.wait(left)
+                else:
+                    self._bark()
+
+    def _bark(self) -> None:
+        assert self._file is not None
+        self._file.write(f"Timeout ({datetime.timedelta(seconds=self._deadline_s)})!\n")
+        self._file.flush()
+        faulthandler.dump_traceback(self._file)
+        os._exit(1)
 
 
 def _open(run: Path, worker: str) -> IO[str]:

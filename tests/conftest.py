@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +16,8 @@ import torch
 
 import tests.typecheck
 
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # begun by a shell's "&": what tests start would ignore Ctrl-C too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.disable()  # until everything is imported
 pytest.register_assert_rewrite("tests.contracts")
 

@@ -162,6 +162,7 @@ def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, ho
     assert process.returncode == 1, log
     stacks = (learner.folder / "crashes" / "w0.stacks").read_text()
     assert stacks.startswith("Timeout (0:00:0") and f" in {function}" in stacks and " in random_context" in stacks
+    assert (" in _bark" in stacks) is (deed == "sleep"), "the thread of Python's writes them wherever it can"
     wait_for(lambda: learner.events_of("crash"), "the record")
     (record,) = learner.records()
     assert (record["what"], record["job"]) == ("vanished", "pretrain/0/0")

@@ -24,7 +24,7 @@ class ReluctantRay:
             pass
         self.started.append([process, *psutil.Process(process.pid).children()])
         if len(self.started) <= self.failures:
-            raise Exception("The current node timed out.\nOr something else did.")  # noqa: TRY002
+            raise Exception("The current node timed out.\nOr something else did.")
 
     def shutdown(self):
         self.shut += 1
