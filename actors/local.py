@@ -17,7 +17,8 @@ def begin(ray: Any, cores: int, note: Callable[[str], None], stopped: Callable[[
     """Start Ray with room for so many workers, and again if it did not come up.
 
     Ray's node ends itself, for good, when one of the processes that it starts takes more than 30 s,
-    as may happen on a machine that is busy; only a new Ray helps.  Raises RuntimeError after ``TRIES``, or if it did not come up and ``stopped``.
+    as may happen on a machine that is busy; only a new Ray helps.  Raises RuntimeError after ``TRIES``,
+    or if it did not come up and ``stopped``.
     """
     for number in range(1, TRIES + 1):
         before = psutil.Process().children()
