@@ -87,7 +87,8 @@ class Fleet:
             if not oversubscribe:
                 check_cores(actors)
             try:
-                local.begin(ray, actors, note, stopped)
+                options = {"object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
+                local.begin(ray, note, stopped, num_cpus=actors, **options)
             except RuntimeError as error:
                 raise FleetFailed(str(error)) from error
         else:

@@ -13,8 +13,8 @@ TRIES = 3
 """Ray is started so often before a run gives up."""
 
 
-def begin(ray: Any, cores: int, note: Callable[[str], None], stopped: Callable[[], bool]) -> None:
-    """Start Ray with room for so many workers, and again if it did not come up.
+def begin(ray: Any, note: Callable[[str], None], stopped: Callable[[], bool] = lambda: False, **options: Any) -> None:
+    """Start Ray with these options of ``ray.init``, and again if it did not come up.
 
     Ray's node ends itself, for good, when one of the processes that it starts takes more than 30 s,
     as may happen on a machine that is busy; only a new Ray helps.  Raises RuntimeError after ``TRIES``,
@@ -23,14 +23,7 @@ def begin(ray: Any, cores: int, note: Callable[[str], None], stopped: Callable[[
     for number in range(1, TRIES + 1):
         before = psutil.Process().children()
         try:
-            ray.init(
-                num_cpus=cores,
-                object_store_memory=100 << 20,
-                _node_ip_address="127.0.0.1",
-                include_dashboard=False,
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-            )
+            ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR, **options)
             return
         except Exception as error:  # of no kind that Ray would give a name
             ray.shutdown()

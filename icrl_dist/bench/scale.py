@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import math
 import os
 import queue
 import statistics
@@ -171,7 +172,7 @@ def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
         "workers": count,
         "ingest_per_s": round(len(stored) / (stored[-1] - began), 1),
         "ack_p50_ms": round(1e3 * statistics.median(taken), 1),
-        "ack_p99_ms": round(1e3 * taken[int(0.99 * (len(taken) - 1))], 1),
+        "ack_p99_ms": round(1e3 * taken[math.ceil(0.99 * (len(taken) - 1))], 1),
         "busy": inbox.drops["busy"],
         "resent": sum(one["resent"] for one in said),
         "duplicates": inbox.drops["duplicate"],

@@ -19,11 +19,14 @@ from typing import Any
 
 import numpy as np
 
+from actors import local
 from icrl_dist.stream import batch, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Query
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
+
+_log = logging.getLogger(__name__)
 
 CREDITS = 8
 LIMIT = 1 << 20
@@ -214,14 +217,7 @@ def local_ray() -> Iterator[Any]:
 
     if ray.is_initialized():
         raise RuntimeError("a Ray session is open in this process: run this benchmark in one of its own")
-    ray.init(
-        address="local",
-        num_cpus=2,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-        configure_logging=False,
-    )
+    local.begin(ray, _log.warning, address="local", num_cpus=2, configure_logging=False)
     try:
         yield ray
     finally:

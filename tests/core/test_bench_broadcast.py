@@ -16,7 +16,7 @@ def test_it_reports_a_ratio_for_each_size() -> None:
     for size in broadcast.WIDTHS:
         ((ours, rays),) = result["pairs"][size]
         assert ours > 0 and rays > 0
-        assert result[f"ratio_{size}"] == pytest.approx(ours / rays, abs=0.01)
+        assert result[f"ratio_{size}"] == pytest.approx(ours / rays, rel=0.02, abs=0.01)
     assert json.loads(json.dumps(result)) == result
     assert f"{result['bytes_12mb']:,}" in broadcast.describe(result)
 

@@ -50,9 +50,10 @@ def test_an_endpoint_that_cannot_be_bound(endpoint: str) -> None:
 
 
 def test_a_udp_port_is_another_than_the_tcp_port_of_its_number() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        number = free.getsockname()[1]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
-        server.bind(("127.0.0.1", 0))
-        number = server.getsockname()[1]
+        server.bind(("127.0.0.1", number))
         assert ask("stream endpoint", f"udp/127.0.0.1:{number}").ok is False
         assert ask("stream endpoint", f"tcp/127.0.0.1:{number}").ok is True
 

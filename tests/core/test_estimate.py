@@ -98,7 +98,7 @@ print(json.dumps(rates.measure(override(load("demo"), sys.argv[1:], "test"), "de
 def test_the_demo_takes_what_its_plan_says(tmp_path):
     """Within a factor of two.  The demo with its own room, model, tasks, adversaries and batches, but shorter everywhere.
 
-    Other tests run beside it, so if that fails the rates are measured once more, after the run.
+    Other tests run beside it, so if that fails the rates are measured once more, after the run, and all of it once more.
     """
     settings = [*SHORT, "learner.threads=1"]
     words = [word for setting in settings for word in ("--set", setting)]
@@ -110,10 +110,15 @@ def test_the_demo_takes_what_its_plan_says(tmp_path):
         rates = Rates(**{**found, "phases": tuple(PhaseRates(**phase) for phase in found["phases"])})
         return 3600 * estimate(rates, nodes=1, cores=1, gbit_per_s=1.0)["hours"]
 
-    before, began = planned(), time.monotonic()
     command = [sys.executable, "-m", "icrl_dist.cli", "train", "demo", "--engine", "inline", "--out", tmp_path / "demo"]
-    subprocess.run([*command, *words], check=True, stdout=subprocess.DEVNULL)
-    real = time.monotonic() - began
-    if not before / 2 < real < 2 * before:  # the machine may have changed its pace
-        after = planned()
-        assert min(before, after) / 2 < real < 2 * max(before, after), (before, real, after)
+    before, seen = planned(), []
+    for _ in range(2):
+        began = time.monotonic()
+        subprocess.run([*command, "--overwrite", *words], check=True, stdout=subprocess.DEVNULL)
+        real = time.monotonic() - began
+        after = before if before / 2 < real < 2 * before else planned()  # the machine may have changed its pace
+        seen.append((before, real, after))
+        if min(before, after) / 2 < real < 2 * max(before, after):
+            return
+        before = after
+    raise AssertionError(f"planned, taken, planned: {seen}")

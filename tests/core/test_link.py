@@ -44,6 +44,7 @@ class MemoryLinks:
 class ZenohLinks:
     def __init__(self) -> None:
         self.learner: Link = ZenohLink.listen(ANYWHERE)
+        self.learner.serve("icrl/settle", lambda query: query.reply(b""))
         self.made = [self.learner]
 
     def worker(self) -> Link:
@@ -51,7 +52,9 @@ class ZenohLinks:
         return self.made[-1]
 
     def settle(self) -> None:
-        time.sleep(0.1)
+        for worker in self.made[1:]:
+            worker.request("icrl/settle", b"", 30.0)  # behind what it has declared
+        time.sleep(0.1)  # what the learner has declared
 
 
 class TestMemoryLink(LinkBattery):
@@ -101,7 +104,7 @@ def test_names_that_cannot_be_keys_are_refused() -> None:
 
 def test_a_dispatcher_outlives_what_it_runs(caplog: pytest.LogCaptureFixture) -> None:
     dispatcher, ran = Dispatcher("test"), list[str]()
-    dispatcher.post(lambda: ran.append("later"), 0.05)
+    dispatcher.post(lambda: ran.append("later"), 1.0)
     dispatcher.post(lambda: 1 / 0)  # type: ignore[arg-type]
     dispatcher.post(lambda: ran.append("now"))
     dispatcher.post(lambda: ran.append("never"), 60.0)

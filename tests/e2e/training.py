@@ -9,6 +9,7 @@ import time
 
 import psutil
 
+from icrl_dist import processes
 from icrl_dist.stream import plane, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 
@@ -27,7 +28,7 @@ def start(*arguments, **options):
     )
 
 
-def finish(process, timeout=200):
+def finish(process, timeout=500):
     output, _ = process.communicate(timeout=timeout)
     return output
 
@@ -36,7 +37,7 @@ def result_of(folder):
     return json.loads((folder / "result.json").read_text())
 
 
-def wait_for(condition, what, timeout=120):
+def wait_for(condition, what, timeout=300):
     deadline = time.monotonic() + timeout
     while not (value := condition()):
         assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
@@ -68,7 +69,7 @@ def on_first_adapt_trajectory(folder, act, round_=0):
 
 
 def workers_of(process):
-    return [p for p in psutil.Process(process.pid).children(recursive=True) if "_Host.work" in " ".join(p.cmdline())]
+    return [p for p in psutil.Process(process.pid).children(recursive=True) if processes.is_worker(p)]
 
 
 def equal(result, other):
@@ -82,5 +83,5 @@ def kill_the_tree(process):
         with contextlib.suppress(psutil.NoSuchProcess):
             member.kill()
     finish(process)
-    _, alive = psutil.wait_procs(family, timeout=15)
+    _, alive = psutil.wait_procs(family, timeout=60)
     assert not alive

@@ -69,9 +69,9 @@ def worker(hub, office):
     """``worker(name)``: announced, with a link of its own to close."""
 
     def announced(name):
-        link = hub()
+        link, before = hub(), sum(e["event"] == "worker" for e in office.events)
         link.announce(KEYS.alive(name))
-        office.wait("worker", sum(e["event"] == "worker" for e in office.events) + 1)
+        office.wait("worker", before + 1)
         return link
 
     return announced

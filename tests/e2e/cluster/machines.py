@@ -149,7 +149,7 @@ def _namespaces(process):
     return set()
 
 
-def wait_until(condition, what, timeout=100):
+def wait_until(condition, what, timeout=250):
     deadline = time.monotonic() + timeout
     while True:
         began = time.monotonic()
