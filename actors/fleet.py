@@ -87,8 +87,7 @@ class Fleet:
             if not oversubscribe:
                 check_cores(actors)
             try:
-                options = {"object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
-                local.begin(ray, note, stopped, num_cpus=actors, **options)
+                local.begin(ray, note, stopped, num_cpus=actors, object_store_memory=100 << 20, _node_ip_address="127.0.0.1")
             except RuntimeError as error:
                 raise FleetFailed(str(error)) from error
         else:

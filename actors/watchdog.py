@@ -52,12 +52,11 @@ class Watchdog:
     @contextlib.contextmanager
     def over(self, deadline_s: float) -> Iterator[None]:
         """Work for at most so many seconds."""
-        sooner = not 0 < self._deadline_s <= deadline_s
-        self._deadline_s = deadline_s
-        self._arm()
-        if sooner:
-            with self._changed:
+        with self._changed:
+            if not 0 < self._deadline_s <= deadline_s:
                 self._changed.notify()
+            self._deadline_s = deadline_s
+        self._arm()
         try:
             yield
         finally:

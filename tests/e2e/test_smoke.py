@@ -74,7 +74,7 @@ def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undi
     trajectories = [store.read(row.identity) for row in store.ledger]
     store.close()
     assert {t.identity for t in trajectories} == wanted and len(trajectories) == len(wanted)
-    assert {t.worker for t in trajectories} <= {"w0", "w1"}
+    assert {t.worker for t in trajectories} == {"w0", "w1"}
     digests = [checkpoints.read_manifest(version_file(folder, version))["weights_digest"] for version in range(2)]
     for t in trajectories:
         if t.identity.stage == "adapt":

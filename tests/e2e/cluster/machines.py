@@ -126,21 +126,22 @@ def up(folder):
         (desk.home / "onprem.yaml").write_text(files.filled_in(head, workers))
         desk.run(hosts.ROOT / "deploy" / "zenoh" / "certificates.sh", Cluster.CERTIFICATES, head.address)
         desk.run(*Cluster.ray("get-auth-token", "--generate"))
-        _bring_up(desk)
+        started(lambda: desk.run(*Cluster.ray("up", "-y", "--no-config-cache", Cluster.FILE), timeout=200))
         yield Cluster(desk, head, tuple(workers), late)
     assert namespaces.isdisjoint(set().union(*map(_namespaces, psutil.pids())))
     assert str(folder) not in Path("/proc/mounts").read_text()
 
 
-def _bring_up(desk, times=3):
-    """`ray up`, again if a machine was so busy that Ray's 30 seconds for a node's start were over."""
+def started(start, clear=lambda: None, times=3):
+    """``start``, and after ``clear`` again if a machine was so busy that Ray's 30 seconds for a node's start were over."""
     for left in reversed(range(times)):
         try:
-            desk.run(*Cluster.ray("up", "-y", "--no-config-cache", Cluster.FILE), timeout=200)
+            start()
             return
         except AssertionError as error:
             if not left or "timed out during startup" not in str(error):
                 raise
+            clear()
 
 
 def _namespaces(process):
