@@ -151,6 +151,16 @@ def slim(checkpoint: Checkpoint) -> Checkpoint:
     return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith(("model/", "outcomes/"))}, manifest)
 
 
+def is_slim(path: Path) -> bool:
+    """Whether a file is an agent as ``slim`` leaves it: to replace it loses nothing that training needs."""
+    try:
+        checkpoint = load_checkpoint(path)
+    except StoreError:
+        return False
+    kept = slim(checkpoint)
+    return kept.arrays.keys() == checkpoint.arrays.keys() and kept.manifest.keys() == checkpoint.manifest.keys()
+
+
 def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda episodes: None) -> Checkpoint:
     """The checkpoint with what its model expects to happen (``surprise.calibrate``); as it is if it has that already."""
     if checkpoint.part("outcomes"):

@@ -44,7 +44,8 @@ class Train:
     resume: bool = False
     """Go on with the run in the folder from its last checkpoint."""
     overwrite: bool = False
-    """Delete the run in the folder first."""
+    """Replace the run in the folder: it is removed once the new one has its first checkpoint, and comes
+    back if the new one ends before that."""
     json: bool = False
     """Print the result as one JSON object on the last line."""
     given: tyro.conf.Suppress[tuple[str, ...]] = ()

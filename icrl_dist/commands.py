@@ -34,8 +34,8 @@ LOCAL_ACTORS = 2
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
-    from icrl_dist import launch
-    from icrl_dist.files import atomic_write, save_checkpoint
+    from icrl_dist import launch, run_folder
+    from icrl_dist.files import atomic_write, hold
     from icrl_dist.terminal import Display
 
     if not arguments.run and not arguments.source:
@@ -56,40 +56,50 @@ def train(arguments: Train, console: Console) -> int:
         check_cores(actors or LOCAL_ACTORS)
     if arguments.engine == "ray":
         launch.check_security(run, arguments.address)
-    launch.prepare(run, folder, arguments.resume, arguments.overwrite, source)
+    begun = launch.prepare(run, folder, arguments.resume, arguments.overwrite, source)
     began = time.monotonic()
-    try:
-        with Display(console) as display:
-            if arguments.engine == "inline":
-                result = launch.train_inline(run, folder, display.report)
-            else:
-                options = (arguments.oversubscribe, arguments.min_actors)
-                result = launch.train_ray(run, folder, actors, arguments.address, display.report, *options)
-            from icrl_dist import heldout  # torch with it, which neither the learner nor the workers should wait for
-            from icrl_dist.agent import checkpoint_file
+    with contextlib.ExitStack() as held:
+        try:
+            with Display(console) as display:
+                with begun:
+                    report = begun.heed(display.report)
+                    if arguments.engine == "inline":
+                        result = launch.train_inline(run, folder, report)
+                    else:
+                        options = (arguments.oversubscribe, arguments.min_actors)
+                        result = launch.train_ray(run, folder, actors, arguments.address, report, *options)
+                held.enter_context(hold(folder))  # as the learner did: nobody replaces the run while it is evaluated
+                from icrl_dist import heldout  # torch with it, which neither the learner nor the workers should wait for
 
-            if run.method != "experts":
-                with launch.interruptible():
-                    save_checkpoint(checkpoint_file(folder), heldout.calibrate(folder, display))
-                    results = heldout.online(run, folder, display)
-    except launch.TrainInterrupted:
-        resume = f"`{_resuming(arguments.given)}` goes on from the checkpoint"
-        told = f"interrupted; {resume if folder.exists() else 'nothing had been done yet'}"
-        console.print(told, highlight=False, markup=False, soft_wrap=True)
-        return INTERRUPTED
-    result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
-    if run.method == "experts":
-        result |= heldout.show_experts(folder, console)
-    else:
-        result |= heldout.show_online(run, folder / "report", *results, console)
-    atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
+                if run.method != "experts":
+                    with launch.interruptible():
+                        heldout.keep_calibrated(folder, display)
+                        results = heldout.online(run, folder, display)
+        except launch.TrainInterrupted:
+            resume = f"`{_resuming(arguments.given)}` goes on from the checkpoint"
+            told = (
+                f"{folder} is as it was before"
+                if begun.restored
+                else resume
+                if folder.exists()
+                else "nothing had been done yet"
+            )
+            console.print(f"interrupted; {told}", highlight=False, markup=False, soft_wrap=True)
+            return INTERRUPTED
+        result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}
+        if run.method == "experts":
+            evaluated = heldout.show_experts(folder, console)
+        else:
+            evaluated = heldout.show_online(run, folder / "report" / heldout.report_name(run, folder), *results, console)
+        result = run_folder.concluded(folder, result, evaluated)
+        atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
         f"trajectories, {result['seconds']:.0f} s, run folder {folder}",
         highlight=False,
         markup=False,
     )
-    if result["staleness"]:
+    if result.get("staleness"):
         console.print(f"asynchronous: trajectories by versions behind: {result['lag']}; digests differ from run to run")
     for given_up in result["quarantined"]:
         console.print(f"quarantined: {given_up['variation']}: {given_up['cause']}", highlight=False, markup=False)
@@ -126,14 +136,15 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
         raise ConfigError(f"--suite {arguments.suite}: only Dark Room has that so far; {run.problem} has --suite online")
     deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or default_deployment(run.model)
     answer: dict[str, Any] = {"suite": arguments.suite, "deploy": deploy, "what": str(what)}
+    report = folder / heldout.report_name(run, what, arguments.suite, deploy)
     if arguments.suite == "online":
         with Display(console) as display:
             results = heldout.online(run, what, display, arguments.deploy)
-        answer |= heldout.show_online(run, folder, *results, console)
+        answer |= heldout.show_online(run, report, *results, console)
     elif arguments.suite == "posterior":
         with Display(console) as display:
-            report = heldout.posterior(run, what, display)
-        answer |= heldout.show_posterior(run, folder, report, console)
+            found = heldout.posterior(run, what, display)
+        answer |= heldout.show_posterior(run, report, found, console)
     else:
         answer |= heldout.show_offline(heldout.offline(run, what, arguments.deploy), console)
     if arguments.json:
@@ -156,7 +167,7 @@ def _evaluated(arguments: Evaluate) -> tuple[Path, Path]:
 def export(arguments: Export, console: Console) -> int:
     """``icrl-dist export``: an agent without what only training needs."""
     from icrl_dist import heldout
-    from icrl_dist.agent import checkpoint_file, slim
+    from icrl_dist.agent import checkpoint_file, is_slim, slim
     from icrl_dist.files import save_checkpoint
     from icrl_dist.terminal import Display
 
@@ -164,6 +175,8 @@ def export(arguments: Export, console: Console) -> int:
     out = arguments.out or (arguments.what if arguments.what.is_dir() else source.parent) / "agent.npz"
     if out.is_dir():
         raise ConfigError(f"--out {out}: is a folder; name a file, such as {out / 'agent.npz'}")
+    if out.exists() and not is_slim(out):
+        raise ConfigError(f"--out {out}: exists, and is no agent that was exported; name another file")
     with Display(console) as display:
         save_checkpoint(out, slim(heldout.calibrate(source, display)))
     console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)
@@ -247,7 +260,7 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
                 f"--connect {connect}: TLS needs --certificates, a folder with ca.pem, monitor.pem and monitor.key"
             )
         return connect, certificates or "", ""
-    files = [what / "endpoint"] if what else sorted(Path("runs").glob("*/endpoint"), key=lambda f: f.stat().st_mtime)
+    files = [what / "endpoint"] if what else sorted(Path("runs").glob("[!.]*/endpoint"), key=lambda f: f.stat().st_mtime)
     files = [file for file in files if held(file.parent)] or files  # a crash leaves its endpoint behind
     if not files or not files[-1].is_file():
         raise ConfigError(

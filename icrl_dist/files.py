@@ -34,21 +34,24 @@ class Checkpoint:
 def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
     """Be the only one at work in a run folder until the returned file is closed, or this process ends.
 
-    Raises StoreError if somebody else still is after ``timeout_s``: a run that was just killed
-    needs a moment to go.
+    The folder may be moved meanwhile, or replaced while this waits: the lock that counts is the one
+    that is in the folder now.  Raises StoreError if somebody else still is at work after
+    ``timeout_s``: a run that was just killed needs a moment to go.
     """
     path = folder / ".lock"
-    file = path.open("ab")
     deadline = time.monotonic() + timeout_s
     while True:
+        file = path.open("ab")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return file
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
         except BlockingIOError:
             if time.monotonic() > deadline:
                 file.close()
                 raise StoreError(f"{folder}: another learner is at work in this folder; end it, or use another --out") from None
             time.sleep(0.05)
+        file.close()
 
 
 def held(folder: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from icrl_dist.agent import calibrated, checkpoint_file, model_of, outcomes_of
 from icrl_dist.config import Deployment, Run, default_deployment
 from icrl_dist.envs import tasks
 from icrl_dist.exact import RULES
-from icrl_dist.files import Checkpoint, atomic_write, load_checkpoint
+from icrl_dist.files import Checkpoint, atomic_write, load_checkpoint, save_checkpoint
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.store import Store
 from icrl_dist.surprise import Surprise
@@ -42,6 +43,31 @@ def calibrate(what: Path, display: Display) -> Checkpoint:
         display.report(event | {"step": episodes, "steps": 2 * surprise.EPISODES})
 
     return calibrated(load_checkpoint(checkpoint_file(what)), progress)
+
+
+def keep_calibrated(folder: Path, display: Display) -> None:
+    """Calibrate a run's newest checkpoint, which is written anew only if it was not calibrated before."""
+    made = calibrate(folder, display)
+    file = checkpoint_file(folder)
+    if not load_checkpoint(file).part("outcomes"):
+        save_checkpoint(file, made)
+
+
+def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment | None = None) -> str:
+    """The name of a report, without its ending: the suite, the agent and the settings, so that other settings have another.
+
+    Such as ``online-T2-1a2b3c4d-paper-uniform-p0_0.2-40episodes-2seeds``: T^2, whose weights have that
+    digest.  A checkpoint file's own name comes before; more than ten probabilities are named by a digest.
+    """
+    manifest = load_checkpoint(checkpoint_file(what)).manifest
+    settings = run.evaluate
+    levels = "_".join(repr(float(p)).removesuffix(".0") for p in settings.p)
+    if len(levels) > 60:
+        levels = hashlib.sha256(levels.encode()).hexdigest()[:16]
+    agent = f"T{manifest['version']}-{str(manifest.get('weights_digest', ''))[:8]}"
+    by = deploy or default_deployment(run.model)
+    named = "" if what.is_dir() else f"{what.stem[:60]}-"
+    return f"{suite}-{named}{agent}-{by}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
 
 
 def online(
@@ -109,14 +135,14 @@ def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[eval
 
 
 def show_online(
-    run: Run, folder: Path, results: list[evaluate.Result], surprised: dict[str, Any], console: Console
+    run: Run, report: Path, results: list[evaluate.Result], surprised: dict[str, Any], console: Console
 ) -> dict[str, Any]:
-    """Print the table, draw the figure, keep the rows in the folder; returns them with the figure's path."""
+    """Print the table, keep the rows as ``report``.json and the figure as ``report``.png; returns the rows with its path."""
     rows = [result.row() for result in results]
     adapted = _adaptation(results)
     title = f"{run.method.upper()} on {_tasks(run, len(results[0].returns))}, {run.evaluate.seeds} seeds"
-    atomic_write(folder / "online.json", lambda file: file.write(json.dumps(rows, indent=1).encode()))
-    figure = plots.adaptation(rows, folder / "adaptation.png", title)
+    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(rows, indent=1).encode()))
+    figure = plots.adaptation(rows, report.with_name(f"{report.name}.png"), title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
     for one in results:
         if one.broken:
@@ -184,18 +210,18 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
     return report
 
 
-def show_posterior(run: Run, folder: Path, report: dict[str, Any], console: Console) -> dict[str, Any]:
-    """Print the tables, draw the figure, keep everything in the folder; returns all but the curves."""
+def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Console) -> dict[str, Any]:
+    """Print the tables, keep everything as ``report``.json and the figure as ``report``.png; returns all but the curves."""
     size = run.darkroom.size
     title = f"{run.method.upper()} beside the exact posterior in a {size}x{size} Dark Room"
-    atomic_write(folder / "posterior.json", lambda file: file.write(json.dumps(report, indent=1).encode()))
-    figure = plots.agreement(report, folder / "posterior.png", title)
+    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
+    figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
     for law, meaning in truth.LAWS.items():
-        console.print(kl_table(report, law, f"KL(exact || model) in nats, where {meaning}"))
+        console.print(kl_table(found, law, f"KL(exact || model) in nats, where {meaning}"))
     adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
-    console.print(gap_table(report, f"Online return by Algorithm 1 beside the exact agent's: {adversary}"))
+    console.print(gap_table(found, f"Online return by Algorithm 1 beside the exact agent's: {adversary}"))
     console.print(f"figure {figure}", highlight=False, markup=False)
-    return {key: value for key, value in report.items() if not key.endswith("_curves")} | {"figure": str(figure)}
+    return {key: value for key, value in found.items() if not key.endswith("_curves")} | {"figure": str(figure)}
 
 
 def _goals(heldout: bool) -> str:

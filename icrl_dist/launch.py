@@ -11,7 +11,6 @@ import dataclasses
 import json
 import os
 import platform
-import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from icrl_dist import child, endpoints
+from icrl_dist import child, endpoints, run_folder
 from icrl_dist.child import Report, TrainFailed
 from icrl_dist.config import ConfigError, Run, dumps, load
 from icrl_dist.doctor import need_ray_token
@@ -33,26 +32,44 @@ class TrainInterrupted(Exception):  # noqa: N818
     """The run was interrupted; a checkpoint has been written."""
 
 
-def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> None:
+def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> run_folder.Begun:
     """Make the run folder: ``run.toml``, ``env.json``, and with ``source`` what another run's version stands on.
 
-    Raises ConfigError if the folder exists and is neither to be resumed nor overwritten, or
-    is to be resumed with other numbers; where its learner listens and is reached may have changed.
+    The run goes on within the returned context, which decides what becomes of a run that is
+    overwritten.  Raises ConfigError if the folder cannot be a run's own, if it exists and is neither
+    to be resumed nor overwritten, if a run is on in it, or if it is to be resumed with other
+    numbers; where its learner listens and is reached may have changed.
     """
+    if resume and overwrite:
+        raise ConfigError(f"--resume --overwrite: one goes on with the run in {folder}, the other replaces it; leave one out")
+    run_folder.check_place(folder, source[0] if source else None)
     try:
         Keys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
-    file = folder / "run.toml"
-    if overwrite and file.exists():
-        shutil.rmtree(folder)
+    run_folder.recover(folder)
+    begun = run_folder.Begun(folder, source[1] if source and not resume else -1)
     if folder.exists() and not resume and any(folder.iterdir()):
-        raise ConfigError(f"{folder} exists: use --resume to go on with it, --overwrite to begin anew, or another --out")
+        if not overwrite:
+            raise ConfigError(f"{folder} exists: use --resume to go on with it, --overwrite to begin anew, or another --out")
+        begun.set_aside()
+    try:
+        _make(run, folder, resume, source)
+    except BaseException:
+        begun.restore()
+        raise
+    return begun
+
+
+def _make(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | None) -> None:
+    file = folder / "run.toml"
     if resume and not file.exists():
         raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to begin one")
     before = load(str(file)) if resume else None
     if before is not None and _elsewhere(before, run) != run:
         raise ConfigError(f"--resume: {file} has other numbers than asked for; resume with the run's own, or use another --out")
+    if resume:
+        run_folder.take(folder).close()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if source is not None and not resume:
@@ -78,7 +95,7 @@ def _fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
     try:
         fork(theirs, version, run, folder)
     except BaseException:
-        shutil.rmtree(folder)  # it was made just now, and half a fork is no run
+        run_folder.remove(folder)  # it was made just now, and half a fork is no run
         raise
 
 
@@ -111,7 +128,10 @@ def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
 
     hub = MemoryHub()
     with hub.link() as ours, hub.link() as theirs:
-        service = Service(run, folder, ours, report)
+        try:
+            service = Service(run, folder, ours, report)
+        except RunFailed as error:
+            raise TrainFailed(str(error)) from None
         worker = Worker(theirs, folder.name, "w0")
 
         def work() -> None:
@@ -217,7 +237,7 @@ def _unmade_if_refused(folder: Path) -> Iterator[None]:
         yield
     except (ConfigError, TrainInterrupted):
         if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
-            shutil.rmtree(folder)
+            run_folder.remove(folder)
         raise
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import signal
 import threading
 import time
@@ -14,6 +13,7 @@ from typing import Any, Self
 
 from rich.console import Console
 
+from icrl_dist import run_folder
 from icrl_dist.chaos import schedule
 from icrl_dist.chaos.disk import NoDisk
 from icrl_dist.chaos.faults import FAULTS, Missed
@@ -131,7 +131,6 @@ def _digests(result: dict[str, Any]) -> str:
 
 
 def _clear(training: Training) -> None:
-    """Remove the run folder and the log of a training that is over."""
-    if training.folder.exists():
-        shutil.rmtree(training.folder)
+    """Remove the run folder and the log of a training that is over.  Raises ConfigError if others' files lie there."""
+    run_folder.remove(training.folder)
     training.log.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,7 +72,9 @@ def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_
     over, soon = (answer[name]["0"] for name in ("first10_over_oracle", "episode_of_90"))
     assert over == pytest.approx(sum(rows[kept]) / sum(rows["oracle"]), abs=1e-3) and over > 0.6
     assert soon is None or rows[kept][soon - 1] >= 0.9 * np.mean(rows["oracle"])
-    assert (tmp_path / "runs" / "darkroom-pretrained" / "report" / "adaptation.png").is_file()
+    report = Path(answer["figure"])
+    assert report.is_file() and report.resolve().parent == tmp_path / "runs" / "darkroom-pretrained" / "report"
+    assert report.name.endswith("-committed-unseen-p0-5episodes-1seeds.png")
     assert load_agent("darkroom").manifest["size"] == 10
 
 

@@ -66,7 +66,7 @@ def test_damage_while_the_run_is_on_is_found_before_it_is_learned_from(parent, t
 def test_one_learner_a_folder(parent, monkeypatch):
     monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
     with hold(parent[0]), pytest.raises(StoreError, match="another learner is at work"):
-        run_inline(parent[2], parent[0], resume=True)
+        launch.train_inline(parent[2], parent[0], print)
 
 
 def test_a_fork_with_the_same_numbers_ends_where_its_parent_did(parent, tmp_path):
