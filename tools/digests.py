@@ -66,7 +66,7 @@ def run(name: str, folder: Path) -> dict[str, object]:
         "OMP_NUM_THREADS": "1",
         "PYTHONPATH": os.pathsep.join((str(Path.cwd()), os.environ.get("PYTHONPATH", ""))),
     }
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     if done.returncode:
         raise SystemExit(f"{name}: exit code {done.returncode}\n{done.stderr[-2000:]}")
     result = json.loads(done.stdout.splitlines()[-1])
