@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import time
 
-from icrl_dist.belief import Room
-from icrl_dist.config import Run
-from icrl_dist.rollout import InContextPolicy
+from icrl_dist.config.run import Run
+from icrl_dist.problems.darkroom.posterior import Room
+from icrl_dist.rollout.deployment import InContextPolicy
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Link
 from icrl_dist.types import NULL, Identity, Variation

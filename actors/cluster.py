@@ -13,8 +13,9 @@ from typing import Any
 
 from actors import missing
 from actors.placement import Machine, Placement
-from icrl_dist import endpoints, nodes
-from icrl_dist.config import ConfigError
+from icrl_dist.config.run import ConfigError
+from icrl_dist.diagnostics import node_facts
+from icrl_dist.stream import endpoints
 
 LOOK_S = 1.0
 """Ray is asked for its machines so often."""
@@ -61,7 +62,7 @@ class Cluster:
         self._looked = -LOOK_S
         self._certificates = ""
         self._ports: list[tuple[str, int]] = []
-        self._here = nodes.facts()
+        self._here = node_facts.facts()
         self._loopback = ""
 
     def look_for(self, endpoint: str, connect: str, certificates: str) -> None:
@@ -79,7 +80,7 @@ class Cluster:
         """
         where = endpoints.parse(endpoint)
         try:
-            with nodes.listening(where.host, where.port) as port:
+            with node_facts.listening(where.host, where.port) as port:
                 if not connect:
                     self._ports = [(where.host, port)]
                 self._gathering = True
@@ -141,7 +142,7 @@ class Cluster:
 
     def _ask(self, one: _Candidate) -> None:
         where = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(one.machine.node, soft=False)
-        task = self._ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=where)(nodes.facts)
+        task = self._ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=where)(node_facts.facts)
         one.since, one.tries = time.monotonic(), one.tries + 1
         self._asked[task.remote(self._certificates, self._ports)] = one
 
@@ -160,7 +161,7 @@ class Cluster:
                 unfit += self._unfit(one, said, asked_again=not final, refused=final or self._tried_enough(one))
                 continue
             machine.host = facts["host"]
-            if differing := nodes.differences(self._here, facts):
+            if differing := node_facts.differences(self._here, facts):
                 remedy = "run `ray up` again, so that all machines have the same"
                 unfit += self._unfit(one, f"{machine}: {', '.join(differing)}: {remedy}", asked_again=False)
             elif wrong := objections(facts):
@@ -202,7 +203,7 @@ class Cluster:
         if time.monotonic() - self._silent.get(node, -SILENT_S) < SILENT_S:
             return False
         there = self._alive().get(node)
-        if there and not nodes.reach(str(there["NodeManagerAddress"]), int(there["NodeManagerPort"]), timeout_s=1.0):
+        if there and not node_facts.reach(str(there["NodeManagerAddress"]), int(there["NodeManagerPort"]), timeout_s=1.0):
             return True
         self._silent[node] = time.monotonic()
         return False

@@ -16,9 +16,9 @@ from typing import Any
 
 from actors import local
 from actors.cluster import Cluster, brief
-from actors.host import _Host
 from actors.placement import Machine, Placement
-from icrl_dist.config import ConfigError
+from actors.ray_actor import _Host
+from icrl_dist.config.run import ConfigError
 
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",

@@ -13,8 +13,7 @@ import sys
 import threading
 from collections.abc import Mapping
 
-from icrl_dist import endpoints
-from icrl_dist.stream import security
+from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from icrl_dist import crashes
+from icrl_dist.telemetry import crash_reports
 
 GRACE_S = 2.0
 """Seconds that the thread of Python's has to get the interpreter's lock and to write."""
@@ -117,7 +117,7 @@ class Watchdog:
 def _open(run: Path, worker: str) -> IO[str]:
     with contextlib.suppress(OSError):  # then it goes to a temporary file
         if run.is_dir():
-            path = crashes.stacks_of(run, worker)
+            path = crash_reports.stacks_of(run, worker)
             path.parent.mkdir(exist_ok=True)
             return path.open("w")
     return tempfile.NamedTemporaryFile("w", prefix=f"icrl-dist-{worker}-", suffix=".stacks", delete=False)

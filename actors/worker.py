@@ -13,16 +13,18 @@ from typing import Any
 
 import icrl_dist
 from actors.beliefs import Beliefs
-from actors.policy import LivePolicy
-from actors.showing import Showing
+from actors.publisher import Showing
 from actors.watchdog import Watchdog
-from icrl_dist import code, crashes, jobs
-from icrl_dist.config import parse
-from icrl_dist.envs import tasks
+from actors.weight_cache import LivePolicy
+from icrl_dist import version as code
+from icrl_dist.collect import jobs
+from icrl_dist.config.run import parse
 from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.problems import splits
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Link, LinkError, Refused, Unanswered
+from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Identity, Job, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -60,7 +62,7 @@ class Worker:
         self._link.announce(self._keys.alive(self.name))
         _, hello = self._ask("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
         run = parse(hello["run"], "the learner's run")
-        policy = LivePolicy(self._link, self._keys, tasks.spec(run), run.model, run.stream.max_message_bytes)
+        policy = LivePolicy(self._link, self._keys, splits.spec(run), run.model, run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
         beliefs = Beliefs(self._link, self._keys.monitor(f"belief/{self.name}"), self.name, run)
         watchdog = Watchdog(self._folder, self.name)
@@ -104,7 +106,7 @@ class Worker:
             _log.exception("job %s failed", job.label)
             refused = isinstance(error, Refused)  # then the reason names the trajectory
             under_way = None if refused else next((identity for identity in job.identities() if identity not in made), None)
-            record = crashes.raised(self.name, job, under_way, error)
+            record = crash_reports.raised(self.name, job, under_way, error)
             _settle(sender, drain_s)
             self._ask("failed", job=list(job.name), record=record, file=self._keep(record))
         finally:
@@ -120,7 +122,7 @@ class Worker:
     def _keep(self, record: dict[str, Any]) -> str:
         """Write the record into the run folder, if that is on this machine; the file's name."""
         try:
-            return crashes.write(self._folder, record).name if self._folder else ""
+            return crash_reports.write(self._folder, record).name if self._folder else ""
         except OSError as error:
             _log.warning("the learner is to write this crash record: %s", error)
             return ""
@@ -147,7 +149,7 @@ class Worker:
         def beat() -> None:
             key = self._keys.monitor(f"worker/{self.name}")
             while True:
-                fields = {**self._count(sender), **crashes.memory()}
+                fields = {**self._count(sender), **crash_reports.memory()}
                 now = {
                     "job": self._job,
                     "doing": self._doing,

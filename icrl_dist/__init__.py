@@ -10,9 +10,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from icrl_dist import oracle
-    from icrl_dist.agent import InContextAgent, load_agent
-    from icrl_dist.envs import make
+    from icrl_dist.agent.in_context_agent import InContextAgent, load_agent
+    from icrl_dist.problems.darkroom import solver as oracle
+    from icrl_dist.problems.registry import make
     from icrl_dist.types import NULL, Adversary, Task, Variation
 
 __version__ = "0.1.0"
@@ -20,9 +20,9 @@ __version__ = "0.1.0"
 __all__ = ["NULL", "Adversary", "InContextAgent", "Task", "Variation", "load_agent", "make", "oracle"]
 
 _HOME = {
-    "InContextAgent": "icrl_dist.agent",
-    "load_agent": "icrl_dist.agent",
-    "make": "icrl_dist.envs",
+    "InContextAgent": "icrl_dist.agent.in_context_agent",
+    "load_agent": "icrl_dist.agent.in_context_agent",
+    "make": "icrl_dist.problems.registry",
     "NULL": "icrl_dist.types",
     "Adversary": "icrl_dist.types",
     "Task": "icrl_dist.types",
@@ -33,7 +33,7 @@ _HOME = {
 def __getattr__(name: str) -> object:
     """The public names, imported when first asked for: most commands need no torch."""
     if name == "oracle":
-        return importlib.import_module("icrl_dist.oracle")
+        return importlib.import_module("icrl_dist.problems.darkroom.solver")
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module 'icrl_dist' has no attribute {name!r}")

@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from icrl_dist.config import ConfigError, load
-from icrl_dist.files import StoreError, explained
+from icrl_dist.config.run import ConfigError, load
+from icrl_dist.storage.files import StoreError, explained
 from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist.agent import spec_from
-from icrl_dist.config import ConfigError, Run, dumps
-from icrl_dist.envs import tasks
-from icrl_dist.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.agent.in_context_agent import spec_from
+from icrl_dist.config.run import ConfigError, Run, dumps
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
-from icrl_dist.pretrain import Optimiser
+from icrl_dist.problems import splits
+from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.stream.wire import weights_digest
+from icrl_dist.training.fit import Optimiser
 from icrl_dist.types import Spec, Weights
 
 PARTIAL = "partial.npz"
@@ -44,7 +44,7 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
 
 def _tasks(run: Run) -> dict[str, Any]:
     """Which tasks it was trained on, and which it was not."""
-    split = tasks.split(run)
+    split = splits.split(run)
     if run.problem == "darkroom":
         return {"size": run.darkroom.size, "test_goals": [[int(c) for c in task.vector("goal")] for task in split.test]}
     plain = [[dict(task.params) for task in part] for part in (split.train, split.test)]

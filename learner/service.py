@@ -13,25 +13,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist import context, files, pretrain
-from icrl_dist.config import Run
-from icrl_dist.envs import tasks
-from icrl_dist.evaluate import label_quality
-from icrl_dist.lineage import Lineage
-from icrl_dist.metrics import Metrics
+from icrl_dist.config.run import Run
+from icrl_dist.methods.recipes import Phase
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
-from icrl_dist.recipes import Phase
-from icrl_dist.store import Damaged, Store
+from icrl_dist.problems import splits
+from icrl_dist.results.evaluate import label_quality
+from icrl_dist.storage import files
+from icrl_dist.storage.dataset import Damaged, Store
+from icrl_dist.storage.fork import Lineage
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link
+from icrl_dist.telemetry.metrics import Metrics
+from icrl_dist.training import batches, fit
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
 from learner.broadcast import Broadcast
-from learner.desk import Desk
-from learner.herald import Herald
-from learner.inbox import Inbox
-from learner.plan import Plan
-from learner.work import Board
+from learner.ingest import Inbox
+from learner.phases import Plan
+from learner.reporter import Herald
+from learner.scheduler import Board
+from learner.worker_api import Desk
 
 Report = Callable[[dict[str, Any]], None]
 
@@ -64,12 +65,12 @@ class Service:
     def _begin(self, closing: contextlib.ExitStack) -> None:
         run, folder, link, report = self._run, self._folder, self._link, self._report
         self._keys = Keys(folder.name)
-        self._spec = tasks.spec(run)
+        self._spec = splits.spec(run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
-        self._opt = pretrain.Optimiser(self.model, run.optim)
+        self._opt = fit.Optimiser(self.model, run.optim)
         self.version = files.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
@@ -252,11 +253,11 @@ class Service:
         began = time.monotonic()
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
 
-        def batch(step: int) -> context.Batch:
+        def batch(step: int) -> batches.Batch:
             key = (_FIT_DRAWS, phase.produces, step)
             rng = np.random.default_rng(np.random.SeedSequence(self._run.seed, spawn_key=key))
             torch.manual_seed(int(rng.integers(2**31)))
-            return context.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
+            return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
 
         def progress(step: int, loss: float) -> None:
             self._partial = step  # damage may end this fit: it is taken up from here
@@ -269,7 +270,7 @@ class Service:
 
         first = self._partial
         try:
-            loss = pretrain.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, batch, progress, first)
+            loss = fit.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, batch, progress, first)
         finally:
             torch.set_num_threads(torch_threads)
         self._partial = 0

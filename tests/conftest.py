@@ -26,7 +26,7 @@ assert not imported, f"{imported} were imported before the import hook: their sh
 tests.typecheck.install("icrl_dist")
 torch.set_num_threads(1)
 
-from icrl_dist.config import (  # noqa: E402
+from icrl_dist.config.run import (
     AdversaryConfig,
     ContextConfig,
     DarkRoomConfig,
@@ -39,9 +39,9 @@ from icrl_dist.config import (  # noqa: E402
     Run,
     StreamConfig,
 )
-from icrl_dist.envs import darkroom  # noqa: E402
-from icrl_dist.stream.memory_link import MemoryHub, MemoryLink  # noqa: E402
-from icrl_dist.types import Task  # noqa: E402
+from icrl_dist.problems.darkroom import room as darkroom
+from icrl_dist.stream.memory_link import MemoryHub, MemoryLink
+from icrl_dist.types import Task
 
 FIRST = ("e2e", "learner", "actors")
 """Folders whose tests wait and run long: begun first, they leave no processor idle at the end."""

@@ -8,17 +8,17 @@ import sys
 import numpy as np
 import torch
 
-from icrl_dist import envs
-from icrl_dist.algos.sac_batch import train
-from icrl_dist.envs import problems
-from icrl_dist.games import SACConfig
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.experts.sac.batched import train
+from icrl_dist.problems import registry
+from icrl_dist.problems.dmc import domains
 from icrl_dist.types import Variation
 
 
 def main():
     torch.set_num_threads(1)
-    pole = [Variation(problems.task("dmc-cartpole-balance"))]
-    env = envs.batch(pole)
+    pole = [Variation(domains.task("dmc-cartpole-balance"))]
+    env = registry.batch(pole)
     rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
     config = SACConfig(hidden=(64, 64), batch=64, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
 
@@ -35,7 +35,7 @@ def main():
         if total / 10 >= 190:
             sys.exit("torch's compiler was imported" if "torch._dynamo" in sys.modules else 0)
 
-    train(envs.batch(pole), config, 12_000, [2], look, "cpu")
+    train(registry.batch(pole), config, 12_000, [2], look, "cpu")
 
 
 if __name__ == "__main__":

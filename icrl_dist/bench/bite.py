@@ -16,15 +16,17 @@ from typing import Any
 
 import torch
 
-from icrl_dist import bites, envs
 from icrl_dist.bench import disturbance
 from icrl_dist.bench.disturbance import Make, Report, Setting, Sizes, lost, measure, settings
-from icrl_dist.config import ConfigError
-from icrl_dist.envs import pick_place, problems
-from icrl_dist.experts import ExpertPolicy
-from icrl_dist.files import atomic_write
-from icrl_dist.games import SACConfig
-from icrl_dist.tables import nearest
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.config.toml import nearest
+from icrl_dist.experts.train import ExpertPolicy
+from icrl_dist.problems import registry
+from icrl_dist.problems.continuous import calibrated_strength
+from icrl_dist.problems.dmc import domains
+from icrl_dist.problems.metaworld import pick_place
+from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Task, Variation
 
 KNOWN = ("dmc-cartpole-balance", pick_place.KIND)
@@ -88,8 +90,8 @@ def run(
     ``steps`` of SAC for a problem's experts, instead of those of ``bench disturbance``.  Raises ConfigError
     for an unknown problem, and for experts that are not competent.
     """
-    bites.share(f"bite:{bite:g}")
-    known = (*problems.PROBLEMS, pick_place.KIND)
+    calibrated_strength.share(f"bite:{bite:g}")
+    known = (*domains.PROBLEMS, pick_place.KIND)
     if problem is not None and problem not in known:
         raise ConfigError(
             f"bench disturbance: problem = {problem!r}{nearest(problem, known)}: choose one of {', '.join(known)}"
@@ -101,7 +103,12 @@ def run(
             rows += _solved(kind, bite, steps, report, sizes or SIZES)
     finally:
         torch.set_num_threads(threads)
-    return {"bite": bite, "problems": rows, "file": str(bites.own_file()), "ok": all(row["reached"] for row in rows)}
+    return {
+        "bite": bite,
+        "problems": rows,
+        "file": str(calibrated_strength.own_file()),
+        "ok": all(row["reached"] for row in rows),
+    }
 
 
 def _solved(kind: str, bite: float, steps: int | None, report: Report, sizes: Sizes) -> list[dict[str, Any]]:
@@ -163,13 +170,13 @@ def _row(kind: str, one: Setting, make: Make, bite: float, config: SACConfig, re
 
 
 def _needed(kind: str, one: Setting) -> float:
-    return COMPETENT * envs.spec(one.task).horizon * (10 if kind == pick_place.KIND else 1)
+    return COMPETENT * registry.spec(one.task).horizon * (10 if kind == pick_place.KIND else 1)
 
 
 def _tasks(kind: str, one: Setting, sizes: Sizes) -> tuple[Task, ...]:
     if kind != pick_place.KIND:
-        return tuple(task.replace(forces=one.forces) for task in problems.grid(kind, 2))
-    from icrl_dist.envs.metaworld import ml1_tasks
+        return tuple(task.replace(forces=one.forces) for task in domains.grid(kind, 2))
+    from icrl_dist.problems.metaworld.environment import ml1_tasks
 
     return ml1_tasks(sizes.tasks)
 
@@ -178,7 +185,7 @@ def _expert(kind: str, config: SACConfig, report: Report) -> Make:
     """Makes the tasks' experts, each in the rows of its own task; trains them first if they are not in the cache."""
     if kind == pick_place.KIND:
         return disturbance.ToldTheGoal
-    variations = tuple(Variation(task) for task in problems.grid(kind, 2))
+    variations = tuple(Variation(task) for task in domains.grid(kind, 2))
     found = disturbance.trained(kind, variations, config, report)
     if len(found) < len(variations):
         raise ConfigError(f"sac.cache = {config.cache!r}: the experts that were trained are not there; name a folder")
@@ -188,8 +195,8 @@ def _expert(kind: str, config: SACConfig, report: Report) -> Make:
 def _keep(row: dict[str, Any]) -> None:
     """In the user's own table, in the place of what it held for the same."""
     key = ("problem", "forces", "metres", "bite")
-    others = [old for old in bites.own() if any(old[name] != row[name] for name in key)]
-    file = bites.own_file()
+    others = [old for old in calibrated_strength.own() if any(old[name] != row[name] for name in key)]
+    file = calibrated_strength.own_file()
     file.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(file, lambda out: out.write(json.dumps([*others, row], indent=1).encode() + b"\n"))
 

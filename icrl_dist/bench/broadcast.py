@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from icrl_dist.bench.stream import local_ray
-from icrl_dist.config import ConfigError, ModelConfig
+from icrl_dist.config.run import ConfigError, ModelConfig
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Query

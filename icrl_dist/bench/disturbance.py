@@ -16,18 +16,20 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 
-from icrl_dist import envs, histories
-from icrl_dist.config import ConfigError, load
-from icrl_dist.envs import pick_place, problems
-from icrl_dist.envs.network import networks
-from icrl_dist.experts import ExpertPolicy, train_expert
-from icrl_dist.games import SACConfig
-from icrl_dist.histories import History
-from icrl_dist.rollout import Actor, deploy_online
-from icrl_dist.tables import nearest
+from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.config.toml import nearest
+from icrl_dist.experts import cache
+from icrl_dist.experts.cache import History
+from icrl_dist.experts.train import ExpertPolicy, train_expert
+from icrl_dist.problems import registry
+from icrl_dist.problems.continuous.network_adversary import networks
+from icrl_dist.problems.dmc import domains
+from icrl_dist.problems.metaworld import pick_place
+from icrl_dist.rollout.deployment import Actor, deploy_online
 from icrl_dist.types import Adversary, Job, Task, Variation
 
-PROBLEMS = (*problems.PROBLEMS, pick_place.KIND)
+PROBLEMS = (*domains.PROBLEMS, pick_place.KIND)
 WEAK = 0.02
 """Share of the return that the default adversaries take on average, below which they are called weak."""
 EARNS = 0.01
@@ -103,7 +105,7 @@ def run(
 
 def numbers(kind: str, steps: int = 0) -> SACConfig:
     """SAC's numbers for an expert of this problem: its laptop run file's, but for so many ``steps``, or those of ``LONGER``."""
-    config = load(f"{kind}-laptop" if kind in problems.PROBLEMS else "metaworld-laptop").sac
+    config = load(f"{kind}-laptop" if kind in domains.PROBLEMS else "metaworld-laptop").sac
     return dataclasses.replace(config, steps=steps or LONGER.get(kind, config.steps))
 
 
@@ -111,9 +113,9 @@ def settings(kind: str) -> list[Setting]:
     """The disturbances of a problem: both presets of forces where they differ, Meta-World's metres."""
     if kind == pick_place.KIND:
         return [Setting("", pick_place.task((0.0, 0.65, 0.02), (0.0, 0.85, 0.2)), pick_place.MOVED)]
-    forces = problems.problem(kind).forces
+    forces = domains.problem(kind).forces
     presets = ("paper",) if forces["paper"] == forces["qarl"] else ("paper", "qarl")
-    return [Setting(one, problems.task(kind, forces=one), forces[one].count) for one in presets]  # type: ignore[index]
+    return [Setting(one, domains.task(kind, forces=one), forces[one].count) for one in presets]  # type: ignore[index]
 
 
 def policy(kind: str, config: SACConfig, report: Report) -> Make:
@@ -126,8 +128,8 @@ def policy(kind: str, config: SACConfig, report: Report) -> Make:
 
 def expert(kind: str, config: SACConfig, report: Report) -> History:
     """The undisturbed expert of the problem's nominal task, from the cache or of a training."""
-    variation = Variation(problems.task(kind))
-    found = histories.any_kept(variation, config, 0)
+    variation = Variation(domains.task(kind))
+    found = cache.any_kept(variation, config, 0)
     if found is None:
         report(f"{kind}: an expert trains for {config.steps:,} steps")
         found = next(iter(trained(kind, (variation,), config, report)), None)
@@ -146,10 +148,10 @@ def trained(kind: str, variations: tuple[Variation, ...], config: SACConfig, rep
         if note or next(told) % 10 == 0:
             report(f"{kind}: {text}")
 
-    asked = (*histories.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
+    asked = (*cache.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
     for _ in train_expert(Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, asked, len(variations)), "bench", tell):
         pass  # what is wanted is in the cache
-    return [history for one in variations if (history := histories.any_kept(one, config, 0)) is not None]
+    return [history for one in variations if (history := cache.any_kept(one, config, 0)) is not None]
 
 
 class ToldTheGoal:
@@ -162,7 +164,7 @@ class ToldTheGoal:
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
         """What it does if what is shown were true."""
-        from icrl_dist.envs.metaworld import expert as scripted
+        from icrl_dist.problems.metaworld.environment import expert as scripted
 
         seen = observation.astype(np.float64)
         seen[:, 36:] = self._env.truth[:, 36:]
@@ -189,7 +191,7 @@ def measure(rows: Sequence[Variation], make: Make, episodes: int, tasks: int) ->
 
     ``rows`` are the R variations of each task, task by task: C = episodes x tasks.
     """
-    env = envs.batch(rows)
+    env = registry.batch(rows)
     acting, adversaries = make(env), len(rows) // tasks
     chance = ([_chance(number, row // adversaries) for row in range(len(rows))] for number in range(episodes))
     ran = list(deploy_online(env, acting, chance))
@@ -208,7 +210,7 @@ def variations(one: Setting, sizes: Sizes) -> tuple[list[Variation], int]:
     """The null adversary and K of strength 1 in each task, task by task; and how many tasks."""
     tasks: tuple[Task, ...] = (one.task,)
     if one.task.kind == pick_place.KIND:
-        from icrl_dist.envs.metaworld import ml1_tasks
+        from icrl_dist.problems.metaworld.environment import ml1_tasks
 
         tasks = ml1_tasks(sizes.tasks)
     return [Variation(task, push) for task in tasks for push in pushes(one, sizes.adversaries)], len(tasks)
@@ -217,7 +219,7 @@ def variations(one: Setting, sizes: Sizes) -> tuple[list[Variation], int]:
 def pushes(one: Setting, count: int, strength: float = 1.0) -> tuple[Adversary, ...]:
     """The null adversary and ``count`` others, at every strength the same ones."""
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_ADVERSARIES,)))
-    return networks(rng, count + 1, envs.spec(one.task), one.outputs, strength)
+    return networks(rng, count + 1, registry.spec(one.task), one.outputs, strength)
 
 
 def lost(returns: Float[np.ndarray, "C R"]) -> dict[str, float | None]:
@@ -254,11 +256,11 @@ def _row(kind: str, one: Setting, make: Make, sizes: Sizes, config: SACConfig) -
     if kind == pick_place.KIND:
         about: dict[str, Any] = {"metres": pick_place.disturbance(one.task)}
     else:
-        about = {"forces": one.forces, "newtons": problems.problem(kind).forces[one.forces].largest, "steps": config.steps}  # type: ignore[index]
+        about = {"forces": one.forces, "newtons": domains.problem(kind).forces[one.forces].largest, "steps": config.steps}  # type: ignore[index]
     if measured.succeeded is not None:
         alone, *under = measured.succeeded.tolist()
         about |= {"success": round(alone, 3), "success_disturbed": round(float(np.mean(under)), 3)}
-    return {"problem": kind, **about, "broken": measured.broken, **found, **verdict(found, envs.spec(one.task).horizon)}
+    return {"problem": kind, **about, "broken": measured.broken, **found, **verdict(found, registry.spec(one.task).horizon)}
 
 
 def verdict(found: dict[str, float | None], horizon: int) -> dict[str, Any]:

@@ -9,12 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrl_dist import envs
-from icrl_dist.config import ConfigError
-from icrl_dist.envs import darkroom, pick_place, problems
-from icrl_dist.envs.adversary import sample_dirichlet
-from icrl_dist.envs.network import network
-from icrl_dist.tables import nearest
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.toml import nearest
+from icrl_dist.problems import registry
+from icrl_dist.problems.continuous.network_adversary import network
+from icrl_dist.problems.darkroom import room
+from icrl_dist.problems.darkroom.adversaries import sample_dirichlet
+from icrl_dist.problems.dmc import domains
+from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.types import Task, Variation
 
 _BATCH = {"darkroom": 1024}
@@ -24,13 +26,13 @@ _SIMULATIONS = 20
 def _darkroom(rng: np.random.Generator, batch: int) -> list[Variation]:
     """A random goal and an own Dirichlet adversary (p > 0) in every row of a 10x10 room."""
     goals = rng.integers(0, 10, size=(batch, 2)).tolist()
-    return [Variation(darkroom.task(goal), sample_dirichlet(rng, darkroom.ACTIONS, 0.2)) for goal in goals]
+    return [Variation(room.task(goal), sample_dirichlet(rng, room.ACTIONS, 0.2)) for goal in goals]
 
 
 def _dmc(kind: str, rng: np.random.Generator, batch: int) -> list[Variation]:
     """Tasks of pretraining by turns, each row with a network of its own."""
-    tasks = problems.grid(kind, 4)
-    inputs, outputs = envs.spec(tasks[0]).observation, problems.problem(kind).forces["paper"].count
+    tasks = domains.grid(kind, 4)
+    inputs, outputs = registry.spec(tasks[0]).observation, domains.problem(kind).forces["paper"].count
     seeds = rng.integers(2**31, size=batch).tolist()
     return [Variation(tasks[row % len(tasks)], network(seed, inputs, outputs)) for row, seed in enumerate(seeds)]
 
@@ -45,9 +47,9 @@ def run(problem: str = "darkroom", batch: int | None = None, seconds: float = 3.
     environments, ``limit_ratio`` over MuJoCo's ``mj_step`` alone, all three by turns.  Raises
     ConfigError for an unknown problem and for a batch or a time that is not above 0.
     """
-    if problem not in envs.KINDS:
-        known = ", ".join(sorted(envs.KINDS))
-        raise ConfigError(f"bench env: problem = {problem!r}{nearest(problem, envs.KINDS)}: choose one of {known}")
+    if problem not in registry.KINDS:
+        known = ", ".join(sorted(registry.KINDS))
+        raise ConfigError(f"bench env: problem = {problem!r}{nearest(problem, registry.KINDS)}: choose one of {known}")
     batch = _BATCH.get(problem, _SIMULATIONS) if batch is None else batch
     if batch < 1:
         raise ConfigError(f"bench env: batch = {batch}: must be above 0")
@@ -59,7 +61,7 @@ def run(problem: str = "darkroom", batch: int | None = None, seconds: float = 3.
 
 def _rooms(batch: int, seconds: float) -> dict[str, float]:
     rng = np.random.default_rng(0)
-    env = envs.batch(_darkroom(rng, batch))
+    env = registry.batch(_darkroom(rng, batch))
     actions = rng.integers(0, env.spec.actions, size=(env.spec.horizon, batch))
     kept = _seeded(0, batch)
 
@@ -99,7 +101,7 @@ class _Plain(NamedTuple):
 
 
 def _dm_control(kind: str) -> _Plain:
-    from icrl_dist.envs.dmc import suite_environment
+    from icrl_dist.problems.dmc.simulation import suite_environment
 
     env = suite_environment(kind)
 
@@ -111,7 +113,7 @@ def _dm_control(kind: str) -> _Plain:
 
 
 def _meta_world(task: Task) -> _Plain:
-    from icrl_dist.envs.metaworld import environment
+    from icrl_dist.problems.metaworld.environment import environment
 
     env = environment(task)
     return _Plain(env.reset, env.step, env.model, env.data, env.frame_skip)
@@ -130,7 +132,7 @@ def _simulations(kind: str, batch: int, seconds: float) -> dict[str, float]:
 
     rng = np.random.default_rng(0)
     rows = _reaches(rng, batch) if kind == pick_place.KIND else _dmc(kind, rng, batch)
-    ours = envs.batch(rows)
+    ours = registry.batch(rows)
     theirs = [_meta_world(row.task) if kind == pick_place.KIND else _dm_control(kind) for row in rows]
     actions = rng.uniform(-1, 1, (ours.spec.horizon, batch, ours.spec.actions)).astype(np.float32)
 

@@ -18,10 +18,10 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
-from icrl_dist.algos.chance import of_updates
-from icrl_dist.algos.sac_batch import Products, SACBatch
-from icrl_dist.algos.sb3 import blank
-from icrl_dist.games import SACConfig
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.experts.sac.batched import Products, SACBatch
+from icrl_dist.experts.sac.draws import of_updates
+from icrl_dist.experts.sac.sb3_files import blank
 from icrl_dist.types import Spec
 
 SPEC = Spec((-np.inf,) * 17, (np.inf,) * 17, 6, 200, discrete=False)

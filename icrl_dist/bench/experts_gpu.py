@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist import envs
-from icrl_dist.algos.chance import Chance
-from icrl_dist.algos.sac_batch import Products, SACBatch, pick, train
 from icrl_dist.bench.experts import REMEMBERED, Sizes, alone, lockstep
-from icrl_dist.config import ConfigError, load
-from icrl_dist.envs import Batch, tasks
-from icrl_dist.games import SACConfig
+from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.experts.sac.batched import Products, SACBatch, pick, train
+from icrl_dist.experts.sac.draws import Chance
+from icrl_dist.problems import registry, splits
+from icrl_dist.problems.registry import Batch
 
 SIZES = Sizes(160, SACConfig(replay=REMEMBERED), 60, 12)
 LEAST = 300.0
@@ -104,8 +104,8 @@ def updates(sizes: Sizes, turns: int, device: torch.device) -> tuple[dict[str, A
 def paper_env() -> tuple[Batch, SACConfig]:
     """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the numbers of its SAC."""
     given = load(PAPER)
-    rows = [row for index, task in enumerate(tasks.split(given).train) for row in tasks.variations(given, index, task)]
-    return envs.batch(rows), given.sac
+    rows = [row for index, task in enumerate(splits.split(given).train) for row in splits.variations(given, index, task)]
+    return registry.batch(rows), given.sac
 
 
 def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) -> dict[str, Any]:

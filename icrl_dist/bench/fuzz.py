@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from icrl_dist import segment
 from icrl_dist.bench.mutations import mutate
 from icrl_dist.bench.stream import example
-from icrl_dist.config import ConfigError
-from icrl_dist.stream import batch, strict, wire
+from icrl_dist.config.run import ConfigError
+from icrl_dist.storage import segment
+from icrl_dist.stream import batching, validation, wire
 from icrl_dist.types import NULL, Job, Variation, Weights
 
 LIMIT = 1 << 20
@@ -70,7 +70,7 @@ def targets() -> dict[str, Target]:
     arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     vectors = dataclasses.replace(one, **arrays)
     trajectory = wire.encode_trajectory(one)
-    answers = strict.pack("answers", {"reasons": ["", "busy"]})
+    answers = validation.pack("answers", {"reasons": ["", "busy"]})
     name, frame = segment.encode(one, names)
     frames = [frame[segment.HEADER_BYTES :], segment.encode(vectors, names)[1][segment.HEADER_BYTES :]]
     first = name[segment.HEADER_BYTES :][: int.from_bytes(name[4:8], "little")]
@@ -85,9 +85,9 @@ def targets() -> dict[str, Target]:
             lambda data: wire.decode_message(data, LIMIT), refusal, [message, wire.encode_message("give", job=trajectory)]
         ),
         "batch": Target(
-            lambda data: batch.split(_Query(data), LIMIT), refusal, [batch.join([message] * 3), batch.join([large])]
+            lambda data: batching.split(_Query(data), LIMIT), refusal, [batching.join([message] * 3), batching.join([large])]
         ),
-        "answers": Target(lambda data: batch.reasons(data, 2), refusal, [answers]),
+        "answers": Target(lambda data: batching.reasons(data, 2), refusal, [answers]),
         "frame": Target(lambda data: segment.decode(data, names), ValueError, frames),
         "name": Target(lambda data: segment.Names().read(data), ValueError, [first]),
     }

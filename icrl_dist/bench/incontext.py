@@ -18,7 +18,7 @@ import torch
 from icrl_dist.bench import incontext_cost as cost
 from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.bench import peer
-from icrl_dist.files import atomic_write
+from icrl_dist.storage.files import atomic_write
 
 FLOORS = {"training": 600.0, "deployment": 1100.0}
 """Contexts and environment steps (20 environments) a CPU-second that the official code reached."""

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from icrl_dist import envs, pretrain
 from icrl_dist.bench import peer
 from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, SPEC, Law
-from icrl_dist.config import ContextConfig
-from icrl_dist.envs import darkroom
+from icrl_dist.config.run import ContextConfig
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.rollout import InContextPolicy, Policy, RandomPolicy, episode
+from icrl_dist.problems import registry
+from icrl_dist.problems.darkroom import room
+from icrl_dist.rollout.deployment import InContextPolicy, Policy, RandomPolicy, episode
+from icrl_dist.training import fit
 from icrl_dist.types import NULL, Variation
 
 LENGTHS = tuple(range(0, 4001, 500))
@@ -38,7 +39,7 @@ def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
     that ended for their next context, as the official code does.
     """
     rng = np.random.default_rng(0)
-    env = envs.batch([Variation(darkroom.task(goal), NULL) for goal in rng.integers(0, 10, size=(batch, 2)).tolist()])
+    env = registry.batch([Variation(room.task(goal), NULL) for goal in rng.integers(0, 10, size=(batch, 2)).tolist()])
     rngs = rng.spawn(batch)
     torch.manual_seed(0)
     ours = InContextPolicy(PretrainedTransformer(env.spec, MODEL).eval(), batch, ContextConfig(keep="last"))
@@ -138,12 +139,12 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
 def _our_step(law: Law, device: str, batch: int) -> tuple[Callable[[], object], int]:
     """A training step on one drawn batch, and its labelled queries."""
     model = PretrainedTransformer(SPEC, MODEL).to(device).train()
-    opt = pretrain.Optimiser(model, OPTIM)
+    opt = fit.Optimiser(model, OPTIM)
     drawn = law.draw(0, 0, batch, OPTIM.queries)
     data = drawn.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=drawn.query.shape))
 
     def step() -> None:
-        value = pretrain.batch_loss(model, data)
+        value = fit.batch_loss(model, data)
         value.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), OPTIM.clip)
         opt.step(OPTIM.learning_rate)

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int
 
-from icrl_dist import pretrain
 from icrl_dist.bench import peer
-from icrl_dist.config import ModelConfig, OptimConfig
-from icrl_dist.context import Batch
-from icrl_dist.envs import darkroom
-from icrl_dist.envs.darkroom import cells, next_cell
+from icrl_dist.config.run import ModelConfig, OptimConfig
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.models.heads import Categorical
-from icrl_dist.oracle import Hypotheses, heuristic_labels, log_likelihood, posterior, posterior_action
+from icrl_dist.problems.darkroom import room as darkroom
+from icrl_dist.problems.darkroom.room import cells, next_cell
+from icrl_dist.problems.darkroom.solver import Hypotheses, heuristic_labels, log_likelihood, posterior, posterior_action
+from icrl_dist.training import fit
+from icrl_dist.training.batches import Batch
 from icrl_dist.types import NULL, Spec, Variation
 
 SIZE, LENGTH, GOALS = 10, 100, 80
@@ -151,10 +151,10 @@ def ours(seed: int, report: Report = lambda text: None, steps: int = STEPS, clos
             raise _Enough
         watch.go()
 
-    opt = pretrain.Optimiser(model, OPTIM)
+    opt = fit.Optimiser(model, OPTIM)
     watch.go()
     try:
-        pretrain.fit(model, opt, OPTIM, OPTIM.learning_rate, steps, batch, look)
+        fit.fit(model, opt, OPTIM, OPTIM.learning_rate, steps, batch, look)
     except _Enough:
         return _outcome(True, curve, floor)
     return _outcome(False, curve, floor)
@@ -197,7 +197,7 @@ def _our_loss(model: PretrainedTransformer, held_out: Drawn) -> float:
     for rows in np.array_split(np.arange(len(held_out.goal)), max(1, len(held_out.goal) // 32)):
         part = Drawn(**{k: v[rows] for k, v in vars(held_out).items()})
         wide = Drawn(**vars(part) | {"query": part.query.repeat(LENGTH, 1), "label": part.label.repeat(LENGTH, 1)})
-        total += float(pretrain.batch_loss(model, wide.batch(every[rows]))) * len(rows)
+        total += float(fit.batch_loss(model, wide.batch(every[rows]))) * len(rows)
     return total / len(held_out.goal)
 
 

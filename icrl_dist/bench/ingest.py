@@ -24,14 +24,14 @@ from typing import Any
 import psutil
 
 from icrl_dist.bench.stream import KEYS, LIMIT, example
-from icrl_dist.config import ConfigError, StreamConfig
-from icrl_dist.store import Store
+from icrl_dist.config.run import ConfigError, StreamConfig
+from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Job, Spec, Trajectory
-from learner.inbox import Inbox
+from learner.ingest import Inbox
 
 CREDITS = StreamConfig().credits
 """A run's own default."""

@@ -26,10 +26,10 @@ from typing import Any, Literal
 import psutil
 
 from icrl_dist.bench.training import need_alive, training
-from icrl_dist.processes import is_learner, is_worker
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry.processes import is_learner, is_worker
 
 BOUND = 0.98
 """Being watched may cost a trajectory's CPU time this share."""

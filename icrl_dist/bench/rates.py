@@ -23,21 +23,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist import context, envs, evaluate, jobs, pretrain, surprise
+from icrl_dist.agent import ood_score
 from icrl_dist.bench.samples import Sample, in_full, made_up
-from icrl_dist.config import Run
-from icrl_dist.envs import tasks
-from icrl_dist.estimate import PhaseRates, Rates
-from icrl_dist.histories import sac_of
+from icrl_dist.collect import jobs
+from icrl_dist.config.run import Run
+from icrl_dist.diagnostics.estimate import PhaseRates, Rates
+from icrl_dist.experts.cache import sac_of
+from icrl_dist.methods.recipes import METHODS, Phase
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
-from icrl_dist.recipes import METHODS, Phase
-from icrl_dist.store import Store
+from icrl_dist.problems import registry, splits
+from icrl_dist.results import evaluate
+from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.training import batches, fit
 from icrl_dist.types import Job, Trajectory
-from learner.inbox import Inbox
+from learner.ingest import Inbox
 
 BUDGET_S = 8.0
 """A part that takes longer is timed for so long and continued in thought."""
@@ -57,7 +60,7 @@ def measure(run: Run, name: str, tell: Tell = lambda said: None, budget_s: float
 
 
 def _measure(run: Run, name: str, tell: Tell, budget_s: float) -> Rates:
-    method, spec = METHODS[run.method], tasks.spec(run)
+    method, spec = METHODS[run.method], splits.spec(run)
     model = PretrainedTransformer(spec, run.model)
     arrays = weights_of(model)
     weights = len(wire.encode_message("weights", **{key: value.tobytes() for key, value in arrays.items()}))
@@ -153,10 +156,10 @@ def _continued(spent: np.ndarray, count: int, longest: int) -> float:
 
 def _training(job: Job, budget_s: float) -> float:
     """Seconds of a job's SAC trainings, by episodes in which the experts learn."""
-    from icrl_dist.algos.sac_batch import train
-    from icrl_dist.experts import trained_by
+    from icrl_dist.experts.sac.batched import train
+    from icrl_dist.experts.train import trained_by
 
-    config, env = sac_of(job), envs.batch(job.variations)
+    config, env = sac_of(job), registry.batch(job.variations)
     horizon = env.spec.horizon
     short = dataclasses.replace(config, random_steps=horizon, warmup=max(horizon, config.batch // len(job.variations) + 1))
     times: list[float] = []
@@ -182,9 +185,9 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
     pools = METHODS[run.method].learn(run, dataclasses.replace(phase, round=0), data)
     optim, times = run.optim, [0.0]
 
-    def batch(step: int) -> context.Batch:
+    def batch(step: int) -> batches.Batch:
         rng = np.random.default_rng(step)
-        return context.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
+        return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
 
     def progress(step: int, loss: float) -> None:
         times.append(time.perf_counter())
@@ -192,13 +195,13 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        pretrain.fit(model, pretrain.Optimiser(model, optim), optim, 1e-6, 200, batch, progress)
+        fit.fit(model, fit.Optimiser(model, optim), optim, 1e-6, 200, batch, progress)
     return float(np.mean(np.diff(times[2:])))  # contexts differ in length from step to step: the mean, not the median
 
 
 def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
     """Trajectories a second: sent on credit over a link, checked, stored with fsync, acknowledged; all in this process."""
-    spec, keys, numbers = tasks.spec(run), Keys("plan"), itertools.count()
+    spec, keys, numbers = splits.spec(run), Keys("plan"), itertools.count()
     acknowledged: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     few = sample[: min(len(sample), _ENOUGH)]
     with tempfile.TemporaryDirectory(dir=_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
@@ -252,8 +255,8 @@ def _evaluation(run: Run, model: PretrainedTransformer, budget_s: float) -> floa
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        surprise.calibrate(run, model, count)
-    total = _continued(np.diff(times), 2 * surprise.EPISODES, 1 << 30)
+        ood_score.calibrate(run, model, count)
+    total = _continued(np.diff(times), 2 * ood_score.EPISODES, 1 << 30)
     others = list(_others(run))
     for make, copies in [(evaluate.in_context(run, model), 1 + (len(METHODS[run.method].phases(run)) > 1)), *others]:
         times[:] = [time.perf_counter()]
@@ -268,7 +271,7 @@ def _evaluation(run: Run, model: PretrainedTransformer, budget_s: float) -> floa
 def _others(run: Run) -> Iterator[tuple[evaluate.MakePolicy, int]]:
     """Who a model is held against, and how many that cost about the same."""
     if run.problem == "darkroom":
-        from icrl_dist.exact import RULES
+        from icrl_dist.problems.darkroom.exact_agents import RULES
 
         yield evaluate.random, 1
         yield evaluate.optimal(run), 1

@@ -22,12 +22,12 @@ from typing import Any
 import psutil
 
 from icrl_dist.bench.training import need_alive, training
-from icrl_dist.config import ConfigError
-from icrl_dist.processes import is_learner, is_worker
-from icrl_dist.store import Store
-from icrl_dist.stream import plane, wire
+from icrl_dist.config.run import ConfigError
+from icrl_dist.storage.dataset import Store
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry.processes import is_learner, is_worker
 from icrl_dist.types import Identity
 
 _TASKS = 39  # to train on in a 7x7 room
@@ -96,7 +96,7 @@ class _Heard:
                 self._stored = fields["trajectories"]
             elif kind == "trajectories":
                 now = time.monotonic()
-                self._sent += [(now, one["worker"], Identity.parse(one["identity"])) for one in plane.rows(fields)]
+                self._sent += [(now, one["worker"], Identity.parse(one["identity"])) for one in monitor_messages.rows(fields)]
             self._changed.notify_all()
 
     def _read(self) -> None:

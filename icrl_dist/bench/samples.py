@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icrl_dist import envs, evaluate
-from icrl_dist.recipes import Key
-from icrl_dist.rollout import episode
+from icrl_dist.methods.recipes import Key
+from icrl_dist.problems import registry
+from icrl_dist.results import evaluate
+from icrl_dist.rollout.deployment import episode
 from icrl_dist.types import Job, Trajectory
 
 
@@ -30,7 +31,7 @@ def made_up(job: Job) -> list[Trajectory]:
     rng, made = np.random.default_rng(0), []
     rows = job.rows()[: max(2, job.tasks)]
     chosen = list(job.variations[: len(rows)])
-    ran = episode(envs.batch(chosen), evaluate.random_vectors(chosen), [np.random.default_rng(r) for r in range(len(rows))])
+    ran = episode(registry.batch(chosen), evaluate.random_vectors(chosen), [np.random.default_rng(r) for r in range(len(rows))])
     queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
     count, actions = queries + stretches * length, ran.actions.shape[-1]
     for row, (task, variation) in enumerate(rows):

@@ -21,8 +21,8 @@ import numpy as np
 import psutil
 
 from icrl_dist.bench.training import need_alive, training
-from icrl_dist.config import ConfigError
-from icrl_dist.processes import is_learner, is_worker
+from icrl_dist.config.run import ConfigError
+from icrl_dist.telemetry.processes import is_learner, is_worker
 
 _NUMBERS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
 _PERIOD_S = 1.0

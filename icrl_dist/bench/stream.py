@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from actors import local
-from icrl_dist.stream import batch, wire
+from icrl_dist.stream import batching, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Query
 from icrl_dist.stream.zenoh_link import ZenohLink
@@ -154,7 +154,7 @@ class _Stream:
         return (self._sink.taken - before) / (last - start)
 
     def _take_apart(self, query: Query) -> None:
-        for part in batch.split(query, LIMIT):
+        for part in batching.split(query, LIMIT):
             self._data.put(part)
 
     def stop(self) -> None:

@@ -15,10 +15,10 @@ import time
 
 import numpy as np
 
-from actors.showing import PERIOD_S
+from actors.publisher import PERIOD_S
 from icrl_dist.monitor.feed import PERIOD_S as LOOK_S
 from icrl_dist.monitor.feed import LiveFeed
-from icrl_dist.stream import plane, wire
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
@@ -108,7 +108,7 @@ def _episodes(worker: int, streams: int) -> list[list[Trajectory]]:
 
 
 def _message(told: list[list[Trajectory]], trials: range) -> bytes:
-    return plane.trajectories((one[trial % _TRIALS] for one in told for trial in trials), time.time())
+    return monitor_messages.trajectories((one[trial % _TRIALS] for one in told for trial in trials), time.time())
 
 
 if __name__ == "__main__":

@@ -13,13 +13,13 @@ from typing import Any, Self
 
 from rich.console import Console
 
-from icrl_dist import run_folder
 from icrl_dist.chaos import schedule
 from icrl_dist.chaos.disk import NoDisk
 from icrl_dist.chaos.faults import FAULTS, Missed
 from icrl_dist.chaos.outcome import SAME, Outcome, Reference, summary, table, verdict
 from icrl_dist.chaos.training import Broken, Training
-from icrl_dist.config import ConfigError, load, override, validate
+from icrl_dist.config.run import ConfigError, load, override, validate
+from icrl_dist.launch import run_folder
 
 TRIES = 4
 """So many strikes are drawn for a fault until one lands."""

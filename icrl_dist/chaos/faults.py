@@ -12,12 +12,13 @@ from typing import Any
 
 import psutil
 
-from icrl_dist import endpoints, segment
 from icrl_dist.chaos.disk import PAGE, Disk
 from icrl_dist.chaos.proxy import Proxy
 from icrl_dist.chaos.schedule import Strike
 from icrl_dist.chaos.training import Broken, Training, gone
-from icrl_dist.store import Store
+from icrl_dist.storage import segment
+from icrl_dist.storage.dataset import Store
+from icrl_dist.stream import endpoints
 
 STOP_S, CUT_S = 15.0, 12.0
 """How long the learner is stopped, and the link cut: beyond ``stream.reply_timeout_s``."""

@@ -12,7 +12,7 @@ from typing import Any
 from rich.table import Table
 
 from icrl_dist.chaos.disk import allocated
-from icrl_dist.config import ConfigError, Run, load
+from icrl_dist.config.run import ConfigError, Run, load
 
 SAME = ("dataset_digest", "weights_digest", "trajectories")
 """What must be equal in every result."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icrl_dist.config import ConfigError, Run
-from icrl_dist.recipes import METHODS
+from icrl_dist.config.run import ConfigError, Run
+from icrl_dist.methods.recipes import METHODS
 
 FAULTS = {
     "kill-worker": "SIGKILL of a worker",

@@ -17,12 +17,12 @@ from typing import Any, Self
 import psutil
 
 from icrl_dist.chaos.schedule import Strike
-from icrl_dist.config import Run
-from icrl_dist.processes import is_learner, is_worker
-from icrl_dist.recipes import METHODS
-from icrl_dist.stream import plane, security, wire
+from icrl_dist.config.run import Run
+from icrl_dist.methods.recipes import METHODS
+from icrl_dist.stream import monitor_messages, security, wire
 from icrl_dist.stream.link import Keys, LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry.processes import is_learner, is_worker
 
 _POLL_S = 0.02
 _LOOK_S = 2.0
@@ -191,7 +191,7 @@ class _Ear:
         """One message of the monitor plane."""
         kind, fields = wire.decode_message(payload)
         if kind == "trajectories":
-            for one in plane.rows(fields):
+            for one in monitor_messages.rows(fields):
                 name = "/".join(one["identity"].split("/")[:2])
                 self._heard[name] += 1
                 self._note(name, False, self._heard[name])

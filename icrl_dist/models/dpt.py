@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from icrl_dist.config import ModelConfig
+from icrl_dist.config.run import ModelConfig
 from icrl_dist.models import heads
 from icrl_dist.models.gpt import GPT, Cache, Decoder, copied
 from icrl_dist.types import Spec

@@ -6,8 +6,9 @@ import functools
 from collections import OrderedDict, deque
 from typing import Any, NamedTuple
 
-from icrl_dist.monitor import plain, sketch
-from icrl_dist.monitor.plain import Odd
+from icrl_dist.monitor import drawing as sketch
+from icrl_dist.monitor import validation
+from icrl_dist.monitor.validation import Odd
 from icrl_dist.types import STAGES, Identity
 
 VARIATIONS = 4096
@@ -41,7 +42,11 @@ class About(NamedTuple):
     @classmethod
     def of(cls, told: dict[str, Any]) -> About:
         """As an entry of ``variations`` in docs/tap.md tells it."""
-        return cls(plain.text(told.get("problem"), 64), plain.named(told.get("task")), plain.named(told.get("adversary")))
+        return cls(
+            validation.text(told.get("problem"), 64),
+            validation.named(told.get("task")),
+            validation.named(told.get("adversary")),
+        )
 
 
 _NOTHING = About("", {}, {})
@@ -101,12 +106,12 @@ class Curves:
 
     def returned(self, told: dict[str, Any], worker: str, time: float) -> int:
         """Episodes of a variation ended: as in an entry of ``variations`` in docs/tap.md; how many."""
-        identity = _of_variation(plain.text(told.get("identity"), 120))
-        trials = [plain.integer(trial, 0) for trial in plain.listed(told.get("trials"), _TOGETHER)]
-        returns = plain.numbers(told.get("returns"), _TOGETHER)
+        identity = _of_variation(validation.text(told.get("identity"), 120))
+        trials = [validation.integer(trial, 0) for trial in validation.listed(told.get("trials"), _TOGETHER)]
+        returns = validation.numbers(told.get("returns"), _TOGETHER)
         if len(trials) != len(returns):
             raise Odd("schema")
-        weights, digest = plain.integer(told.get("weights"), -1), plain.text(told.get("digest"), 64)
+        weights, digest = validation.integer(told.get("weights"), -1), validation.text(told.get("digest"), 64)
         place, phase = (identity.task, identity.variation), _phase(identity)
         known = self._curves[place].parts.get(phase) if place in self._curves else None
         about = known.about if known is not None and known.about is not None else About.of(told)
@@ -157,9 +162,9 @@ class Curves:
         told = {
             "name": f"{place[0]}/{place[1]}",
             "identity": "/".join(map(str, identity)),
-            "worker": plain.text(message.get("worker")),
-            "episode_return": plain.number(message.get("episode_return")),
-            "time": plain.when(message.get("time")),
+            "worker": validation.text(message.get("worker")),
+            "episode_return": validation.number(message.get("episode_return")),
+            "time": validation.when(message.get("time")),
         }
         self._episodes[place] = {**told, "drawing": drawing, "seq": self._next}
         if len(self._episodes) > _DRAWN:
@@ -207,7 +212,7 @@ class Curves:
 @functools.lru_cache(maxsize=VARIATIONS)
 def _of_variation(name: str) -> Identity:
     """``STAGE/ROUND/TASK/VARIATION`` as the identity of its first trial.  Raises Odd for anything else."""
-    return plain.identity(f"{name}/0")
+    return validation.identity(f"{name}/0")
 
 
 def _origin(

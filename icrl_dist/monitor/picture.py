@@ -11,12 +11,12 @@ import uuid
 from collections import Counter, deque
 from typing import Any
 
-from icrl_dist.monitor import plain, readers
+from icrl_dist.monitor import readers, validation
 from icrl_dist.monitor.curves import Curves
-from icrl_dist.monitor.pace import Pace
-from icrl_dist.monitor.plain import Odd
-from icrl_dist.monitor.staff import Staff
-from icrl_dist.stream import strict
+from icrl_dist.monitor.rates import Pace
+from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.workers import Staff
+from icrl_dist.stream import validation as strict
 
 LARGEST = 1 << 20
 """A message of more bytes than this is left out."""
@@ -71,8 +71,8 @@ class Picture:
         """Take in one message of the monitor plane, whatever it is."""
         try:
             message = strict.unpack(payload, LARGEST)
-            kind = plain.text(message.get("kind"), 32)
-            run = plain.text(key.partition("/")[2].partition("/")[0], 200)
+            kind = validation.text(message.get("kind"), 32)
+            run = validation.text(key.partition("/")[2].partition("/")[0], 200)
             with self._lock:
                 self._take(run, kind, message, now)
         except strict.WireError as error:
@@ -95,7 +95,7 @@ class Picture:
         elif kind == "trajectories":
             self._returned(message)
         elif kind == "episode":
-            self._curves.drawn(plain.identity(message.get("identity")), message)
+            self._curves.drawn(validation.identity(message.get("identity")), message)
         elif kind == "worker":
             self._staff.beat(message, now)
         elif kind == "event":
@@ -119,10 +119,10 @@ class Picture:
         self._run["name"], self._heard = run, now
 
     def _returned(self, message: dict[str, Any]) -> None:
-        worker, time, odd = plain.text(message.get("worker")), plain.when(message.get("time")), None
-        for told in plain.listed(message.get("variations"), _VARIATIONS):
+        worker, time, odd = validation.text(message.get("worker")), validation.when(message.get("time")), None
+        for told in validation.listed(message.get("variations"), _VARIATIONS):
             try:
-                self._pace.produced(self._curves.returned(plain.mapped(told), worker, time))
+                self._pace.produced(self._curves.returned(validation.mapped(told), worker, time))
             except Odd as error:  # the others are none the worse for it
                 odd = error
         if odd:

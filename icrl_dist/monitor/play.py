@@ -14,11 +14,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from icrl_dist.agent import InContextAgent
-from icrl_dist.belief import Belief, Room
-from icrl_dist.config import Run
-from icrl_dist.envs.darkroom import ACTIONS, cells, next_cell
-from icrl_dist.oracle import Hypotheses, optimal_returns
+from icrl_dist.agent.in_context_agent import InContextAgent
+from icrl_dist.config.run import Run
+from icrl_dist.problems.darkroom.posterior import Belief, Room
+from icrl_dist.problems.darkroom.room import ACTIONS, cells, next_cell
+from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from icrl_dist.types import NULL, Adversary
 
 EPISODES = 400

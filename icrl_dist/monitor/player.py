@@ -11,8 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
-from icrl_dist.agent import load_agent
-from icrl_dist.config import ConfigError, Deployment, parse
+from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.config.run import ConfigError, Deployment, parse
 from icrl_dist.monitor.play import PlayGame
 from icrl_dist.monitor.serve import EventStream, application, serving
 

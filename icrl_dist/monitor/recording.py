@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from icrl_dist.config import ConfigError, load
-from icrl_dist.ledger import Row
-from icrl_dist.recipes import METHODS, about
-from icrl_dist.store import Store
-from icrl_dist.stream import plane, wire
+from icrl_dist.config.run import ConfigError, load
+from icrl_dist.methods.recipes import METHODS, about
+from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.index import Row
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys
 
 _BEAT_S = 1.0
@@ -117,12 +117,12 @@ class Recording:
         drawn: dict[str, float] = {}
         for now, row in zip(self._when, self._ordered, strict=True):
             trajectory, worker = self._store.read(row.identity), row.worker
-            yield now, self._keys.monitor(f"trajectories/{_part(worker)}"), plane.trajectories([trajectory], now)
+            yield now, self._keys.monitor(f"trajectories/{_part(worker)}"), monitor_messages.trajectories([trajectory], now)
             done[worker] += 1
             steps[worker] += len(trajectory.actions)
             if now - drawn.get(worker, 0.0) >= _EPISODES_S:
                 drawn[worker] = now
-                yield now, self._keys.monitor(f"episode/{_part(worker)}"), plane.episode(trajectory, now)
+                yield now, self._keys.monitor(f"episode/{_part(worker)}"), monitor_messages.episode(trajectory, now)
             if now - beaten.get(worker, 0.0) >= _BEAT_S:
                 beaten[worker] = now
                 yield self._beat(now, row, done[worker], steps[worker])

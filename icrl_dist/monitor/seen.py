@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from icrl_dist.monitor.pace import SERIES
 from icrl_dist.monitor.picture import Picture
+from icrl_dist.monitor.rates import SERIES
 
 _POINTS = 600
 _EVENTS = 200

@@ -26,7 +26,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from icrl_dist.config import ConfigError
+from icrl_dist.config.run import ConfigError
 
 VIEWERS = 64
 """Viewers of one page at once; further ones are told to come back."""

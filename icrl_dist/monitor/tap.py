@@ -7,8 +7,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
-from icrl_dist.config import ConfigError
-from icrl_dist.stream import plane, wire
+from icrl_dist.config.run import ConfigError
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.types import Identity
 
 
@@ -42,7 +42,7 @@ class Tapped:
         """One message of the monitor plane."""
         try:
             kind, fields = wire.decode_message(payload)
-            told = [one for one in plane.rows(fields) if self._passes(one)] if kind == "trajectories" else []
+            told = [one for one in monitor_messages.rows(fields) if self._passes(one)] if kind == "trajectories" else []
         except (wire.WireError, ValueError):
             return
         for one in told:

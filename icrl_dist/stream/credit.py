@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from icrl_dist.stream import batch
+from icrl_dist.stream import batching
+from icrl_dist.stream.dispatch import Dispatcher
 from icrl_dist.stream.link import Link, LinkError, Outcome, Refused, Unanswered
-from icrl_dist.stream.strict import WireError
-from icrl_dist.stream.threads import Dispatcher
+from icrl_dist.stream.validation import WireError
 
 BACKOFF_S = (0.05, 2.0)
 """First and longest wait before an item is sent again, seconds; each wait doubles the last."""
@@ -141,7 +141,7 @@ class CreditSender:
                 items.append(self._waiting.popleft())
             self._flights += 1
         try:
-            request = batch.join([item.payload for item in items])
+            request = batching.join([item.payload for item in items])
             self._link.send(self._key, request, self._timeout_s, lambda outcome: self._land(items, outcome))
         except LinkError as error:
             with self._changed:
@@ -203,7 +203,7 @@ def _reasons(outcome: Outcome, count: int) -> tuple[list[str], bool]:
     """Why each item was not taken, empty where it was; and whether a reason is the other side's own."""
     if isinstance(outcome, bytes):
         try:
-            return batch.reasons(outcome, count), True
+            return batching.reasons(outcome, count), True
         except WireError as error:
             return [f"an answer that is none: {error}"] * count, False
     return [str(outcome)] * count, isinstance(outcome, Refused)

@@ -6,8 +6,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from icrl_dist.stream.dispatch import Dispatcher, Mailbox, handle
 from icrl_dist.stream.link import Done, Link, LinkError, Outcome, Query, Refused, Unanswered, matches, may_drop
-from icrl_dist.stream.threads import Dispatcher, Mailbox, handle
 
 
 class MemoryHub:

@@ -14,7 +14,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from icrl_dist.stream.strict import (
+from icrl_dist.stream.validation import (
     DEPTH,
     REASONS,
     VERSION,

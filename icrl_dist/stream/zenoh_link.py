@@ -22,6 +22,7 @@ import zenoh
 from zenoh import CongestionControl, ConsolidationMode, Priority
 from zenoh.handlers import Callback
 
+from icrl_dist.stream.dispatch import Dispatcher, Mailbox, handle
 from icrl_dist.stream.link import (
     Done,
     Link,
@@ -32,7 +33,6 @@ from icrl_dist.stream.link import (
     Unanswered,
     may_drop,
 )
-from icrl_dist.stream.threads import Dispatcher, Mailbox, handle
 
 _REFUSED = b"refused: "
 """Before a reason of ours: Zenoh answers for itself with error replies too (``Timeout``)."""

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import pytest
 
 from actors import cluster, fleet, missing
-from icrl_dist import nodes
-from icrl_dist.config import ConfigError
+from icrl_dist.config.run import ConfigError
+from icrl_dist.diagnostics import node_facts
 
-REACH = nodes.reach
+REACH = node_facts.reach
 OURS, HEADS = "tcp/127.0.0.1:0", "tls/localtest:7447"
 
 
@@ -53,7 +53,7 @@ class AccountingRay:
         assert soft is False
 
         def made(what):
-            if what is nodes.facts:
+            if what is node_facts.facts:
                 return SimpleNamespace(remote=lambda certificates, ports: ("facts", node, tuple(ports)))
             self.placed.append((node, num_cpus))
             work = SimpleNamespace(remote=lambda endpoint, run_name, name, *_: ("work", node, name))
@@ -68,7 +68,7 @@ class AccountingRay:
     def get(self, one):
         if one[0] == "work":
             raise self.ended.pop(one)
-        said = {**HERE, "host": one[1], "unreached": [nodes.reach(*p) for p in one[2] if p[1] and nodes.reach(*p)]}
+        said = {**HERE, "host": one[1], "unreached": [node_facts.reach(*p) for p in one[2] if p[1] and node_facts.reach(*p)]}
         changed = self.answers.get(one[1], {})
         if isinstance(changed, Exception):
             raise changed
@@ -81,7 +81,7 @@ class AccountingRay:
         pass
 
 
-HERE = nodes.facts()
+HERE = node_facts.facts()
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def local_name(monkeypatch):
     monkeypatch.setattr(
         socket, "getaddrinfo", lambda host, *a, **k: real("127.0.0.1" if host == "localtest" else host, *a, **k)
     )
-    monkeypatch.setattr(nodes.socket, "create_server", _server(nodes.socket.create_server))
+    monkeypatch.setattr(node_facts.socket, "create_server", _server(node_facts.socket.create_server))
 
 
 def _server(real):

@@ -14,12 +14,12 @@ import psutil
 import pytest
 
 from actors.fleet import Fleet, FleetFailed
-from icrl_dist.recipes import METHODS
-from icrl_dist.stream import batch, wire
+from icrl_dist.methods.recipes import METHODS
+from icrl_dist.stream import batching, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
-from learner.desk import Desk
-from learner.work import Board
+from learner.scheduler import Board
+from learner.worker_api import Desk
 from tests.e2e.training import wait_for
 
 KEYS = Keys("test")
@@ -57,7 +57,7 @@ class Learner:
         return self.link.endpoints[0]
 
     def take(self, query):
-        for one in batch.split(query, 1 << 20):
+        for one in batching.split(query, 1 << 20):
             identity = wire.decode_trajectory(one.payload, 1 << 20).identity
             with self.lock:
                 if self.board.wants(identity):

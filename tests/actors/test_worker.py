@@ -12,16 +12,17 @@ import icrl_dist
 from actors import beliefs
 from actors import worker as worker_module
 from actors.beliefs import Beliefs
-from actors.policy import LivePolicy
 from actors.watchdog import Watchdog
+from actors.weight_cache import LivePolicy
 from actors.worker import Worker
-from icrl_dist import jobs
-from icrl_dist.belief import Room
-from icrl_dist.config import dumps
-from icrl_dist.envs import spec, tasks
+from icrl_dist.collect import jobs
+from icrl_dist.config.run import dumps
+from icrl_dist.methods.recipes import METHODS
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
-from icrl_dist.recipes import METHODS
-from icrl_dist.stream import batch, plane, wire
+from icrl_dist.problems import splits
+from icrl_dist.problems.darkroom.posterior import Room
+from icrl_dist.problems.registry import spec
+from icrl_dist.stream import batching, monitor_messages, wire
 from icrl_dist.stream.link import Keys, Refused, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
@@ -32,7 +33,7 @@ KEYS = Keys("test")
 
 def weights(run, version):
     torch.manual_seed(version)
-    arrays = weights_of(PretrainedTransformer(spec(tasks.split(run).train[0]), run.model))
+    arrays = weights_of(PretrainedTransformer(spec(splits.split(run).train[0]), run.model))
     return Weights(version, arrays, wire.weights_digest(arrays))
 
 
@@ -56,7 +57,7 @@ class Learner:
             query.reply(self.answers.pop(0))
 
     def data(self, query):
-        for one in batch.split(query, 1 << 20):
+        for one in batching.split(query, 1 << 20):
             trajectory = wire.decode_trajectory(one.payload, 1 << 20)
             if trajectory.identity in self.refused:
                 one.refuse(f"not-finite: {trajectory.identity}: a value is infinite")
@@ -83,7 +84,9 @@ def test_a_worker_does_its_job_says_who_it_is_and_stops(hub, small_run):
     assert {t.worker for t in learner.stored} == {"w7"}
     assert learner.asked[0][1]["version"] == icrl_dist.__version__
     assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
-    told = lambda: [row["identity"] for kind, said in list(seen) if kind == "trajectories" for row in plane.rows(said)]  # noqa: E731
+    told = lambda: [  # noqa: E731
+        row["identity"] for kind, said in list(seen) if kind == "trajectories" for row in monitor_messages.rows(said)
+    ]
     eventually(lambda: told() == [str(i) for i in job.identities()])  # the mailbox has a thread of its own
 
 
@@ -279,7 +282,7 @@ def test_the_policy_waits_for_exactly_the_version_that_is_named(hub, small_run):
     learner = hub()
     latest = [b""]
     learner.serve(KEYS.weights_latest, lambda q: q.reply(latest[0]) if latest[0] else q.refuse("busy"))
-    policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=5.0)
+    policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=5.0)
     zero, one = weights(small_run, 0), weights(small_run, 1)
     threading.Timer(0.3, lambda: learner.publish(KEYS.weights, wire.encode_weights(zero), droppable=False)).start()
     model, digest = policy.at(0)
@@ -291,7 +294,7 @@ def test_the_policy_waits_for_exactly_the_version_that_is_named(hub, small_run):
     np.testing.assert_array_equal(weights_of(model)["head.weight"], one.arrays["head.weight"])
     assert policy.at(0)[1] == zero.digest, "a job of an earlier round that is done again"
     with pytest.raises(Unanswered, match="version 0 is gone; the learner is at 1"):
-        LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20).at(0)
+        LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20).at(0)
 
 
 def test_the_policy_asks_for_an_older_version_by_its_number_and_forgets_the_oldest(hub, small_run):
@@ -304,13 +307,13 @@ def test_the_policy_asks_for_an_older_version_by_its_number_and_forgets_the_olde
         query.reply(wire.encode_weights(versions[asked[-1]]))
 
     learner.serve(KEYS.weights_latest, answer)
-    policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20)
+    policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20)
     for version in (6, 2, 6, 0, 1, 3, 2, 6):
         assert policy.at(version)[1] == versions[version].digest
     assert asked == [6, 2, 0, 1, 3, 6]
 
 
 def test_the_policy_does_not_wait_for_ever(hub, small_run):
-    policy = LivePolicy(hub(), KEYS, spec(tasks.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
+    policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
     with pytest.raises(Unanswered, match=r"version 3 did not come within 0.3 s"):
         policy.at(3)

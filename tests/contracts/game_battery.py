@@ -14,8 +14,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from icrl_dist import envs
-from icrl_dist.envs.variation import VariationEnv
+from icrl_dist.problems import registry
+from icrl_dist.problems.gym_adapter import VariationEnv
 from icrl_dist.types import Variation
 
 MakeVariation = Callable[[], Variation]
@@ -28,7 +28,7 @@ def _episode(env: VariationEnv, seed: int) -> list[Any]:
     """Every observation and result of one episode of seeded random actions."""
     env.action_space.seed(seed)
     seen: list[Any] = [env.reset(seed=seed)[0].tobytes()]
-    for _ in range(envs.spec(env.variation.task).horizon):
+    for _ in range(registry.spec(env.variation.task).horizon):
         observation, *rest, info = env.step(env.action_space.sample())
         seen.append((observation.tobytes(), *rest, {name: np.asarray(value).tolist() for name, value in info.items()}))
     return seen
@@ -38,14 +38,14 @@ def gymnasium_contract(make_variation: MakeVariation) -> None:
     """gymnasium's own checker has nothing to say."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        check_env(envs.make(make_variation()))
+        check_env(registry.make(make_variation()))
     complaints = [str(w.message) for w in caught if not any(text in str(w.message) for text in HARMLESS)]
     assert complaints == []
 
 
 def spec_agrees_with_spaces(make_variation: MakeVariation) -> None:
     variation = make_variation()
-    env, spec = envs.make(variation), envs.spec(variation.task)
+    env, spec = registry.make(variation), registry.spec(variation.task)
     box = env.observation_space
     assert isinstance(box, spaces.Box)
     assert box.dtype == np.float32
@@ -60,18 +60,18 @@ def spec_agrees_with_spaces(make_variation: MakeVariation) -> None:
 
 
 def observations_lie_in_the_space(make_variation: MakeVariation) -> None:
-    env = envs.make(make_variation())
+    env = registry.make(make_variation())
     env.action_space.seed(0)
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
-    for _ in range(envs.spec(env.variation.task).horizon):
+    for _ in range(registry.spec(env.variation.task).horizon):
         observation = env.step(env.action_space.sample())[0]
         assert env.observation_space.contains(observation), observation
 
 
 def same_seed_same_episode(make_variation: MakeVariation) -> None:
     """In the same environment, in another one, and however many episodes came before."""
-    one, other = envs.make(make_variation()), envs.make(make_variation())
+    one, other = registry.make(make_variation()), registry.make(make_variation())
     first = _episode(one, 3)
     assert _episode(one, 3) == first
     _episode(other, 4)
@@ -79,14 +79,14 @@ def same_seed_same_episode(make_variation: MakeVariation) -> None:
 
 
 def seeds_matter(make_variation: MakeVariation) -> None:
-    env = envs.make(make_variation())
+    env = registry.make(make_variation())
     assert len({str(_episode(env, seed)) for seed in range(5)}) == 5
 
 
 def an_unseeded_reset_goes_on(make_variation: MakeVariation) -> None:
     """reset() without a seed continues the generator rather than repeating the episode."""
-    env = envs.make(make_variation())
-    actions = [env.action_space.sample() for _ in range(envs.spec(env.variation.task).horizon)]
+    env = registry.make(make_variation())
+    actions = [env.action_space.sample() for _ in range(registry.spec(env.variation.task).horizon)]
     env.reset(seed=0)
     episodes = set()
     for _ in range(4):
@@ -97,9 +97,9 @@ def an_unseeded_reset_goes_on(make_variation: MakeVariation) -> None:
 
 def truncated_exactly_at_the_horizon(make_variation: MakeVariation) -> None:
     """Never terminated; one step more is refused, and a reset allows the next episode."""
-    env = envs.make(make_variation())
+    env = registry.make(make_variation())
     env.action_space.seed(0)
-    horizon = envs.spec(env.variation.task).horizon
+    horizon = registry.spec(env.variation.task).horizon
     for _ in range(2):
         env.reset(seed=1)
         ends = [env.step(env.action_space.sample())[2:4] for _ in range(horizon)]
@@ -109,14 +109,14 @@ def truncated_exactly_at_the_horizon(make_variation: MakeVariation) -> None:
 
 
 def a_step_before_reset_is_refused(make_variation: MakeVariation) -> None:
-    env = envs.make(make_variation())
+    env = registry.make(make_variation())
     with pytest.raises(RuntimeError, match="reset"):
         env.step(env.action_space.sample())
 
 
 def an_action_outside_the_space_is_refused(make_variation: MakeVariation) -> None:
     variation = make_variation()
-    env, spec = envs.make(variation), envs.spec(variation.task)
+    env, spec = registry.make(variation), registry.spec(variation.task)
     env.reset(seed=0)
     wrong: list[Any] = [np.int64(-1), np.int64(spec.actions)] if spec.discrete else [np.full(spec.actions, 1e3, np.float32)]
     for action in wrong:

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 import pytest
 
-from icrl_dist.stream import batch
+from icrl_dist.stream import batching
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Link, LinkError, Outcome, Query, Refused, Unanswered
 
@@ -45,7 +45,7 @@ def each(handler: Callable[[Query], object]) -> Callable[[Query], None]:
     """A handler of requests that gives their items to ``handler`` one by one."""
 
     def take_apart(query: Query) -> None:
-        for part in batch.split(query, 1 << 20):
+        for part in batching.split(query, 1 << 20):
             handler(part)
 
     return take_apart

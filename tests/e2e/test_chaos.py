@@ -12,14 +12,14 @@ import socket
 import psutil
 import pytest
 
-from icrl_dist import arguments, cli
 from icrl_dist.chaos import campaign, disk, proxy, schedule
 from icrl_dist.chaos.faults import FAULTS, Struck
 from icrl_dist.chaos.outcome import Outcome, verdict
-from icrl_dist.config import ConfigError, load, override
-from icrl_dist.files import StoreError
-from icrl_dist.launch import prepare
-from icrl_dist.metrics import Metrics
+from icrl_dist.cli import arguments, main
+from icrl_dist.config.run import ConfigError, load, override
+from icrl_dist.launch.train import prepare
+from icrl_dist.storage.files import StoreError
+from icrl_dist.telemetry.metrics import Metrics
 from learner import __main__ as learner
 
 SMALL = ["--set", "icaa.rounds=0", "--set", "pretrain.steps=20"]
@@ -29,13 +29,13 @@ SMALL = ["--set", "icaa.rounds=0", "--set", "pretrain.steps=20"]
 def reference(tmp_path_factory):
     """The undisturbed run, in one process."""
     folder = tmp_path_factory.mktemp("chaos") / "undisturbed"
-    assert cli.main(["train", "smoke", *SMALL, "--evaluate.episodes", "1", "--engine", "inline", "--out", str(folder)]) == 0
+    assert main.main(["train", "smoke", *SMALL, "--evaluate.episodes", "1", "--engine", "inline", "--out", str(folder)]) == 0
     return folder
 
 
 def chaos(capsys, reference, out, *arguments):
     against = ["--reference", str(reference), "--out", str(out)]
-    code = cli.main(["chaos", "smoke", *SMALL, "--actors", "1", *against, "--json", *arguments])
+    code = main.main(["chaos", "smoke", *SMALL, "--actors", "1", *against, "--json", *arguments])
     printed = capsys.readouterr()
     answer = json.loads(printed.out.splitlines()[-1])
     assert answer["ok"] is (code == 0), printed.err
@@ -103,7 +103,7 @@ def test_a_run_without_a_sealed_segment_is_told_so():
 
 def test_what_cannot_be_asked_for(capsys, reference, tmp_path):
     def refused(*arguments):
-        assert cli.main(["chaos", "smoke", "--out", str(tmp_path / "out"), *arguments]) == 2
+        assert main.main(["chaos", "smoke", "--out", str(tmp_path / "out"), *arguments]) == 2
         return capsys.readouterr().err
 
     assert "no such fault; there are kill-worker" in refused("--faults", "kill-all")
@@ -166,8 +166,8 @@ def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device", "runs/smoke/report/adaptation.png")
 
-    monkeypatch.setitem(cli.COMMANDS, "doctor", (arguments.Doctor, full))
-    assert cli.main(["doctor"]) == 1
+    monkeypatch.setitem(main.COMMANDS, "doctor", (arguments.Doctor, full))
+    assert main.main(["doctor"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "adaptation.png: could not be written" in line and "free space, then use --resume" in line
 

@@ -13,12 +13,15 @@ from importlib import metadata
 
 import pytest
 
-from icrl_dist import agent, cli, commands, heldout, launch
+from icrl_dist.agent import in_context_agent
+from icrl_dist.cli import commands, main
+from icrl_dist.launch import train
+from icrl_dist.results import heldout
 
 
 def refused(capsys, *arguments):
     """The one line that the command printed, which must end with exit code 2."""
-    assert cli.main([str(a) for a in arguments]) == 2
+    assert main.main([str(a) for a in arguments]) == 2
     printed = capsys.readouterr()
     lines = printed.err.strip().splitlines()
     assert len(lines) == 1, printed
@@ -129,29 +132,29 @@ def test_nothing_to_evaluate_or_to_listen_to(capsys, tmp_path, monkeypatch):
 def test_an_unknown_command_and_an_unknown_flag(capsys):
     assert "'trian'" in refused(capsys, "trian")
     with pytest.raises(SystemExit) as stopped:
-        cli.main(["train", "smoke", "--adversary.cuont", "3"])
+        main.main(["train", "smoke", "--adversary.cuont", "3"])
     assert stopped.value.code == 2
     assert "cuont" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
+@pytest.mark.parametrize("command", sorted(main.COMMANDS))
 def test_help_teaches_and_does_nothing(capsys, command):
     with pytest.raises(SystemExit) as stopped:
-        cli.main([command, "--help"])
+        main.main([command, "--help"])
     assert stopped.value.code == 0
     printed = capsys.readouterr().out
-    assert f"icrl-dist {command}" in printed and (cli.COMMANDS[command][0].__doc__ or "?").split()[0] in printed
+    assert f"icrl-dist {command}" in printed and (main.COMMANDS[command][0].__doc__ or "?").split()[0] in printed
 
 
 def test_the_version_is_the_packages(capsys):
-    assert cli.main(["--version"]) == 0
+    assert main.main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == metadata.version("icrl-dist")
 
 
 def test_bench_env_ends_with_one_json_object(capsys):
-    assert cli.main(["bench", "env", "--seconds", "0.1", "--json"]) == 0
+    assert main.main(["bench", "env", "--seconds", "0.1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["steps_per_s"] > 0
-    assert cli.main(["bench", "env", "--problem", "darkrom"]) == 2
+    assert main.main(["bench", "env", "--problem", "darkrom"]) == 2
 
 
 def test_nobody_waits_for_what_only_the_evaluation_needs(tmp_path):
@@ -177,10 +180,10 @@ def test_an_evaluation_that_is_stopped_says_how_to_go_on(monkeypatch, tmp_path, 
         signal.raise_signal(getattr(signal, name))
         pytest.fail("it went on")
 
-    monkeypatch.setattr(launch, "train_inline", lambda *_: {})
-    monkeypatch.setattr(agent, "checkpoint_file", lambda folder: folder / "none")
+    monkeypatch.setattr(train, "train_inline", lambda *_: {})
+    monkeypatch.setattr(in_context_agent, "checkpoint_file", lambda folder: folder / "none")
     monkeypatch.setattr(heldout, "calibrate", stopped)
-    assert cli.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
+    assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
     assert f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` goes on" in printed
     assert (tmp_path / "run" / "run.toml").exists()
@@ -202,10 +205,10 @@ def test_the_command_that_goes_on_is_the_one_that_was_given(given, printed):
 def test_a_run_stopped_before_it_began_promises_no_checkpoint(monkeypatch, tmp_path, capsys):
     def stopped(run, folder, *_):
         shutil.rmtree(folder)
-        raise launch.TrainInterrupted
+        raise train.TrainInterrupted
 
-    monkeypatch.setattr(launch, "train_ray", stopped)
-    assert cli.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "run")]) == 130
+    monkeypatch.setattr(train, "train_ray", stopped)
+    assert main.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "run")]) == 130
     assert capsys.readouterr().out == "interrupted; nothing had been done yet\n"
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import psutil
 import pytest
 
-from icrl_dist.agent import load_agent
-from icrl_dist.store import Store
+from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests.e2e.training import endpoint_of, equal, finish, result_of, start, wait_for

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from icrl_dist.monitor import curves
+from icrl_dist.monitor.drawing import optimum
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.monitor.page import showing
-from icrl_dist.monitor.sketch import optimum
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of

@@ -8,7 +8,7 @@ import threading
 import psutil
 import pytest
 
-from icrl_dist.stream import plane, wire
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests.e2e.training import (
     ONE_LIFE,
@@ -50,7 +50,7 @@ def collecting(phase, count):
 
     def reached(kind, fields):
         if kind == "trajectories":
-            seen.update(one["identity"] for one in plane.rows(fields) if one["identity"].startswith(phase))
+            seen.update(one["identity"] for one in monitor_messages.rows(fields) if one["identity"].startswith(phase))
         return len(seen) >= count
 
     return reached

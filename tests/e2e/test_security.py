@@ -8,7 +8,7 @@ import time
 import pytest
 import zenoh
 
-from icrl_dist import cli
+from icrl_dist.cli import main
 from icrl_dist.stream import security
 from icrl_dist.stream.link import Keys, LinkError, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
@@ -301,7 +301,7 @@ def test_what_a_role_may_not_do_works_without_the_rules_and_not_with_them(ours, 
 @pytest.mark.usefixtures("no_ray_token")
 def test_off_this_machine_in_the_clear_is_refused(capsys, tmp_path, ours):
     def refused(*arguments):
-        assert cli.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "out"), *arguments]) == 2
+        assert main.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "out"), *arguments]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert not (tmp_path / "out").exists()
         return line
@@ -316,10 +316,10 @@ def test_off_this_machine_in_the_clear_is_refused(capsys, tmp_path, ours):
 
 
 def test_a_tap_without_its_certificates_is_told_what_it_needs(capsys, ours):
-    assert cli.main(["tap", "--connect", "tls/127.0.0.1:1"]) == 2
+    assert main.main(["tap", "--connect", "tls/127.0.0.1:1"]) == 2
     assert "--certificates" in capsys.readouterr().err
     with listening(ours) as link:
-        assert cli.main(["tap", "--connect", link.endpoints[0], "--certificates", ours + "/none"]) == 2
+        assert main.main(["tap", "--connect", link.endpoints[0], "--certificates", ours + "/none"]) == 2
     assert "none/ca.pem: cannot be read" in capsys.readouterr().err
 
 

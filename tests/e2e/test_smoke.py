@@ -13,12 +13,12 @@ import numpy as np
 import psutil
 import pytest
 
-from icrl_dist import recipes
-from icrl_dist.agent import load_agent
-from icrl_dist.config import load
-from icrl_dist.exact import RULES
-from icrl_dist.files import version_file
-from icrl_dist.store import Store
+from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.config.run import load
+from icrl_dist.methods import recipes
+from icrl_dist.problems.darkroom.exact_agents import RULES
+from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.files import version_file
 from icrl_dist.stream.link import Refused
 from learner import checkpoints
 from tests.e2e.training import (

@@ -9,9 +9,9 @@ import time
 
 import psutil
 
-from icrl_dist import processes
-from icrl_dist.stream import plane, wire
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
 # Both of smoke's rounds, with fewer trajectories in each.
@@ -57,7 +57,7 @@ def on_first_adapt_trajectory(folder, act, round_=0):
 
     def hear(key, payload):
         _, fields = wire.decode_message(payload)
-        heard = any(one["identity"].startswith(f"adapt/{round_}") for one in plane.rows(fields))
+        heard = any(one["identity"].startswith(f"adapt/{round_}") for one in monitor_messages.rows(fields))
         if heard and not acted.is_set():
             acted.set()
             act()

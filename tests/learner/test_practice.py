@@ -4,11 +4,11 @@ import dataclasses
 
 import pytest
 
-from icrl_dist import explain
-from icrl_dist.config import PracticeConfig
-from icrl_dist.launch import TrainInterrupted
+from icrl_dist.config.run import PracticeConfig
+from icrl_dist.diagnostics import explain
+from icrl_dist.launch.train import TrainInterrupted
 from icrl_dist.types import Identity
-from learner import checkpoints, herald, service
+from learner import checkpoints, reporter, service
 from tests.learner.test_service import no_tensorboard, run_inline, same
 
 __all__ = ["no_tensorboard"]
@@ -37,7 +37,7 @@ def test_a_round_of_practice_stopped_midway_goes_on_to_the_same_bytes(run, tmp_p
     made = []
     real = service.Service.run
     monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
-    monkeypatch.setattr(herald, "PERIOD_S", 0.0)
+    monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     with pytest.raises(TrainInterrupted):
         run_inline(run, tmp_path / "stopped", stop)
     partial = checkpoints.read_manifest(tmp_path / "stopped" / "checkpoints" / checkpoints.PARTIAL)

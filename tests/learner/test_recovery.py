@@ -6,13 +6,15 @@ import shutil
 
 import pytest
 
-from icrl_dist import explain, jobs, launch
-from icrl_dist.config import ConfigError, override
-from icrl_dist.files import StoreError, hold
-from icrl_dist.lineage import parse_source
-from icrl_dist.store import Store
+from icrl_dist.collect import jobs
+from icrl_dist.config.run import ConfigError, override
+from icrl_dist.diagnostics import explain
+from icrl_dist.launch import train
+from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.files import StoreError, hold
+from icrl_dist.storage.fork import parse_source
 from icrl_dist.types import Identity
-from learner import herald, service
+from learner import reporter, service
 from tests.learner.test_service import no_tensorboard, parent, run_inline, same
 
 __all__ = ["no_tensorboard", "parent"]
@@ -66,7 +68,7 @@ def test_damage_while_the_run_is_on_is_found_before_it_is_learned_from(parent, t
 def test_one_learner_a_folder(parent, monkeypatch):
     monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
     with hold(parent[0]), pytest.raises(StoreError, match="another learner is at work"):
-        launch.train_inline(parent[2], parent[0], print)
+        train.train_inline(parent[2], parent[0], print)
 
 
 def test_a_fork_with_the_same_numbers_ends_where_its_parent_did(parent, tmp_path):
@@ -101,7 +103,7 @@ def test_a_fork_with_other_numbers_keeps_the_data_that_it_began_with(parent, tmp
 )
 def test_a_fork_that_does_not_fit_is_refused(parent, tmp_path, settings, message):
     with pytest.raises(ConfigError, match=message):
-        launch.prepare(override(parent[2], settings, "--set"), tmp_path / "fork", False, False, (parent[0], 0))
+        train.prepare(override(parent[2], settings, "--set"), tmp_path / "fork", False, False, (parent[0], 0))
     assert not (tmp_path / "fork" / "run.toml").exists()
 
 
@@ -136,13 +138,13 @@ def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began
     run = override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set")
     made, real = [], service.Service.run
     monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
-    monkeypatch.setattr(herald, "PERIOD_S", 0.0)
+    monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
 
     def stop(event):
         if event.get("stage") == "fit" and event["version"] == 0:
             made[0].stop()
 
-    with pytest.raises(launch.TrainInterrupted):
+    with pytest.raises(train.TrainInterrupted):
         run_inline(run, tmp_path / "run", stop)
     result = run_inline(run, tmp_path / "run", resume=True)
     assert result["trajectories"] == 42 + 3 * 7 * 3 * (run.icaa.trials + 1)

@@ -8,17 +8,17 @@ import sys
 import numpy as np
 import pytest
 
-from icrl_dist import launch
-from icrl_dist.agent import load_agent
-from icrl_dist.config import ConfigError
-from icrl_dist.files import version_file
-from icrl_dist.store import Store
-from learner import checkpoints, herald, service
+from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.config.run import ConfigError
+from icrl_dist.launch import train
+from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.files import version_file
+from learner import checkpoints, reporter, service
 
 
 def run_inline(run, folder, report=lambda event: None, **options):
-    launch.prepare(run, folder, **{"resume": False, "overwrite": False, **options})
-    return launch.train_inline(run, folder, report)
+    train.prepare(run, folder, **{"resume": False, "overwrite": False, **options})
+    return train.train_inline(run, folder, report)
 
 
 METRICS = service.Metrics
@@ -88,9 +88,9 @@ def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, u
     made = []
     real = service.Service.run
     monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
-    monkeypatch.setattr(herald, "PERIOD_S", 0.0)
+    monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     folder = tmp_path / "stopped"
-    with pytest.raises(launch.TrainInterrupted):
+    with pytest.raises(train.TrainInterrupted):
         run_inline(small_run, folder, stop_at)
     assert stopped
     if what == "fit":
@@ -114,29 +114,29 @@ def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(parent):
 def test_a_folder_in_use_and_other_numbers_are_refused(small_run, tmp_path, parent):
     folder = shutil.copytree(parent[0], tmp_path / "undisturbed")
     with pytest.raises(ConfigError, match="exists: use --resume"):
-        launch.prepare(small_run, folder, resume=False, overwrite=False)
+        train.prepare(small_run, folder, resume=False, overwrite=False)
     with pytest.raises(ConfigError, match="other numbers"):
-        launch.prepare(dataclasses.replace(small_run, seed=5), folder, resume=True, overwrite=False)
+        train.prepare(dataclasses.replace(small_run, seed=5), folder, resume=True, overwrite=False)
     with pytest.raises(ConfigError, match="holds no run"):
-        launch.prepare(small_run, tmp_path / "nothing", resume=True, overwrite=False)
+        train.prepare(small_run, tmp_path / "nothing", resume=True, overwrite=False)
     wide = dataclasses.replace(small_run, model=dataclasses.replace(small_run.model, width=32))
-    (folder / "run.toml").write_text(launch.dumps(wide))
+    (folder / "run.toml").write_text(train.dumps(wide))
     with pytest.raises(ConfigError, match="a checkpoint of another model"):
         run_inline(wide, folder, resume=True)
     large = dataclasses.replace(small_run, darkroom=dataclasses.replace(small_run.darkroom, horizon=9))
-    (folder / "run.toml").write_text(launch.dumps(large))
+    (folder / "run.toml").write_text(train.dumps(large))
     with pytest.raises(ConfigError, match="a checkpoint of another spec"):
         run_inline(large, folder, resume=True)
 
 
 def test_a_job_that_always_fails_ends_the_run_with_its_cause(small_run, tmp_path, monkeypatch):
-    from icrl_dist import jobs
+    from icrl_dist.collect import jobs
 
     def broken(job, worker):
         raise ZeroDivisionError("the environment broke")
 
     monkeypatch.setattr(jobs, "random_context", broken)
     with pytest.raises(
-        launch.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"
+        train.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"
     ):
         run_inline(small_run, tmp_path / "broken")

@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from icrl_dist.monitor import curves, staff
-from icrl_dist.monitor.pace import Pace
+from icrl_dist.monitor import curves, workers
 from icrl_dist.monitor.picture import Picture
-from icrl_dist.oracle import Hypotheses, optimal_returns
-from icrl_dist.stream import plane, wire
+from icrl_dist.monitor.rates import Pace
+from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
+from icrl_dist.stream import monitor_messages, wire
 from tests.monitor.messages import PUSHY, ROOM, about, beat, event, hear, progress, trajectory
 
 
 def watch(picture, *trajectories, now=0.0):
     for one in trajectories:
-        hear(picture, f"trajectories/{one.worker}", plane.trajectories([one], now), now)
-        hear(picture, f"episode/{one.worker}", plane.episode(one, now), now)
+        hear(picture, f"trajectories/{one.worker}", monitor_messages.trajectories([one], now), now)
+        hear(picture, f"episode/{one.worker}", monitor_messages.episode(one, now), now)
 
 
 def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum():
@@ -144,7 +144,7 @@ def test_workers_work_wait_fall_silent_go_and_come_again():
     busy, idle = picture.snapshot(4.0)["workers"]
     assert (busy["state"], busy["unstored"], busy["steps_per_s"]) == ("working", 1, pytest.approx(100.0))
     assert (idle["state"], idle["silent_s"]) == ("silent", 4.0)
-    assert staff.SILENT_S < 3.0
+    assert workers.SILENT_S < 3.0
     hear(picture, "event", event("worker", "worker w0 is gone", worker="w0", alive=False), 4.5)
     gone = picture.snapshot(4.5)["workers"][0]
     assert (gone["state"], gone["job"], gone["steps_per_s"]) == ("gone", "", 0.0)
@@ -283,7 +283,7 @@ def test_memory_is_bounded_whatever_comes(monkeypatch):
     monkeypatch.setattr(curves, "VARIATIONS", 5)
     monkeypatch.setattr(curves, "_EPISODES", 12)
     monkeypatch.setattr(curves, "_OPTIMA", 0)
-    monkeypatch.setattr(staff, "_MOST", 3)
+    monkeypatch.setattr(workers, "_MOST", 3)
     picture = Picture("demo")
     for n in range(300):
         watch(picture, trajectory(f"adapt/0/{n % 9}/0/{n}"))
@@ -345,8 +345,8 @@ def test_a_run_that_was_over_may_go_on(how):
 
 
 MESSAGES = {
-    "trajectories": plane.trajectories([trajectory()], 0.0),
-    "episode": plane.episode(trajectory(), 0.0),
+    "trajectories": monitor_messages.trajectories([trajectory()], 0.0),
+    "episode": monitor_messages.episode(trajectory(), 0.0),
     "worker": beat(),
     "learner": progress(),
     "run": about(),

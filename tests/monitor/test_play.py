@@ -6,15 +6,15 @@ from threading import Event, Thread
 import numpy as np
 import pytest
 
-from icrl_dist.agent import InContextAgent, load_agent
-from icrl_dist.cli import main
-from icrl_dist.config import dumps, load, parse
-from icrl_dist.envs.darkroom import MOVES, cells
+from icrl_dist.agent.in_context_agent import InContextAgent, load_agent
+from icrl_dist.cli.main import main
+from icrl_dist.config.run import dumps, load, parse
 from icrl_dist.monitor import player
 from icrl_dist.monitor.play import HELD_S, PlayGame
 from icrl_dist.monitor.player import Player
 from icrl_dist.monitor.serve import EventStream
-from icrl_dist.oracle import Hypotheses, optimal_returns
+from icrl_dist.problems.darkroom.room import MOVES, cells
+from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 
 RIGHT, LEFT, UP, DOWN, STAY = range(5)
 

@@ -7,14 +7,15 @@ import time
 
 import pytest
 
-from icrl_dist import files, launch
-from icrl_dist.cli import main
-from icrl_dist.config import ConfigError
+from icrl_dist.cli.main import main
+from icrl_dist.config.run import ConfigError
+from icrl_dist.launch import train
 from icrl_dist.monitor import page
 from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
 from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.recording import Recording
-from icrl_dist.store import Store
+from icrl_dist.storage import files
+from icrl_dist.storage.dataset import Store
 from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import service
@@ -39,8 +40,8 @@ def watched(module_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
         patch.setattr(MemoryLink, "publish", listen)
-        launch.prepare(module_run, folder, resume=False, overwrite=False)
-        launch.train_inline(module_run, folder, lambda event: None)
+        train.prepare(module_run, folder, resume=False, overwrite=False)
+        train.train_inline(module_run, folder, lambda event: None)
     return folder, heard
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from icrl_dist.cli import main
+from icrl_dist.cli.main import main
 from icrl_dist.monitor.lines import Column, Scroll, cell, fit
 from icrl_dist.monitor.pages import Detail, Help
 from icrl_dist.monitor.recording import Recording

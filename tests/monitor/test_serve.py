@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from icrl_dist.config import ConfigError
+from icrl_dist.config.run import ConfigError
 from icrl_dist.monitor import serve
 from icrl_dist.monitor.serve import EventStream, application, serving
 

@@ -10,10 +10,10 @@ import threading
 import msgpack
 import pytest
 
-from icrl_dist.cli import main
-from icrl_dist.config import ConfigError
+from icrl_dist.cli.main import main
+from icrl_dist.config.run import ConfigError
 from icrl_dist.monitor.tap import Tapped
-from icrl_dist.stream import plane, wire
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import NULL
 from tests.monitor.messages import progress, trajectory
@@ -35,7 +35,7 @@ def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0)
                 law = {"adversary": NULL} if variation == 0 else {}
                 made.append(trajectory(f"adapt/0/{task}/{variation}/{trial}", **law))
     for first in range(0, len(made), 7):
-        tap("key", plane.trajectories(made[first : first + 7], 0.0))
+        tap("key", monitor_messages.trajectories(made[first : first + 7], 0.0))
     broken = [{"identity": "x"}, {"identity": "adapt/0/0/0", "trials": [1], "returns": [], "steps": []}, 7]
     for odd in (progress(), b"garbage", *(wire.encode_message("trajectories", variations=[one]) for one in broken)):
         tap("key", odd)
@@ -108,7 +108,7 @@ def test_it_ends_when_nobody_reads_it_or_nothing_can_be_written(hub, monkeypatch
 
     def run():
         while not over.wait(0.01):
-            link.publish("icrl/demo/mon/trajectories/w0", plane.trajectories([trajectory()], 0.0), droppable=True)
+            link.publish("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory()], 0.0), droppable=True)
 
     running = threading.Thread(target=run)
     running.start()

@@ -8,10 +8,10 @@ from importlib import resources
 
 import numpy as np
 
-from icrl_dist.envs import darkroom
 from icrl_dist.monitor.picture import Picture
-from icrl_dist.store import Store
-from icrl_dist.stream import plane, wire
+from icrl_dist.problems.darkroom import room
+from icrl_dist.storage.dataset import Store
+from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.types import NULL, Adversary, Identity, Trajectory, Variation
 
 BEGAN = 1_700_000_000.0
@@ -28,7 +28,7 @@ def episode(task=0, variation=0, trial=0, earned=3, worker="w0", stage="adapt", 
     adversary = adversary or (NULL if variation == 0 else DIRICHLET)
     return Trajectory(
         identity=Identity(stage, 0, task, variation, trial),
-        variation=Variation(darkroom.task((2, 2), SIZE, HORIZON, (0, 0)), adversary),
+        variation=Variation(room.task((2, 2), SIZE, HORIZON, (0, 0)), adversary),
         weights=0 if stage == "adapt" else -1,
         digest="ab" * 32 if stage == "adapt" else "",
         worker=worker,
@@ -95,10 +95,10 @@ class Watched:
         self.say("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
 
     def store(self, trajectory):
-        self.picture.hear("icrl/demo/mon/trajectories/w0", plane.trajectories([trajectory], self.time), self.time)
+        self.picture.hear("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
 
     def draw(self, trajectory):
-        self.picture.hear("icrl/demo/mon/episode/w0", plane.episode(trajectory, self.time), self.time)
+        self.picture.hear("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
 
     def busy(self):
         """Four tasks of two variations, two workers."""

@@ -12,7 +12,7 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
     import signal
     import time
 
-    from icrl_dist import envs
+    from icrl_dist.problems import registry
 
     def raise_an_error():
         raise ZeroDivisionError("the room broke")
@@ -49,11 +49,11 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
                 DEEDS[os.environ["HOSTILE"]]()
             return self._batch.step(action)
 
-    real = envs.batch
+    real = registry.batch
 
     def batch(variations):
         """The real environments, unless the hostile variation is among them."""
         made = real(variations)
         return Hostile(made) if any(repr(v) == os.environ["HOSTILE_VARIATION"] for v in variations) else made
 
-    envs.batch = batch
+    registry.batch = batch

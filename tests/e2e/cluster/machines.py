@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 
-from icrl_dist.store import Store
+from icrl_dist.storage.dataset import Store
 from tests.e2e import hosts
 from tests.e2e.cluster import files
 

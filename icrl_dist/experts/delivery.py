@@ -1,0 +1,148 @@
+"""What a history becomes on its way to the learner: episodes, query states and stretches, with their labels.
+
+Stretches are cut from episodes that an expert led (zeta of eq. 6): the variation's own, or, for a guess of
+the task that is wrong, another task's, while labels are the variation's own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from icrl_dist.experts.cache import LED, History, own_seed
+from icrl_dist.experts.sac import draws
+from icrl_dist.problems import registry
+from icrl_dist.problems.registry import Batch
+from icrl_dist.rollout.recorder import Recorder
+from icrl_dist.types import Identity, Job, Trajectory
+
+_KNOWN = 1
+"""Part of the key of what is drawn for query states and stretches: the trajectory's own key draws its episode."""
+
+Act = Callable[[np.ndarray], np.ndarray]
+"""Mean actions (N, E, A) of N experts in E states of each (N, E, S)."""
+
+
+def delivered(job: Job, found: Sequence[History], worker: str, act: Act | None) -> Iterator[Trajectory]:
+    """``job.trials`` episodes of each variation's history, evenly spaced, with query states and labels.
+
+    ``act`` is what leads and labels, or None for Meta-World's scripted policy.
+    """
+    misled = _misled(job, act)
+    for row, (task, variation) in enumerate(job.rows()):
+        history = found[row]
+        led = _Led.of(history, {name: column[row] for name, column in misled.items()})
+        chosen = np.linspace(0, len(history.rewards) - 1, job.trials).round().astype(int)
+        for trial, episode in enumerate(chosen.tolist()):
+            identity = Identity(job.stage, job.round, task, variation, trial)
+            yield Trajectory(
+                identity=identity,
+                variation=job.variation(identity),
+                weights=job.weights,
+                digest="",
+                worker=worker,
+                observations=history.observations[episode],
+                actions=history.actions[episode],
+                rewards=history.rewards[episode],
+                adversary=history.adversary[episode],
+                origin="expert",
+                **_known(job, history, led, identity.rng(job.seed, _KNOWN)),
+            )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Led:
+    """G episodes that experts led in a variation."""
+
+    actions: Float32[np.ndarray, "G H A"]
+    observations: Float32[np.ndarray, "G H+1 S"]
+    rewards: Float32[np.ndarray, "G H"]
+    labels: Float32[np.ndarray, "G H A"]
+    wrong: Bool[np.ndarray, " G"]
+    """Which another task's expert led."""
+
+    @classmethod
+    def of(cls, history: History, misled: dict[str, np.ndarray]) -> _Led:
+        """The variation's own, and those of ``misled`` that did not break down."""
+        own = {name: getattr(history, f"led_{name}") for name in ("actions", "observations", "rewards", "labels")}
+        others = {name: misled[name][misled["whole"]] if misled else column[:0] for name, column in own.items()}
+        both = {name: np.concatenate([column, others[name]]) for name, column in own.items()}
+        return cls(**both, wrong=np.arange(len(both["actions"])) >= len(own["actions"]))
+
+
+def _known(job: Job, history: History, led: _Led, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Query states of the history and stretches of what experts led, with their labels: a trajectory's last arrays."""
+    queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
+    place = np.unravel_index(rng.integers(history.rewards.size, size=queries), history.rewards.shape)
+    wrong = rng.random(stretches) < float(str(job.setting("misled")))
+    right_ones, wrong_ones = np.flatnonzero(~led.wrong), np.flatnonzero(led.wrong)
+    episodes, at = [], []
+    for misled in wrong.tolist():
+        episodes += [int(rng.choice(wrong_ones if misled and len(wrong_ones) else right_ones))] * length
+        first = int(rng.integers(led.rewards.shape[1] - length + 1))
+        at += list(range(first, first + length))
+    rest = np.array(episodes, int), np.array(at, int)
+    return {
+        "queries": np.concatenate([history.observations[:, :-1][place], led.observations[:, :-1][rest]]),
+        "labels": np.concatenate([history.labels[place], led.labels[rest]]),
+        "taken": led.actions[rest],
+        "gained": led.rewards[rest],
+    }
+
+
+def labelled(columns: dict[str, np.ndarray], act: Act | None) -> dict[str, np.ndarray]:
+    """Episodes with the right action at each of their states in place of the true states."""
+    truths = columns.pop("truths", None)
+    if truths is None:
+        assert act is not None, "a game without a scripted policy"
+        seen = columns["observations"][:, :, :-1]
+        labels = act(seen.reshape(len(seen), -1, seen.shape[-1]))
+    else:
+        labels = scripted(truths)
+    return {**columns, "labels": labels.reshape(columns["actions"].shape)}
+
+
+def lead(env: Batch, act: Act | None, seeds: Sequence[int], by: Sequence[int]) -> dict[str, np.ndarray]:
+    """``LED`` episodes in which row r follows expert ``by[r]``; Meta-World's is the scripted policy told that row's goal."""
+    recorder, order = Recorder(env, LED, LED), np.array(by)
+    for episode in range(LED):
+        seen = recorder.reset([np.random.default_rng(draws.key(seed, draws.LED, episode)) for seed in seeds])
+        for _ in range(env.spec.horizon):
+            seen = recorder.step(_led_by(order, seen, getattr(env, "truth", None), act)).observation
+    columns = labelled(recorder.columns(), act)
+    del columns["adversary"]  # zeta holds nothing of it
+    return columns
+
+
+def _misled(job: Job, act: Act | None) -> dict[str, np.ndarray]:
+    """``LED`` episodes of each variation that the next task's expert leads; none if nobody asks for them or there is no other.
+
+    Begun as those of the variation's own expert are.
+    """
+    if job.tasks == 1 or not int(str(job.setting("stretches"))) or not float(str(job.setting("misled"))):
+        return {}
+    seeds = [own_seed(variation, job.seed) for variation in job.variations]
+    by = np.roll(np.arange(len(seeds)), -(len(seeds) // job.tasks))
+    return lead(registry.batch(job.variations), act, seeds, by.tolist())
+
+
+def _led_by(
+    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, act: Act | None
+) -> Float32[np.ndarray, "B A"]:
+    if truth is not None:
+        return scripted(np.concatenate([truth[:, :-3], truth[by, -3:]], axis=1))
+    assert act is not None, "a game without a scripted policy"
+    asked = np.empty_like(seen)
+    asked[by] = seen
+    led: Float32[np.ndarray, "B A"] = act(asked[:, None])[by, 0]
+    return led
+
+
+def scripted(truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
+    """Meta-World's scripted policy at these true states."""
+    from icrl_dist.problems.metaworld.environment import expert
+
+    return expert(truths.reshape(-1, truths.shape[-1]).astype(np.float64))

@@ -1,0 +1,64 @@
+"""Soft actor-critic by stable-baselines3, with the paper's numbers: the reference, and the default for one expert.
+
+stable-baselines3 has one learning rate and one number for both random steps and warm-up; ``Expert``
+has the paper's own for each.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import stable_baselines3
+from stable_baselines3.common.noise import ActionNoise
+from torch.optim import Optimizer
+
+from icrl_dist.config.sac import SACConfig
+
+
+class Expert(stable_baselines3.SAC):
+    """``stable_baselines3.SAC`` with a learning rate for each part, and random steps apart from the warm-up.
+
+    What it saves, ``stable_baselines3.SAC.load`` opens too.
+    """
+
+    rates: tuple[float, float, float] = (SACConfig.actor_rate, SACConfig.critic_rate, SACConfig.temperature_rate)
+    """Learning rates of actor, critics and temperature."""
+    random_steps: int = SACConfig.random_steps
+
+    def _update_learning_rate(self, optimizers: list[Optimizer] | Optimizer) -> None:
+        for optimizer, rate in zip(optimizers if isinstance(optimizers, list) else [optimizers], self.rates, strict=True):
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return super()._sample_action(self.random_steps, action_noise, n_envs)
+
+
+def expert(env: gymnasium.Env[Any, Any], config: SACConfig, seed: int | None, device: str = "auto") -> Expert:
+    """An expert that has learned nothing yet: ``expert(...).learn(steps)``, then ``save(path)``.
+
+    An episode that ends by ``truncated`` has met its time limit: the target bootstraps through it.
+    With a ``seed`` stable-baselines3 seeds torch's, numpy's and Python's global generators.
+    """
+    made = Expert(
+        "MlpPolicy",
+        env,
+        learning_rate=config.critic_rate,
+        buffer_size=config.replay,
+        learning_starts=config.warmup,
+        batch_size=config.batch,
+        tau=config.tau,
+        gamma=config.gamma,
+        train_freq=config.update_every,
+        ent_coef=f"auto_{config.temperature!r}",
+        policy_kwargs={"net_arch": list(config.hidden)},
+        seed=seed,
+        device=device,
+    )
+    made.rates = (config.actor_rate, config.critic_rate, config.temperature_rate)
+    made.random_steps = config.random_steps
+    return made

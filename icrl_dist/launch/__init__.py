@@ -1,0 +1,1 @@
+"""Start the learner and the workers of one run and watch them."""

@@ -1,0 +1,1 @@
+"""The in-context methods: what each collects and what each learns from."""

@@ -1,0 +1,1 @@
+"""The problems: environments, adversaries, splits, labels and references of each."""

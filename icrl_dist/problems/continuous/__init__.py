@@ -1,0 +1,1 @@
+"""Parts that the problems with vectors of actions share."""

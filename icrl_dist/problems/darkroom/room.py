@@ -1,0 +1,131 @@
+"""Dark Room (appendix C.1): a hidden goal in a square room, reward on every step spent on it.
+
+The unit of work is a batch of variations stepped together in numpy.  Each row draws from its
+own generator, so a row's episode is the same whatever stands beside it in the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Float64, Int, UInt8
+
+from icrl_dist.problems.darkroom.adversaries import override_law
+from icrl_dist.types import Spec, Step, Task, Variation
+
+MOVES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
+"""The five actions: +x, -x, +y, -y, stay."""
+ACTIONS = len(MOVES)
+
+
+def task(goal: Sequence[int], size: int = 10, horizon: int = 100, start: Sequence[int] | None = None) -> Task:
+    """The task with this goal cell; ``start=None`` draws a start cell uniformly each episode.
+
+    Raises ValueError if goal or start lies outside the room.
+    """
+    made = Task.of("darkroom", goal=tuple(goal), size=size, horizon=horizon)
+    made = made if start is None else made.replace(start=tuple(start))
+    check(made)
+    return made
+
+
+def check(task: Task) -> None:
+    """Raises ValueError, naming the value, unless the task describes a room."""
+    size, horizon = task.number("size"), task.number("horizon")
+    if not (size >= 2 and float(size).is_integer()):
+        raise ValueError(f"darkroom size={size}: expected a whole number of cells, at least 2")
+    if not (horizon >= 1 and float(horizon).is_integer()):
+        raise ValueError(f"darkroom horizon={horizon}: expected a whole number of steps, at least 1")
+    for name in ("goal", "start"):
+        if name == "start" and task.get("start", "random") == "random":
+            continue
+        cell = task.vector(name)
+        if len(cell) != 2 or any(c != int(c) or not 0 <= c < size for c in cell):
+            raise ValueError(f"darkroom {name}={cell} lies outside the {size:g}x{size:g} room: use 0..{size - 1:g}")
+
+
+def spec(task: Task) -> Spec:
+    """Shape of the room: two coordinates, five actions."""
+    size = task.number("size")
+    return Spec(low=(0.0, 0.0), high=(size - 1.0, size - 1.0), actions=ACTIONS, horizon=int(task.number("horizon")))
+
+
+def cells(size: int) -> Float[np.ndarray, "C 2"]:
+    """All C = size^2 cells as ``(x, y)``, cell number x * size + y."""
+    x, y = np.divmod(np.arange(size * size), size)
+    return np.stack([x, y], axis=1).astype(np.float32)
+
+
+def next_cell(size: int) -> Int[np.ndarray, "C A"]:
+    """Number of the cell that each action leads to from each cell; walls stop a move."""
+    moved = np.clip(cells(size).astype(np.int64)[:, None, :] + MOVES[None], 0, size - 1)
+    table: np.ndarray = moved[..., 0] * size + moved[..., 1]
+    return table
+
+
+class DarkRoom:
+    """B variation environments of one size and horizon, stepped as one batch."""
+
+    def __init__(self, variations: Sequence[Variation]) -> None:
+        tasks = [v.task for v in variations]
+        for one in tasks:
+            check(one)
+        shapes = {(t.number("size"), t.number("horizon")) for t in tasks}
+        if len(shapes) != 1:
+            raise ValueError(f"darkroom: one batch holds one size and horizon, not {sorted(shapes)}")
+        size = int(tasks[0].number("size"))
+        self.spec = spec(tasks[0])
+        self.batch = len(tasks)
+        self._h = self.spec.horizon
+        self._cells = cells(size)
+        self._next = next_cell(size).ravel()
+        self._goal = np.array([int(g[0]) * size + int(g[1]) for g in (t.vector("goal") for t in tasks)])
+        starts = [t.get("start", "random") for t in tasks]
+        self._start = np.array([-1 if isinstance(s, (str, int, float)) else int(s[0]) * size + int(s[1]) for s in starts])
+        laws = {a: override_law(a, ACTIONS) for a in {v.adversary for v in variations}}
+        self._p = np.array([laws[v.adversary][0] for v in variations])
+        # One uniform number u decides a step: u < p overrides, and u / p picks the action.
+        self._edges = np.stack([laws[v.adversary][0] * np.cumsum(laws[v.adversary][1])[:-1] for v in variations])
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> Float[np.ndarray, "B S"]:
+        """Start an episode in every row, all of whose chance is drawn here, row by row."""
+        if len(rngs) != self.batch:
+            raise ValueError(f"darkroom: {len(rngs)} generators for {self.batch} rows")
+        chance = np.stack([rng.random(1 + self.spec.horizon) for rng in rngs], axis=1)
+        drawn = (chance[0] * len(self._cells)).astype(np.int64)
+        self._noise: Float64[np.ndarray, "H B"] = chance[1:]
+        self._cell = np.where(self._start >= 0, self._start, drawn)
+        self._h = 0
+        observation: np.ndarray = self._cells[self._cell]
+        return observation
+
+    def step(self, actions: Int[np.ndarray, " B"]) -> Step:
+        """Act in every row.  Raises RuntimeError past the horizon or before a reset."""
+        if self._h >= self.spec.horizon:
+            raise RuntimeError(f"darkroom: stepped past the horizon of {self.spec.horizon}; call reset first")
+        if actions.shape != (self.batch,) or actions.min() < 0 or actions.max() >= ACTIONS:
+            raise ValueError(f"darkroom: actions {actions}: expected {self.batch} numbers in 0..{ACTIONS - 1}")
+        u = self._noise[self._h]
+        drawn = np.zeros(self.batch, dtype=np.int64)
+        for edge in self._edges.T:
+            drawn += u >= edge
+        overridden = u < self._p
+        executed = np.where(overridden, drawn, actions)
+        self._cell = self._next[self._cell * ACTIONS + executed]
+        self._h += 1
+        return Step(
+            observation=self._cells[self._cell],
+            reward=(self._cell == self._goal).astype(np.float32),
+            done=self._h == self.spec.horizon,
+            adversary=np.where(overridden, drawn, -1).astype(np.int16),
+        )
+
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """The room from above, x to the right and y upwards: goal green, agent blue; 24 pixels a cell."""
+        size = round(len(self._cells) ** 0.5)
+        room = np.full((size, size, 3), 235, np.uint8)
+        for cell, colour in ((self._goal[row], (45, 164, 78)), (self._cell[row], (31, 111, 235))):
+            x, y = divmod(int(cell), size)
+            room[size - 1 - y, x] = colour
+        return room.repeat(24, axis=0).repeat(24, axis=1)

@@ -1,0 +1,158 @@
+"""Exact answers for Dark Room: optimal values, labels, the posterior over (tau, phi).
+
+A variation is a finite MDP with P = (1 - p) P_a + p sum_b q_b P_b, so value iteration is
+exact and takes milliseconds.  Everything here takes M hypotheses (goal, p, q) at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int
+
+from icrl_dist.problems.darkroom.adversaries import override_law
+from icrl_dist.problems.darkroom.room import ACTIONS, MOVES, cells, check, next_cell
+from icrl_dist.types import Trajectory, Variation
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """M variations of one room as arrays: what could be true of the environment.
+
+    With a leading axis, of each row of a batch (only ``log_likelihood`` takes those).
+    """
+
+    size: int
+    horizon: int
+    goal: Int[np.ndarray, "*B M"]
+    """Cell number of the goal."""
+    p: Float64[np.ndarray, "*B M"]
+    q: Float64[np.ndarray, "*B M A"]
+
+    @classmethod
+    def of(cls, variations: Sequence[Variation]) -> Hypotheses:
+        """Raises ValueError unless all variations share one size and horizon."""
+        for v in variations:
+            check(v.task)
+        shapes = {(int(v.task.number("size")), int(v.task.number("horizon"))) for v in variations}
+        if len(shapes) != 1:
+            raise ValueError(f"hypotheses must share one size and horizon, not {sorted(shapes)}")
+        (size, horizon) = shapes.pop()
+        known = {a: override_law(a, ACTIONS) for a in {v.adversary for v in variations}}
+        laws = [known[v.adversary] for v in variations]
+        goal = np.array([int(g[0]) * size + int(g[1]) for g in (v.task.vector("goal") for v in variations)])
+        return cls(size, horizon, goal, np.array([p for p, _ in laws]), np.stack([q for _, q in laws]))
+
+    def rewards(self) -> Float64[np.ndarray, "M C"]:
+        """Reward of arriving in each cell."""
+        return (np.arange(self.size**2)[None, :] == self.goal[:, None]).astype(np.float64)
+
+
+def _backup(h: Hypotheses, value: Float64[np.ndarray, "M C"], gamma: float) -> Float64[np.ndarray, "M C A"]:
+    """Q(s, a) = (1 - p) U(s_a) + p sum_b q_b U(s_b), with U(s') = R(s') + gamma V(s')."""
+    arrived = (h.rewards() + gamma * value)[:, next_cell(h.size)]
+    overridden = np.einsum("mca,ma->mc", arrived, h.q)
+    result: np.ndarray = (1 - h.p)[:, None, None] * arrived + (h.p[:, None] * overridden)[:, :, None]
+    return result
+
+
+def q_values(h: Hypotheses, gamma: float) -> Float64[np.ndarray, "M C A"]:
+    """Optimal action values with a full horizon to go, discounted by gamma."""
+    value = np.zeros((len(h.goal), h.size**2))
+    for _ in range(h.horizon - 1):
+        value = _backup(h, value, gamma).max(axis=2)
+    return _backup(h, value, gamma)
+
+
+def optimal_values(h: Hypotheses) -> Float64[np.ndarray, "M C"]:
+    """Undiscounted return of the optimal policy from every cell."""
+    value = np.zeros((len(h.goal), h.size**2))
+    for _ in range(h.horizon):
+        value = _backup(h, value, 1.0).max(axis=2)
+    return value
+
+
+def optimal_returns(h: Hypotheses, start: Sequence[int] = (0, 0)) -> Float64[np.ndarray, " M"]:
+    """The same from ``start``: the ceiling of every agent."""
+    best: np.ndarray = optimal_values(h)[:, int(start[0]) * h.size + int(start[1])]
+    return best
+
+
+def soft_labels(h: Hypotheses, gamma: float, slack: float) -> Float32[np.ndarray, "M C A"]:
+    """pi*_{tau,phi} as a label: uniform over the actions within ``slack`` of the best (eq. 5).
+
+    Without slack the model would be asked to learn tie-breaks that cost nothing.
+    """
+    q = q_values(h, gamma)
+    good = q >= q.max(axis=2, keepdims=True) - slack
+    result: np.ndarray = (good / good.sum(axis=2, keepdims=True)).astype(np.float32)
+    return result
+
+
+def heuristic_labels(h: Hypotheses) -> Float32[np.ndarray, "M C A"]:
+    """The paper's rule (appendix C.1): first align y with the goal, then x, then stay."""
+    here = cells(h.size)[None, :, :]
+    away = np.sign(here[0][h.goal][:, None, :] - here)
+    move = np.where(away[..., 1:] != 0, away * [0, 1], away * [1, 0])
+    match = (move[:, :, None, :] == MOVES[None, None]).all(axis=3)
+    result: np.ndarray = match.astype(np.float32)
+    return result
+
+
+def cell_numbers(observations: Float[np.ndarray, "*B 2"], size: int) -> Int[np.ndarray, "*B"]:
+    """Number of the cell of each observation."""
+    xy = np.rint(observations).astype(np.int64)
+    result: np.ndarray = xy[..., 0] * size + xy[..., 1]
+    return result
+
+
+def log_likelihood(
+    h: Hypotheses,
+    cell: Int[np.ndarray, " T"],
+    action: Int[np.ndarray, " T"],
+    reward: Float[np.ndarray, " T"],
+    arrived: Int[np.ndarray, " T"],
+) -> Float64[np.ndarray, "T M"]:
+    """log P(s', r | s, a, tau, phi) of each transition under each hypothesis, both factors.
+
+    -inf where a hypothesis is refuted.  The agent's own choice of a is left out: it is the
+    same under every hypothesis (Assumption E.1).  Every transition may have hypotheses of its
+    own, ``h.p (T, M)``.
+    """
+    reached = next_cell(h.size)[cell] == arrived[:, None]
+    overridden = (h.q @ reached[:, :, None].astype(np.float64))[..., 0]
+    chance = (1 - h.p) * reached[np.arange(len(cell)), action][:, None] + h.p * overridden
+    consistent = (arrived[:, None] == h.goal) == (reward[:, None] > 0.5)
+    with np.errstate(divide="ignore"):
+        result: np.ndarray = np.log(chance * consistent)
+    return result
+
+
+def trajectory_log_likelihood(h: Hypotheses, trajectory: Trajectory) -> Float64[np.ndarray, " M"]:
+    """log P(xi | tau, phi) of a whole trajectory, up to the agent's own choices."""
+    cell = cell_numbers(trajectory.observations, h.size)
+    steps = log_likelihood(h, cell[:-1], trajectory.actions.astype(np.int64), trajectory.rewards, cell[1:])
+    total: np.ndarray = steps.sum(axis=0)
+    return total
+
+
+def posterior(log_prior: Float64[np.ndarray, " M"], loglik: Float64[np.ndarray, "*B M"]) -> Float64[np.ndarray, "*B M"]:
+    """P(tau, phi | D).  Raises ValueError if D refutes every hypothesis."""
+    logits = log_prior + loglik
+    top = logits.max(axis=-1, keepdims=True)
+    if not np.isfinite(top).all():
+        raise ValueError("the context has probability 0 under every hypothesis: is the room or the adversary set wrong?")
+    weight = np.exp(logits - top)
+    result: np.ndarray = weight / weight.sum(axis=-1, keepdims=True)
+    return result
+
+
+def posterior_action(
+    belief: Float64[np.ndarray, "B M"],
+    labels: Float32[np.ndarray, "M C A"],
+    cell: Int[np.ndarray, " B"],
+) -> Float64[np.ndarray, "B A"]:
+    """P(a* | s_query, D): what a perfectly pretrained T_theta would output (Theorem E.3)."""
+    return np.einsum("bm,mba->ba", belief, labels[:, cell].astype(np.float64))

@@ -1,0 +1,93 @@
+"""Stick figures of DeepMind Control, from what is observed: MuJoCo's kinematics place the limbs."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Float32
+
+from icrl_dist.problems.dmc.domains import problem
+from icrl_dist.problems.dmc.simulation import suite_environment
+
+_CAPSULE, _BOX, _ELLIPSOID = (getattr(mujoco.mjtGeom, f"mjGEOM_{kind}").value for kind in ("CAPSULE", "BOX", "ELLIPSOID"))
+_TARGET_ARM = 0.03
+"""Half the width of the cross that stands for reacher's target, in metres."""
+
+
+def sticks(kind: str, states: Float32[np.ndarray, "F S"]) -> list[list[list[float]]]:
+    """F frames of a problem's observations, each a list of segments ``[x0, y0, x1, y1]`` in metres.
+
+    From the side; reacher and quadruped from above.  Where the body stands is not observed: the
+    figure stays where it is.
+    """
+    figure = _figure(kind)
+    return [figure.frame(state) for state in states.astype(np.float64)]
+
+
+def step_s(kind: str) -> float:
+    """Simulated seconds between two steps of a problem."""
+    return _figure(kind).step_s
+
+
+@functools.lru_cache(maxsize=16)
+def _figure(kind: str) -> Figure:
+    return Figure(kind)
+
+
+class Figure:
+    """One problem's limbs."""
+
+    def __init__(self, kind: str) -> None:
+        self._env: Any = suite_environment(kind)  # it owns the model
+        self._model, self._domain = self._env.physics.model.ptr, problem(kind).domain
+        self._data = mujoco.MjData(self._model)
+        self.step_s: float = self._env.control_timestep()
+        moving = self._model.geom_bodyid > 0
+        limbs = np.isin(self._model.geom_type, (_CAPSULE, _BOX, _ELLIPSOID)) & moving
+        self._geoms = np.flatnonzero(limbs)
+        capsule = self._model.geom_type[self._geoms] == _CAPSULE
+        self._half = np.where(capsule, self._model.geom_size[self._geoms, 1], self._model.geom_size[self._geoms, 0])
+        self._along = np.where(capsule, 2, 0)  # a capsule lies along its own z
+        self._view = [0, 1] if self._domain in ("reacher", "quadruped") else [0, 2]
+
+    def frame(self, state: Float[np.ndarray, " S"]) -> list[list[float]]:
+        """The segments of one observation."""
+        data = self._data
+        data.qpos[:] = self._positions(state)
+        mujoco.mj_kinematics(self._model, data)
+        middle = data.geom_xpos[self._geoms]
+        axes = data.geom_xmat[self._geoms].reshape(-1, 3, 3)[np.arange(len(self._geoms)), :, self._along]
+        reach = axes * self._half[:, None]
+        ends = np.concatenate([(middle - reach)[:, self._view], (middle + reach)[:, self._view]], axis=1)
+        if self._domain == "reacher":
+            ends = np.concatenate([ends, self._target(state)])
+        rounded: list[list[float]] = ends.round(3).tolist()
+        return rounded
+
+    def _positions(self, state: Float[np.ndarray, " S"]) -> Float[np.ndarray, " Q"]:
+        """qpos, of what the observation says; what it leaves out stays as the model has it."""
+        qpos = self._model.qpos0.copy()
+        if self._domain == "cartpole":
+            qpos[:] = state[0], np.arctan2(state[2], state[1])
+        elif self._domain == "reacher":
+            qpos[:] = state[:2]
+        elif self._domain in ("cheetah", "hopper"):
+            qpos[1:] = state[: len(qpos) - 1]
+        elif self._domain == "walker":
+            qpos[0] = state[14] - self._model.body("torso").pos[2]
+            absolute = np.arctan2(state[1:14:2], state[0:14:2])
+            qpos[2] = absolute[0]
+            parents = self._model.body_parentid[2:] - 1
+            qpos[3:] = absolute[parents] - absolute[1:]  # these joints turn about -y
+        else:
+            hinges = self._model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE.value
+            qpos[self._model.jnt_qposadr[hinges]] = state[: hinges.sum()]
+        return qpos
+
+    def _target(self, state: Float[np.ndarray, " S"]) -> Float[np.ndarray, "2 4"]:
+        """A cross where reacher's finger has to go."""
+        x, y = self._data.geom_xpos[self._model.geom("finger").id][:2] + state[2:4]
+        return np.array([[x - _TARGET_ARM, y, x + _TARGET_ARM, y], [x, y - _TARGET_ARM, x, y + _TARGET_ARM]])

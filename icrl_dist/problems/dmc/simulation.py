@@ -1,0 +1,165 @@
+"""The DeepMind Control Suite as two-player games: the agent acts, an adversary pushes (appendix C.3).
+
+Episodes begin as dm_control begins them.  A step is MuJoCo's own, ended as dm_control ends it, so
+that what is observed belongs to the state; observations and rewards are computed for the whole
+batch at once (``envs.suite``).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from icrl_dist.problems.continuous.network_adversary import Networks
+from icrl_dist.problems.dmc.domains import AXES, HORIZON, Preset, check, problem, spec
+from icrl_dist.problems.dmc.suite import BROKEN, DOMAINS, Rows, check_step, drawn, observed
+from icrl_dist.types import Step, Task, Variation
+
+
+def suite_environment(kind: str) -> Any:
+    """dm_control's own environment of this problem, with the suite's parameters."""
+    os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control looks for a display
+    from dm_control import suite
+
+    one = problem(kind)
+    return suite.load(one.domain, one.task, task_kwargs={"random": np.random.RandomState(0)})
+
+
+class DMC:
+    """B simulations of one problem, each of its own task: agent and adversary act together."""
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        """Raises ValueError for unlike problems, and for a parameter outside its grid."""
+        shapes = {(one.kind, one.get("horizon", HORIZON), one.get("forces", "paper")) for one in tasks}
+        if len(shapes) != 1:
+            raise ValueError(f"dmc: one batch holds one problem, horizon and preset of forces, not {sorted(map(str, shapes))}")
+        for one in tasks:
+            check(one)
+        self.spec, self.batch = spec(tasks[0]), len(tasks)
+        self._problem = problem(tasks[0].kind)
+        preset: Preset = "qarl" if tasks[0].get("forces", "paper") == "qarl" else "paper"
+        self._forces = self._problem.forces[preset]
+        self.disturbance = self._forces.count
+        """Components of an adversary's action."""
+        self._envs = [suite_environment(one.kind) for one in tasks]
+        for env, one in zip(self._envs, tasks, strict=True):
+            _vary(env.physics, one)
+        self._models = [env.physics.model.ptr for env in self._envs]
+        self._data = [env.physics.data.ptr for env in self._envs]
+        self._rows = Rows(self._models, self._data)
+        self._reward = DOMAINS[self._problem.domain].rewards[self._problem.task]
+        views = ([data.ctrl for data in self._data], [data.xfrc_applied for data in self._data])
+        self._each = list(zip(self._models, self._data, *views, strict=True))
+        self._wrenches = np.zeros((self.batch, *views[1][0].shape))
+        pushed = [(self._rows.body(body), AXES.index(axis)) for body, axes in self._forces.components for axis in axes]
+        self._bodies, self._axes = (np.array(places) for places in zip(*pushed, strict=True))
+        self._warnings = [data.warning.number for data in self._data]
+        self._substeps = round(self._envs[0].control_timestep() / self._models[0].opt.timestep)
+        self._whole = self._models[0].opt.integrator == mujoco.mjtIntegrator.mjINT_RK4.value
+        self._low, self._high = (np.array(bound, np.float32) for bound in (self.spec.low, self.spec.high))
+        self._h = self.spec.horizon
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
+        """Start an episode in every row, from that row's generator, as dm_control does."""
+        if len(rngs) != self.batch:
+            raise ValueError(f"dmc: {len(rngs)} generators for {self.batch} rows")
+        for env, rng in zip(self._envs, rngs, strict=True):
+            env.task.random.seed(int(rng.integers(2**32)))
+            with env.physics.reset_context():
+                env.task.initialize_episode(env.physics)
+        self._h = 0
+        self._diverged = np.zeros(self.batch, bool)
+        self._shown = self._observe()
+        return self._shown
+
+    def step(self, actions: Float32[np.ndarray, "B A"], pushes: Float32[np.ndarray, "B F"]) -> Step:
+        """Act in every row; ``pushes`` of 1 are the largest force of the preset.
+
+        A simulation that diverges stands still, without reward, to the episode's end, and is
+        ``diverged`` from then on.  Raises ValueError for actions outside [-1, 1], RuntimeError
+        past the horizon or before a reset.
+        """
+        check_step("dmc", self.spec, self.batch, self._h, actions)
+        self._wrenches[:, self._bodies, self._axes] = pushes * self._forces.largest
+        each = zip(self._each, actions, self._wrenches, self._diverged.tolist(), strict=True)
+        for (model, data, control, push), action, wrench, diverged in each:
+            if not diverged:
+                control[:] = action
+                push[:] = wrench
+                self._advance(model, data)
+        self._h += 1
+        self._diverged |= np.stack(self._warnings)[:, BROKEN].any(axis=1)
+        reward = np.where(self._diverged, 0.0, self._reward(self._rows)).astype(np.float32)
+        self._shown = np.where(self._diverged[:, None], self._shown, self._observe())
+        return Step(self._shown, reward, self._h == self.spec.horizon, pushes, self._diverged.copy())
+
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
+        return drawn(lambda: self._envs[row].physics.render(240, 320, camera_id=0))
+
+    def _advance(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """As dm_control steps: what depends on position and velocity is up to date before and after."""
+        if self._whole:
+            mujoco.mj_step(model, data, self._substeps)
+        else:
+            mujoco.mj_step2(model, data)
+            if self._substeps > 1:
+                mujoco.mj_step(model, data, self._substeps - 1)
+        mujoco.mj_step1(model, data)
+
+    def _observe(self) -> Float32[np.ndarray, "B S"]:
+        return np.clip(observed(self._rows, self._problem.domain).astype(np.float32), self._low, self._high)
+
+
+def _vary(physics: Any, task: Task) -> None:
+    """Set the task's masses and friction on the live model.
+
+    A mass takes its body's inertia along, and what MuJoCo derives from it; with ``mass = "qarl"``
+    neither, as in QARL's code.
+    """
+    model, data = physics.model.ptr, physics.data.ptr
+    for parameter in problem(task.kind).parameters:
+        if parameter.name not in dict(task.params):
+            continue
+        value = task.number(parameter.name)
+        if parameter.body is None:
+            model.geom_friction[:, 0] = value
+            continue
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, parameter.body)
+        if task.get("mass", "rescaled") == "rescaled":
+            model.body_inertia[body] *= value / model.body_mass[body]
+        model.body_mass[body] = value
+    if task.get("mass", "rescaled") == "rescaled":
+        mujoco.mj_setConst(model, data)
+
+
+class Variations:
+    """B variation environments: the game closed with every row's fixed adversary."""
+
+    def __init__(self, variations: Sequence[Variation]) -> None:
+        self.game = DMC([v.task for v in variations])
+        self.spec, self.batch = self.game.spec, self.game.batch
+        self._adversaries = Networks([v.adversary for v in variations], self.spec, self.game.disturbance)
+        self._seen: Float32[np.ndarray, "B S"] | None = None
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
+        """Start an episode in every row."""
+        self._seen = self.game.reset(rngs)
+        return self._seen
+
+    def step(self, actions: Float32[np.ndarray, "B A"]) -> Step:
+        """Act in every row, against what the adversary makes of the same observation.  Raises as ``DMC.step`` does."""
+        if self._seen is None:
+            raise RuntimeError("dmc: call reset before the first step")
+        step = self.game.step(actions, self._adversaries.act(self._seen))
+        self._seen = step.observation
+        return step
+
+    def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
+        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
+        return self.game.image(row)

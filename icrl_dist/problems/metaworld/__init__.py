@@ -1,0 +1,1 @@
+"""Meta-World's ML1 pick-place (appendix C.2)."""

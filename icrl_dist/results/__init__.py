@@ -1,0 +1,1 @@
+"""Evaluation on held-out tasks: returns, statistics, figures and tables."""

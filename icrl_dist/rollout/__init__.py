@@ -1,0 +1,1 @@
+"""Deploy a policy in a batch of environments (Algorithm 1)."""

@@ -1,0 +1,1 @@
+"""The run folder on disk: segments, index, dataset, checkpoints, forks."""

@@ -1,0 +1,281 @@
+"""A segment of the dataset: checked frames in a row, self-contained, as small as its arrays.
+
+A frame is ``magic, length, checksum of the payload, checksum of these`` and a payload:
+
+- a *name*: ``[number, value]``, a variation or a text that the trajectories after it refer to;
+- a *trajectory*: small integers (identity, numbers of names, shapes), then its arrays' bytes;
+- a *seal*: SHA-256 of all before it; nothing follows it.
+
+The header's own checksum lets a reader find the next whole frame behind a damaged one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import mmap
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgpack
+import numpy as np
+
+from icrl_dist.stream import validation, wire
+from icrl_dist.types import ARRAYS, STAGES, VECTORS, Identity, Trajectory, Variation
+
+_HEADER = struct.Struct("<4sIII")
+_HEAD, _CHECKSUM = struct.Struct("<4sII"), struct.Struct("<I")
+_PREFIX = b"icr"
+NAME, TRAJECTORY, SEAL = b"icrN", b"icrT", b"icrS"
+HEADER_BYTES = _HEADER.size
+SEAL_BYTES = HEADER_BYTES + 32
+_NUMBERS = 15
+_DTYPES, _VECTOR_DTYPES = ({name: np.dtype(dtype) for name, (dtype, _) in kinds.items()} for kinds in (ARRAYS, VECTORS))
+
+
+def frame(magic: bytes, payload: bytes) -> bytes:
+    """One frame."""
+    head = _HEAD.pack(magic, len(payload), zlib.crc32(payload))
+    return head + _CHECKSUM.pack(zlib.crc32(head)) + payload
+
+
+class MissingName(ValueError):  # noqa: N818
+    """A frame refers to a name whose own frame was damaged."""
+
+
+@dataclass
+class Names:
+    """The names of one segment: each is written once and referred to by its number."""
+
+    values: dict[int, Variation | str] = field(default_factory=dict)
+    _numbers: dict[bytes | str, int] = field(default_factory=dict)
+    _next: int = 0
+
+    def number(self, value: Variation | str) -> tuple[int, bytes]:
+        """The value's number, and the frame that must be written first if it is new."""
+        # Packed, a variation is told from one that Python holds equal: 0 from 0.0.
+        key = value if isinstance(value, str) else msgpack.packb(wire.from_variation(value))
+        known = self._numbers.get(key)
+        if known is not None:
+            return known, b""
+        number = self._next
+        self._set(number, value, key)
+        return number, frame(NAME, msgpack.packb(number) + (msgpack.packb(key) if isinstance(key, str) else key))
+
+    def read(self, payload: bytes) -> None:
+        """Take up a name frame.  Raises ValueError for a payload that is none."""
+        reader = _reader(payload[:16])
+        number = validation.integer(_next(reader), "name", 0)
+        packed = payload[reader.tell() :]
+        plain = validation.parse(packed)
+        value = plain if isinstance(plain, str) else wire.to_variation(plain)
+        self._set(number, value, value if isinstance(value, str) else packed)
+
+    def _set(self, number: int, value: Variation | str, key: bytes | str) -> None:
+        self.values[number], self._numbers[key] = value, number
+        self._next = max(self._next, number + 1)
+
+    def variation(self, number: int) -> Variation:
+        """Raises MissingName if there is none of this number."""
+        found = self.values.get(number)
+        if not isinstance(found, Variation):
+            raise MissingName(f"variation {number} of this segment is missing")
+        return found
+
+    def text(self, number: int) -> str:
+        """Raises MissingName if there is none of this number."""
+        found = self.values.get(number)
+        if not isinstance(found, str):
+            raise MissingName(f"text {number} of this segment is missing")
+        return found
+
+
+def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
+    """Frames to write: of names that are new in this segment, and of the trajectory."""
+    t, fresh, numbers = trajectory, [], []
+    for value in (t.variation, t.digest, t.worker, t.origin):
+        number, new = names.number(value)
+        numbers.append(number)
+        fresh.append(new)
+    shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.taken))
+    disturbance = () if t.adversary.ndim == 1 else (t.adversary.shape[1],)
+    head = msgpack.packb([*t.identity.key(), t.weights, *numbers, *shape, *disturbance])
+    return b"".join(fresh), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
+
+
+def decode(payload: bytes, names: Names) -> Trajectory:
+    """The trajectory in a frame's payload; its arrays are views of it.
+
+    Raises ValueError for a payload that is none, MissingName if it refers to a name that is lost.
+    """
+    reader = _reader(payload[:256])
+    numbers = [validation.integer(n, "frame", -1) for n in validation.as_list(_next(reader), "frame")]
+    vectors = len(numbers) == _NUMBERS + 1  # the last is their adversary's components
+    if len(numbers) != _NUMBERS and not vectors:
+        raise ValueError(f"a trajectory frame of {len(numbers)} numbers")
+    disturbance = numbers.pop() if vectors else 0
+    stage, round_, task, variation, trial, weights, phi, digest, worker, origin, *sizes = numbers
+    steps, components, queries, actions, taken = sizes
+    if min(numbers[:5] + numbers[6:] + [disturbance]) < 0 or max(*numbers, disturbance) >= 1 << 31 or stage >= len(STAGES):
+        raise ValueError(f"a trajectory frame of {numbers}")
+    width = (actions,) if vectors else ()
+    shapes = {
+        "observations": (steps + 1, components),
+        "actions": (steps, *width),
+        "rewards": (steps,),
+        "adversary": (steps, disturbance) if vectors else (steps,),
+        "queries": (queries, components),
+        "labels": (queries, actions),
+        "taken": (taken, *width),
+        "gained": (taken,),
+    }
+    arrays, at, dtypes = {}, reader.tell(), _VECTOR_DTYPES if vectors else _DTYPES
+    if len(payload) - at != sum(prod(shape) * dtypes[name].itemsize for name, shape in shapes.items()):
+        raise ValueError(f"a trajectory frame of {len(payload)} bytes that claims the shapes {shapes}")
+    for name, dtype in dtypes.items():
+        count = prod(shapes[name])
+        arrays[name] = np.frombuffer(payload, dtype, count, at).reshape(shapes[name])
+        at += count * dtype.itemsize
+    return Trajectory(
+        identity=Identity(STAGES[stage], round_, task, variation, trial),
+        variation=names.variation(phi),
+        weights=weights,
+        digest=names.text(digest),
+        worker=names.text(worker),
+        origin=names.text(origin),
+        **arrays,
+    )
+
+
+def _reader(payload: bytes) -> msgpack.Unpacker:
+    """A reader of whole numbers, and of lists as short as ours; the limits keep a list's claims from filling the memory."""
+    reader = msgpack.Unpacker(
+        max_buffer_size=max(1, len(payload)),
+        max_array_len=_NUMBERS + 1,
+        max_map_len=0,
+        max_str_len=0,
+        max_bin_len=0,
+        max_ext_len=0,
+        ext_hook=validation.no_extension,
+    )
+    reader.feed(payload)
+    return reader
+
+
+def _next(reader: msgpack.Unpacker) -> Any:
+    try:
+        return reader.unpack()
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise ValueError(f"not msgpack: {type(error).__name__}: {error}") from None
+
+
+def seal(sha256: bytes) -> bytes:
+    """The frame that ends a segment, given the hash of all before it."""
+    return frame(SEAL, sha256)
+
+
+def payload(whole: bytes) -> bytes | None:
+    """The payload of one frame; None if it is damaged."""
+    if not _is_header(whole, 0):
+        return None
+    found, checksum = whole[HEADER_BYTES:], _HEADER.unpack_from(whole)[2]
+    return found if zlib.crc32(found) == checksum else None
+
+
+@dataclass
+class Scan:
+    """What is in a segment file."""
+
+    names: Names = field(default_factory=Names)
+    frames: list[tuple[int, int]] = field(default_factory=list)
+    """Offset and length of each trajectory's payload."""
+    damaged: list[tuple[int, int]] = field(default_factory=list)
+    """First byte, and the one after the last, of each damaged range."""
+    sealed: str = ""
+    """SHA-256 that the seal names; empty for a segment that is not sealed."""
+    size: int = 0
+
+    @property
+    def whole(self) -> list[tuple[int, int]]:
+        """First byte, and the one after the last, of each range between the damaged ones, without the seal."""
+        cuts = [(0, 0), *self.damaged, (self.size - SEAL_BYTES if self.sealed else self.size, self.size)]
+        spans = ((before[1], after[0]) for before, after in itertools.pairwise(cuts))
+        return [span for span in spans if span[0] < span[1]]
+
+    def without(self, frames: Sequence[tuple[int, int]]) -> Scan:
+        """The same with these frames counted as damaged."""
+        out = [(offset - HEADER_BYTES, offset + length) for offset, length in frames]
+        return replace(self, damaged=sorted([*self.damaged, *out]))
+
+
+def scan(path: Path) -> Scan:
+    """Read and check a whole segment.  Raises ValueError for frames that are whole but not ours."""
+    found = Scan(size=path.stat().st_size)
+    if not found.size:
+        return found
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        offset = 0
+        while offset < found.size:
+            end, checksum = _end(data, offset)
+            if checksum is None or end > found.size or zlib.crc32(data[offset + HEADER_BYTES : end]) != checksum:
+                _damage(found, offset, min(end, found.size))
+            else:
+                _take(data, offset, end, found)
+            offset = end
+    return found
+
+
+def _damage(found: Scan, start: int, end: int) -> None:
+    if found.damaged and found.damaged[-1][1] == start:
+        start = found.damaged.pop()[0]
+    found.damaged.append((start, end))
+
+
+def _take(data: mmap.mmap, offset: int, end: int, found: Scan) -> None:
+    magic, start = data[offset : offset + 4], offset + HEADER_BYTES
+    if found.sealed:
+        raise ValueError(f"a frame after the seal at byte {offset}")
+    if magic == NAME:
+        found.names.read(data[start:end])
+    elif magic == SEAL:
+        if end - offset != SEAL_BYTES:
+            raise ValueError(f"a seal of {end - offset} bytes at byte {offset}")
+        found.sealed = data[start:end].hex()
+    else:
+        found.frames.append((start, end - start))
+
+
+def _end(data: mmap.mmap, offset: int) -> tuple[int, int | None]:
+    """Where the frame at ``offset`` ends, and its payload's checksum; where no frame begins, where the next one does."""
+    if _is_header(data, offset):
+        _, length, checksum, _ = _HEADER.unpack_from(data, offset)
+        return offset + HEADER_BYTES + length, checksum
+    following = data.find(_PREFIX, offset + 1)
+    while following >= 0 and not _is_header(data, following):
+        following = data.find(_PREFIX, following + 1)
+    return (following if following >= 0 else len(data)), None
+
+
+def _is_header(data: mmap.mmap | bytes, offset: int) -> bool:
+    head = data[offset : offset + HEADER_BYTES]
+    return (
+        len(head) == HEADER_BYTES and head[:4] in (NAME, TRAJECTORY, SEAL) and zlib.crc32(head[:12]) == _HEADER.unpack(head)[3]
+    )
+
+
+def copy(source: Path, spans: Sequence[tuple[int, int]], target: BinaryIO, sealed: bool) -> None:
+    """Write these ranges of a segment as a segment, with a seal of its own if ``sealed``."""
+    digest = hashlib.sha256()
+    with source.open("rb") as file:
+        for start, end in spans:
+            file.seek(start)
+            part = file.read(end - start)
+            digest.update(part)
+            target.write(part)
+    if sealed:
+        target.write(seal(digest.digest()))

@@ -1,0 +1,73 @@
+"""Sharing another run's data: the same files under a second name, held against its hashes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+from icrl_dist.storage import segment
+from icrl_dist.storage.files import StoreError, atomic_write
+from icrl_dist.types import Identity
+
+
+def adopt(theirs: Path, folder: Path, keep: Callable[[Identity], bool]) -> int:
+    """Share the trajectories of another dataset that ``keep`` accepts; returns the bytes shared.
+
+    A sealed segment of nothing else is linked, where the file system can; others are written anew
+    without the rest.  Raises StoreError for a damaged segment.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    shared = 0
+    for source in sorted(theirs.glob("segment-*.frames")):
+        target, found = folder / source.name, _checked(source)
+        unwanted = _unwanted(source, found, keep)
+        if len(unwanted) == len(found.frames):
+            continue
+        if found.sealed and not unwanted:
+            _link(source, target)
+            shared += found.size
+        else:
+            _write(target, source, found.without(unwanted))
+    return shared
+
+
+def _checked(path: Path) -> segment.Scan:
+    remedy = "`icrl-dist train --resume` that run first, which mends its dataset"
+    try:
+        found = segment.scan(path)
+        whole = path.read_bytes()[: max(0, found.size - segment.SEAL_BYTES)]
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be shared ({error}); {remedy}") from None
+    if found.damaged or (found.sealed and hashlib.sha256(whole).hexdigest() != found.sealed):
+        raise StoreError(f"{path}: damaged, so it cannot be shared; {remedy}")
+    return found
+
+
+def _unwanted(path: Path, found: segment.Scan, keep: Callable[[Identity], bool]) -> list[tuple[int, int]]:
+    unwanted = []
+    with path.open("rb") as file:
+        for offset, length in found.frames:
+            file.seek(offset)
+            if not keep(segment.decode(file.read(length), found.names).identity):
+                unwanted.append((offset, length))
+    return unwanted
+
+
+def _write(target: Path, source: Path, found: segment.Scan) -> None:
+    atomic_write(target, lambda file: segment.copy(source, found.whole, file, sealed=True))
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without links
+
+        def copy(file: BinaryIO) -> None:
+            with source.open("rb") as theirs:
+                shutil.copyfileobj(theirs, file)
+
+        atomic_write(target, copy)

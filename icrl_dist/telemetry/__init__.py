@@ -1,0 +1,1 @@
+"""Metrics, alerts, crash reports, and the processes of a run."""

@@ -1,0 +1,1 @@
+"""Training batches, the fit, and its optimizers."""

@@ -1,0 +1,80 @@
+"""What a run still needs: its phases, the jobs of each, and what the store holds of them."""
+
+from __future__ import annotations
+
+from icrl_dist.config.run import Run
+from icrl_dist.methods.recipes import METHODS, Phase
+from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.fork import Lineage
+from icrl_dist.types import Identity, Job
+
+
+class Plan:
+    """A method's phases against a dataset."""
+
+    def __init__(self, run: Run, lineage: Lineage, store: Store, given_up: dict[str, str]) -> None:
+        self.method = METHODS[run.method]
+        self.phases = self.method.phases(run)
+        self.given_up = given_up
+        """Variations that are quarantined, ``adapt/0/3/1``, and why."""
+        self._staleness, self._lineage, self._store = run.stream.staleness, lineage, store
+        self._whole: set[Phase] = set()
+
+    def ask(self, phase: Phase) -> tuple[Job, ...]:
+        """The phase's jobs, with the numbers that it was first asked for with."""
+        return self.method.ask(self._lineage.run_of(phase.produces), phase)
+
+    def next(self, version: int) -> Phase | None:
+        """The first phase that is not fitted, or whose data is not whole, given the newest version."""
+        return next((phase for phase in self.phases if phase.produces > version or not self.whole(phase)), None)
+
+    def look_again(self) -> None:
+        """Look at every phase's data once more, for some may have been lost."""
+        self._whole.clear()
+
+    def whole(self, phase: Phase) -> bool:
+        """Whether nothing of the phase is missing."""
+        if phase not in self._whole and self._count(phase):
+            self._whole.add(phase)
+        return phase in self._whole
+
+    def _count(self, phase: Phase) -> bool:
+        expected = sum(job.trials * sum(_name(job, *row) not in self.given_up for row in job.rows()) for job in self.ask(phase))
+        return self._store.ledger.count(phase.stage, phase.round) >= expected
+
+    def incomplete(self, phase: Phase) -> list[Job]:
+        """The phase's jobs of which something is missing."""
+        return [job for job in self.ask(phase) if len(self.have(job)) < job.trials * len(job.variations)]
+
+    def ahead(self, phase: Phase, version: int) -> list[Phase]:
+        """The phases after this one whose work may go out already: ``stream.staleness``."""
+        newest = version + self._staleness
+        return [p for p in self.phases if p.produces > max(version, phase.produces) and version >= 0 and p.acting <= newest]
+
+    def have(self, job: Job) -> list[Identity]:
+        """What need not be asked for: what is stored, and what was given up before."""
+        stored = self._store.ledger.identities(job.stage, job.round, (job.task, job.task + job.tasks))
+        given_up = {row for row in job.rows() if _name(job, *row) in self.given_up}
+        return stored + [i for i in job.identities() if (i.task, i.variation) in given_up]
+
+    def acting(self, job: Job, version: int) -> int:
+        """The version that acts in a job: its own, or the newest while rounds overlap.
+
+        One T^j acts in all trials of a job, so what is stored of it decides.
+        """
+        if job.weights < 0:
+            return job.weights
+        acted = self._store.ledger.acted(job.stage, job.round, (job.task, job.task + job.tasks))
+        return acted[0] if acted else min(version, job.weights)
+
+    def give_up(self, variations: dict[str, str]) -> None:
+        """Leave variations out from now on; some of their trials may be there, and which ones is chance."""
+        self.given_up.update(variations)
+        for name in self.given_up:
+            stage, *numbers = name.split("/")
+            round_, task, variation = map(int, numbers)
+            self._store.ledger.drop((stage, round_, task, variation))
+
+
+def _name(job: Job, task: int, variation: int) -> str:
+    return f"{job.stage}/{job.round}/{task}/{variation}"

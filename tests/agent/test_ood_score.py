@@ -1,0 +1,215 @@
+"""How unlike pretraining a context is: the readout and its calibration against slow loops, and an unseen disturbance."""
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist.agent import ood_score
+from icrl_dist.agent.in_context_agent import InContextAgent, calibrated, load_agent, model_of, outcomes_of, shipped
+from icrl_dist.agent.ood_score import Surprise
+from icrl_dist.cli import main
+from icrl_dist.config.run import ConfigError, parse
+from icrl_dist.methods.recipes import METHODS
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.models.outcome_readout import RARE, WINDOWS, OutcomeModel
+from icrl_dist.problems import registry, splits
+from icrl_dist.results import evaluate, heldout
+from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
+from icrl_dist.types import NULL, Spec
+
+B, D = 6, 4
+SPECS = (Spec((0.0, -1.0), (9.0, 1.0), 3, 5), Spec((0.0, -1.0), (9.0, 1.0), 2, 5, discrete=False))
+
+
+def decisions(spec, steps, seed, noise=0.1):
+    """Steps of B environments in which what comes depends on state and action, and on chance."""
+    rng = np.random.default_rng(seed)
+    law = np.random.default_rng(99).normal(size=(D, spec.actions, spec.observation + 1)) / D
+    made = []
+    for _ in range(steps):
+        state = rng.normal(size=(B, D)).astype(np.float32)
+        action = (
+            rng.integers(spec.actions, size=B) if spec.discrete else rng.uniform(-1, 1, (B, spec.actions)).astype(np.float32)
+        )
+        taken = np.eye(spec.actions)[action] if spec.discrete else action
+        comes = np.einsum("bd,ba,dao->bo", state, taken, law) + noise * rng.normal(size=(B, spec.observation + 1))
+        before = rng.uniform(0, 1, (B, spec.observation)).astype(np.float32)
+        after = before + comes[:, :-1].astype(np.float32) * np.array([4.5, 1.0], np.float32)
+        made.append((state, before, action, comes[:, -1].astype(np.float32), after))
+    return made
+
+
+def outcome_of(spec, one, row):
+    """What is to be predicted: in units of half the spec's range, and the reward."""
+    _, before, _, reward, after = one
+    change = [(after[row][i] - before[row][i]) / ((spec.high[i] - spec.low[i]) / 2) for i in range(spec.observation)]
+    return np.array([*change, reward[row]], np.float64)
+
+
+def features_of(spec, one, row):
+    state, action = [*one[0][row], 1.0], one[2][row]
+    taken = [*(float(a == action) for a in range(spec.actions)), 1.0] if spec.discrete else [*action, 1.0]
+    return np.array([s * t for s in state for t in taken], np.float64)
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=("discrete", "vectors"))
+def test_the_readout_is_ridge_regression_and_its_loss_a_gaussian_one(spec):
+    seen = decisions(spec, 40, seed=0)
+    model = OutcomeModel.fit(spec, iter(seen), decisions(spec, 40, seed=1))
+    x = np.stack([features_of(spec, one, row) for one in seen for row in range(B)])
+    y = np.stack([outcome_of(spec, one, row) for one in seen for row in range(B)])
+    pull = np.sqrt(1e-3 * np.mean(np.square(x)) * len(x)) * np.eye(x.shape[1])
+    slow = np.linalg.lstsq(np.concatenate([x, pull]), np.concatenate([y, np.zeros((x.shape[1], y.shape[1]))]), rcond=None)[0]
+    np.testing.assert_allclose(model.readout, slow, atol=2e-4)
+    left = np.sqrt(np.mean((y - x @ slow) ** 2, axis=0))
+    np.testing.assert_allclose(model.deviation, left, rtol=1e-3)
+    assert (left < 0.6 * y.std(axis=0)).all(), "nothing is predicted: this would prove little"
+    other = decisions(spec, 1, seed=2)[0]
+    for row, loss in enumerate(model.loss(spec, other)):
+        error = (outcome_of(spec, other, row) - features_of(spec, other, row) @ slow) / left
+        assert loss == pytest.approx(np.mean(0.5 * error**2), rel=1e-2)
+
+
+def test_surprise_is_0_at_the_median_and_1_at_the_rare_quantile_of_held_out_windows():
+    spec, steps = SPECS[0], 60
+    model = OutcomeModel.fit(spec, decisions(spec, 200, seed=0), apart := decisions(spec, steps, seed=1))
+    losses = np.stack([model.loss(spec, one) for one in apart], axis=1)
+    for number, length in enumerate(WINDOWS):
+        fits = max(w for w in WINDOWS if w <= min(length, steps))
+        means = [losses[row, end - fits : end].mean() for row in range(B) for end in range(fits, steps + 1)]
+        np.testing.assert_allclose(model.typical[number], np.quantile(means, 0.5), rtol=1e-5)
+        np.testing.assert_allclose(model.rare[number], np.quantile(means, RARE), rtol=1e-5)
+    for seen in range(1, steps + 1):
+        number = max(n for n, length in enumerate(WINDOWS) if length <= seen)
+        recent = losses[:, seen - WINDOWS[number] : seen].mean(axis=1)
+        expected = (recent - model.typical[number]) / (model.rare[number] - model.typical[number])
+        np.testing.assert_allclose(model.surprise(losses[:, :seen]), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_running_surprise_remembers_the_longest_window_and_no_more():
+    spec = SPECS[0]
+    model = OutcomeModel.fit(spec, decisions(spec, 200, seed=0), decisions(spec, 120, seed=1))
+    running = Surprise(model, spec, B)
+    np.testing.assert_array_equal(running.now(), np.zeros(B))
+    for one in decisions(spec, 30, seed=3, noise=3.0):
+        running.observe(*one)
+    assert running.now().min() > 3
+    calm = decisions(spec, WINDOWS[-1], seed=4)
+    for one in calm:
+        running.observe(*one)
+    np.testing.assert_allclose(running.now(), model.surprise(np.stack([model.loss(spec, one) for one in calm], axis=1)))
+    assert np.median(running.now()) < 1
+
+
+def test_what_never_changes_in_training_is_told_when_it_does():
+    spec = SPECS[0]
+    still = [(s, o, a, r * 0, o) for s, o, a, r, _ in decisions(spec, 50, seed=0)]
+    model = OutcomeModel.fit(spec, still, still)
+    state, before, action, reward, after = decisions(spec, 1, seed=1)[0]
+    assert np.isfinite(model.loss(spec, (state, before, action, reward, after))).all()
+    assert model.surprise(model.loss(spec, (state, before, action, reward, after))[:, None]).min() > 100
+
+
+@pytest.fixture
+def model(small_run):
+    torch.manual_seed(0)
+    return PretrainedTransformer(splits.spec(small_run), small_run.model).eval()
+
+
+def test_calibration_deploys_in_training_tasks_under_adversaries_never_met_and_repeats_itself(small_run, model):
+    heard = []
+    once, again = ood_score.calibrate(small_run, model, heard.append), ood_score.calibrate(small_run, model)
+    assert heard == list(range(1, 2 * ood_score.EPISODES + 1))
+    for name, array in once.arrays().items():
+        np.testing.assert_array_equal(array, again.arrays()[name])
+    rows = list(ood_score._rows(small_run))
+    assert {index for index, _ in rows} == set(range(len(splits.split(small_run).train)))
+    goals = {task["goal"] for task in splits.split(small_run).train}
+    assert {variation.task["goal"] for _, variation in rows} == goals
+    trained = {
+        v.adversary for i, task in enumerate(splits.split(small_run).train) for v in splits.variations(small_run, i, task)
+    }
+    assert {variation.adversary for _, variation in rows} & trained <= {NULL}
+
+
+def test_each_method_is_calibrated_under_the_disturbances_that_it_trains_on(small_run):
+    for name, method in METHODS.items():
+        met = {v.adversary.kind for v in method.variations(small_run, 0, splits.split(small_run).train[0], 5)}
+        assert met == ({"null"} if name == "dpt" else {"null", "dirichlet"})
+
+
+class Mirrored:
+    """Controls that nobody trained on: +x goes -x, and back, +y goes +x, and so on."""
+
+    def __init__(self, inner):
+        self.spec, self.batch, self.reset, self._inner = inner.spec, inner.batch, inner.reset, inner
+
+    def step(self, actions):
+        return self._inner.step(np.array([3, 2, 0, 1, 4])[actions])
+
+
+def deployed(agent, env, episodes=2):
+    """Surprise after each episode."""
+    agent.reset_context(env.batch)
+    found = []
+    for number in range(episodes):
+        obs = env.reset([np.random.default_rng((number, row)) for row in range(env.batch)])
+        for _ in range(env.spec.horizon):
+            action = agent.act(obs)
+            step = env.step(action)
+            agent.observe(obs, action, step.reward, step.observation, np.full(env.batch, step.done))
+            obs = step.observation
+        found.append(agent.surprise)
+    return np.stack(found)
+
+
+def test_surprise_rises_on_an_unseen_kind_of_disturbance_and_not_on_unseen_goals():
+    """The shipped agent on goals that neither it nor its calibration ever met."""
+    agent = load_agent("darkroom", seed=0)
+    run = parse(load_checkpoint(shipped("darkroom")).manifest["run"], "shipped")
+    np.testing.assert_array_equal(agent.surprise, [0.0])
+    usual = deployed(agent, registry.batch(evaluate.variations(run, 0.1)))
+    strange = deployed(agent, Mirrored(registry.batch(evaluate.variations(run, 0.1))))
+    stronger = deployed(agent, registry.batch(evaluate.variations(run, 0.6)))
+    assert usual.shape == (2, 20) and np.mean(usual > 1) <= 0.1
+    assert np.mean(strange > 1) >= 0.95 and np.median(strange) > 2
+    assert np.median(usual) < 0.5 < 1 < np.median(stronger) < np.median(strange) + 3
+    agent.reset_context(2)
+    np.testing.assert_array_equal(agent.surprise, [0.0, 0.0])
+
+
+def test_only_what_the_agent_was_asked_for_counts(small_run, model):
+    agent = InContextAgent(model, {}, small_run.context, 0, outcomes=ood_score.calibrate(small_run, model))
+    obs = np.zeros((1, 2), np.float32)
+    agent.observe(obs, [0], [1.0], obs, [False])
+    np.testing.assert_array_equal(agent.surprise, [0.0])
+    agent.observe(obs, agent.act(obs), [1.0], obs, [False])
+    first = agent.surprise
+    assert first != 0.0
+    agent.observe(obs, [0], [1.0], obs, [False])
+    np.testing.assert_array_equal(agent.surprise, first)
+
+
+def test_an_agent_that_was_not_calibrated_says_so_and_export_calibrates_it(small_run, model, tmp_path):
+    from learner import checkpoints
+
+    file = tmp_path / "version-0000.npz"
+    spec = splits.spec(small_run)
+    arrays = {f"model/{name}": value.numpy() for name, value in model.state_dict().items()}
+    save_checkpoint(file, Checkpoint(arrays, checkpoints.manifest(small_run, spec, 0, 1)))
+    with pytest.raises(ConfigError, match=r"not calibrated.*icrl-dist export"):
+        _ = load_agent(file).surprise
+    assert main.main(["export", str(file), "--out", str(tmp_path / "agent.npz")]) == 0
+    exported = load_checkpoint(tmp_path / "agent.npz")
+    assert load_agent(tmp_path / "agent.npz").surprise.shape == (1,)
+    assert calibrated(exported) is exported
+    expected = ood_score.calibrate(small_run, model_of(exported)[0]).arrays()
+    for name, array in exported.part("outcomes").items():
+        np.testing.assert_array_equal(array, expected[name])
+    broken = Checkpoint({**exported.arrays, "outcomes/more": np.zeros(1)}, exported.manifest)
+    with pytest.raises(StoreError, match="not calibrated by this version"):
+        outcomes_of(broken)
+
+
+def test_a_spread_tells_the_median_and_the_share_above_1():
+    assert heldout._spread(np.array([0.0, 0.5, 1.5, 3.0])) == {"median": 1.0, "above_1": 0.5}

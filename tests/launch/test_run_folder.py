@@ -1,0 +1,264 @@
+"""Run folders: the user's files are never removed, and a run that is replaced comes back unless its successor stands."""
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from icrl_dist.config.run import ConfigError
+from icrl_dist.launch import run_folder, train
+from icrl_dist.storage.files import hold
+
+OURS = (
+    *("run.toml", "env.json", "fork.json", "result.json", "metrics.jsonl", "agent.npz", "learner.log", "learner.err"),
+    *("endpoint", ".lock", ".run.toml.123.part", "dataset/segment-000000.frames", "dataset/.segment-000001.frames.9.part"),
+    *("checkpoints/version-0000.npz", "checkpoints/partial.npz", "checkpoints/.version-0001.npz.7.part"),
+    *("crashes/w0-1.json", "crashes/w0.stacks", "tensorboard/events.out.tfevents.1.host.2.0"),
+    *("report/online-T2-0a1b2c3d-paper-unseen-p0_0.2-3episodes-2seeds.json", "report/adaptation.png", "report/online.json"),
+)
+"""A file of every kind that this program writes into a run folder."""
+FOREIGN = (
+    *("notes.md", ".git/config", "src/main.py", "run.toml.bak", "run.toml~", "report/notes.md", "report/mine.png"),
+    *("dataset/segment-1.frames.bak", "checkpoints/best.npz", "crashes/why.txt", "tensorboard/x", "dataset/raw/a.csv"),
+    *(".notes.md.12.part", "online.json", "version-0000.npz", "deep/run.toml", "run.toml\nx"),
+)
+
+
+def write(folder, names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+    return folder
+
+
+def files(folder):
+    """Every file and link below a folder, and what it holds."""
+    below = sorted(folder.rglob("*"))
+    return {str(p.relative_to(folder)): p.readlink() if p.is_symlink() else p.read_bytes() for p in below if not p.is_dir()}
+
+
+@pytest.fixture(autouse=True)
+def no_wait(monkeypatch):
+    monkeypatch.setattr(run_folder, "WAIT_S", 0.05)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    ours=st.sets(st.sampled_from(OURS)),
+    theirs=st.sets(st.sampled_from(FOREIGN) | st.from_regex(r"[a-z]{1,6}(/[a-z.]{0,5}[a-z])?", fullmatch=True), min_size=1),
+)
+def test_a_folder_with_any_file_of_the_users_is_refused_by_its_name_and_keeps_every_file(module_run, ours, theirs):
+    theirs = {name for name in theirs if not any((name + "/").startswith(o + "/") or o.startswith(name + "/") for o in OURS)}
+    theirs = {name for name in theirs if not any(other.startswith(name + "/") for other in theirs)} or {"notes.md"}
+    with tempfile.TemporaryDirectory() as made:
+        folder = write(Path(made) / "run", {"run.toml", "env.json", *ours, *theirs})
+        before = files(Path(made))
+        with pytest.raises(ConfigError) as refused:
+            train.prepare(module_run, folder, resume=False, overwrite=True)
+        assert any(name.split("/")[0] in str(refused.value) for name in theirs) and "--out" in str(refused.value)
+        with pytest.raises(ConfigError):
+            run_folder.remove(folder)
+        assert files(Path(made)) == before
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_every_foreign_name_alone_is_refused(tmp_path, name):
+    folder = write(tmp_path / "run", [*OURS, name])
+    assert run_folder.foreign(folder)
+    with pytest.raises(ConfigError, match=r"not written by icrl-dist: move that away"):
+        run_folder.remove(folder)
+    assert (folder / name).read_text() == name
+
+
+def test_a_folder_of_our_files_alone_is_removed_whole(tmp_path):
+    folder = write(tmp_path / "run", OURS)
+    assert run_folder.foreign(folder) == []
+    run_folder.remove(folder)
+    assert not folder.exists()
+    run_folder.remove(folder)
+
+
+@pytest.mark.parametrize("place", ["run.toml", "report", "dataset/segment-000000.frames", "checkpoints"])
+def test_links_are_not_followed(tmp_path, module_run, place):
+    outside = write(tmp_path / "outside", ["version-0000.npz", "online.json"])
+    folder = write(tmp_path / "run", ["run.toml", "env.json"])
+    (folder / place).parent.mkdir(exist_ok=True)
+    (folder / place).unlink(missing_ok=True)
+    (folder / place).symlink_to(outside / "online.json" if "." in place else outside)
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match=place):
+        train.prepare(module_run, folder, resume=False, overwrite=True)
+    (tmp_path / "link").symlink_to(outside)
+    with pytest.raises(ConfigError, match="is a link"):
+        run_folder.remove(tmp_path / "link")
+    (tmp_path / "link").unlink()
+    assert files(tmp_path) == before
+
+
+def test_a_run_file_of_the_users_is_no_run(tmp_path, module_run):
+    folder = write(tmp_path / "run", ["run.toml"])
+    with pytest.raises(ConfigError, match="holds no run"):
+        train.prepare(module_run, folder, resume=False, overwrite=True)
+    assert files(folder) == {"run.toml": b"run.toml"}
+
+
+def test_places_that_are_no_runs_own_are_refused(tmp_path, module_run, monkeypatch):
+    home, here = tmp_path / "home", tmp_path / "work" / "here"
+    home.mkdir()
+    write(here, ["run.toml", "env.json"])
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(here)
+    write(tmp_path, ["file"])
+    (tmp_path / "link").symlink_to(here)
+    (tmp_path / "dangling").symlink_to(tmp_path / "none")
+    before = files(tmp_path)
+    refused = {
+        "/": "is the current folder",
+        str(home): "is the home folder",
+        str(here): "an empty --out",
+        str(here.parent): "current folder",
+        str(here / "x" / ".."): "ends in ..",
+        str(tmp_path / "file"): "is a file",
+        str(tmp_path / "link"): f"is a link; name the folder itself, {here}",
+        str(tmp_path / "dangling"): "is a link",
+    }
+    for out, why in refused.items():
+        for options in ({"overwrite": True, "resume": False}, {"overwrite": False, "resume": False}):
+            with pytest.raises(ConfigError) as error:
+                train.prepare(module_run, Path(out), **options)
+            assert f"--out {out}: " in str(error.value) and why in str(error.value)
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("spelling", ["parent", "parent/../parent", "other/parent", "parent/inside", "."])
+def test_a_fork_stays_out_of_its_parents_folder(tmp_path, module_run, spelling):
+    parent = write(tmp_path / "runs" / "parent", ["run.toml", "env.json", "checkpoints/version-0000.npz"])
+    (tmp_path / "runs" / "other").symlink_to(tmp_path / "runs")
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match="the run of --from; use another --out"):
+        train.prepare(module_run, tmp_path / "runs" / spelling, resume=False, overwrite=True, source=(parent, 0))
+    assert files(tmp_path) == before
+
+
+def began(tmp_path, run):
+    """A run with a checkpoint, its folder and what is in it."""
+    folder = tmp_path / "run"
+    train.prepare(run, folder, resume=False, overwrite=False)
+    write(folder, ["checkpoints/version-0000.npz", "dataset/segment-000000.frames", ".lock"])
+    return folder, files(folder)
+
+
+def test_resume_and_overwrite_contradict_each_other(tmp_path, module_run):
+    folder, before = began(tmp_path, module_run)
+    with pytest.raises(ConfigError, match="leave one out"):
+        train.prepare(module_run, folder, resume=True, overwrite=True)
+    assert files(folder) == before
+
+
+@pytest.mark.parametrize("options", [{"resume": False, "overwrite": True}, {"resume": True, "overwrite": False}])
+def test_a_folder_in_which_a_run_is_on_is_left_alone(tmp_path, module_run, options):
+    folder, before = began(tmp_path, module_run)
+    stamp = (folder / "env.json").stat().st_mtime_ns
+    with hold(folder), pytest.raises(ConfigError, match=r"run: a run is on in this folder; end it, or use another --out"):
+        train.prepare(module_run, folder, **options)
+    assert files(folder) == before and (folder / "env.json").stat().st_mtime_ns == stamp
+    with train.prepare(module_run, folder, **options):
+        pass
+
+
+def test_the_earlier_run_goes_with_the_first_checkpoint_and_no_sooner(tmp_path, module_run):
+    folder, before = began(tmp_path, module_run)
+    heard = []
+    with train.prepare(module_run, folder, resume=False, overwrite=True) as begun:
+        report, aside = begun.heed(heard.append), run_folder.aside_of(folder)
+        report({"event": "progress", "version": -1})
+        assert files(aside) == before
+        report({"event": "progress", "version": 0})
+        assert files(aside) == before, "an event is no checkpoint"
+        with pytest.raises(ConfigError, match="a run is on"):
+            train.prepare(module_run, folder, resume=False, overwrite=True)
+        write(folder, ["checkpoints/version-0000.npz"])
+        report({"event": "progress", "version": 0})
+        assert not aside.exists() and len(heard) == 3
+    assert folder.is_dir() and not begun.restored
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, train.TrainInterrupted, ConfigError])
+def test_the_earlier_run_comes_back_if_the_new_one_ends_before_its_first_checkpoint(tmp_path, module_run, error):
+    folder, before = began(tmp_path, module_run)
+    begun = train.prepare(module_run, folder, resume=False, overwrite=True)
+    with pytest.raises(error), begun:
+        write(folder, ["dataset/segment-000000.frames", "learner.log", "crashes/w0-1.json"])
+        raise error
+    assert begun.restored and files(tmp_path) == {f"run/{name}": content for name, content in before.items()}
+
+
+def test_after_the_first_checkpoint_or_a_good_end_the_new_run_stays(tmp_path, module_run):
+    for checkpoint in (True, False):
+        folder, _ = began(tmp_path / str(checkpoint), module_run)
+        with pytest.raises(ConfigError) if checkpoint else contextlib.nullcontext():  # noqa: SIM117
+            with train.prepare(module_run, folder, resume=False, overwrite=True):
+                if checkpoint:
+                    write(folder, ["checkpoints/version-0000.npz"])
+                    raise ConfigError("later")
+        assert (folder / "checkpoints").exists() == checkpoint and [path.name for path in folder.parent.iterdir()] == ["run"]
+
+
+def test_neither_is_removed_if_the_new_folder_got_a_file_of_the_users(tmp_path, module_run):
+    folder, before = began(tmp_path, module_run)
+    heard = []
+    with pytest.raises(ConfigError), train.prepare(module_run, folder, resume=False, overwrite=True) as begun:
+        begun.heed(heard.append)
+        write(folder, ["notes.md"])
+        raise ConfigError("it failed")
+    assert not begun.restored and (folder / "notes.md").exists() and files(run_folder.aside_of(folder)) == before
+    assert str(run_folder.aside_of(folder)) in heard[0]["text"] and "notes.md" in heard[0]["text"]
+
+
+def killed(tmp_path, run):
+    """What a command leaves that was killed while it replaced a run."""
+    folder, before = began(tmp_path, run)
+    train.prepare(run, folder, resume=False, overwrite=True)._lock.close()
+    return folder, run_folder.aside_of(folder), before
+
+
+@pytest.mark.parametrize("options", [(False, False), (True, False), (False, True)])
+def test_after_a_kill_both_runs_are_named_with_the_remedy_and_kept(tmp_path, module_run, options):
+    folder, aside, old = killed(tmp_path, module_run)
+    before = files(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        train.prepare(module_run, folder, *options)
+    assert f"delete {folder} to have that one back, or {aside} to keep the new one" in str(refused.value)
+    assert files(tmp_path) == before
+    run_folder.remove(folder)  # the remedy
+    train.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(folder) == old and not aside.exists()
+
+
+def test_after_a_kill_between_checkpoint_and_removal_the_new_run_stays(tmp_path, module_run):
+    folder, aside, _ = killed(tmp_path, module_run)
+    write(folder, ["checkpoints/version-0000.npz"])
+    train.prepare(module_run, folder, resume=True, overwrite=False)
+    assert not aside.exists() and (folder / "checkpoints").exists()
+
+
+def test_after_a_kill_during_the_removal_what_is_left_is_no_run_that_comes_back(tmp_path, module_run):
+    folder, aside, _ = killed(tmp_path, module_run)
+    (aside / "run.toml").unlink()
+    run_folder.remove(folder)
+    train.prepare(module_run, folder, resume=False, overwrite=False)
+    assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
+
+
+def test_the_lock_that_counts_is_the_one_in_the_folder_now(tmp_path):
+    """Whoever waits for a folder that is replaced meanwhile does not end with the lock of the one that is gone."""
+    folder = write(tmp_path / "run", ["run.toml"])
+    first = hold(folder)
+    (folder / ".lock").unlink()
+    with hold(folder) as second:
+        assert os.path.samestat(os.fstat(second.fileno()), (folder / ".lock").stat())
+        first.close()

@@ -1,0 +1,352 @@
+"""T_theta beside the exact posterior: every measure against a slow loop, in a 3x3 room with two adversaries."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist.config.run import AdversaryConfig, ConfigError, EvaluateConfig, Run
+from icrl_dist.models.dpt import PretrainedTransformer, Transitions
+from icrl_dist.problems import splits
+from icrl_dist.problems.darkroom import divergence
+from icrl_dist.problems.darkroom.adversaries import argmax_law
+from icrl_dist.problems.darkroom.divergence import KINDS, LAWS, Context, Divergence
+from icrl_dist.problems.darkroom.exact_agents import ExactAgent
+from icrl_dist.problems.darkroom.room import ACTIONS
+from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, soft_labels
+from icrl_dist.results import evaluate
+from icrl_dist.results.evaluate import Result
+from icrl_dist.rollout.deployment import RandomPolicy
+from icrl_dist.types import NULL, Adversary, Variation
+from tests.problems.darkroom.test_exact_agents import Transition, likelihood
+from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, HORIZON, SIZE, Room, every_cell, normalised, slow_q
+
+GAMMA, SLACK = 0.99, 0.1
+OTHERS = (NULL, Adversary.of("dirichlet", p=0.2, alpha=ALPHA[::-1]))
+
+
+@pytest.fixture
+def run(small_run: Run) -> Run:
+    """ICAG with two adversaries a goal: 7 goals to train on, 2 held out."""
+    return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=2))
+
+
+@pytest.fixture
+def model(run: Run) -> PretrainedTransformer:
+    torch.manual_seed(0)
+    return PretrainedTransformer(splits.spec(run), run.model).eval()
+
+
+def own(room: Room) -> list[Variation]:
+    """Every goal with two adversaries, which are not the next goal's."""
+    return [Variation(t, a) for i, t in enumerate(room(SIZE, HORIZON)) for a in (ADVERSARIES, OTHERS)[i % 2]]
+
+
+def independent(room: Room) -> list[Variation]:
+    return [Variation(t, a) for t in room(SIZE, HORIZON) for a in ADVERSARIES]
+
+
+def slow_labels(variations: list[Variation]) -> list[list[list[float]]]:
+    """By variation and cell: uniform over the actions within the slack of the best."""
+    found = []
+    for variation in variations:
+        memo: dict[tuple[tuple[int, int], int], list[float]] = {}
+        values = [slow_q(variation, cell, HORIZON, GAMMA, memo) for cell in every_cell()]
+        found.append([normalised([float(q >= max(row) - SLACK) for q in row]) for row in values])
+    return found
+
+
+def history(context: Context, b: int) -> list[Transition]:
+    columns = (context.observations[b], context.actions[b], context.rewards[b], context.next_observations[b])
+    return [((int(s[0]), int(s[1])), int(a), float(r), (int(t[0]), int(t[1]))) for s, a, r, t in zip(*columns, strict=True)]
+
+
+def walks(rows: list[Variation], seed: int = 0, kind: str = "random walk") -> Context:
+    return divergence.contexts(kind, rows, evaluate.random, np.random.default_rng(seed).spawn(len(rows)))
+
+
+@pytest.mark.parametrize("law", [own, independent])
+def test_exact_decisions_equal_enumeration(room: Room, law: object) -> None:
+    variations = law(room)  # type: ignore[operator]
+    rows = [variations[m] for m in (3, 8, 17)]
+    context = walks(rows)
+    query = np.random.default_rng(1).integers(0, SIZE**2, size=(3, 2 * HORIZON + 1))
+    h = Hypotheses.of(variations)
+    decided = divergence.exact_decisions(h, soft_labels(h, GAMMA, SLACK), context, query)
+    labels = slow_labels(variations)
+    assert decided.shape == (3, 2 * HORIZON + 1, ACTIONS)
+    for b in range(3):
+        steps = history(context, b)
+        for t in range(2 * HORIZON + 1):
+            belief = normalised([math.prod(likelihood(v, one) for one in steps[:t]) for v in variations])
+            slow = [sum(w * labels[m][query[b, t]][a] for m, w in enumerate(belief)) for a in range(ACTIONS)]
+            np.testing.assert_allclose(decided[b, t], slow, atol=1e-6)
+    assert np.abs(decided[:, 0] - decided[:, -1]).max() > 0.2, "nothing was learned from the contexts"
+
+
+def test_model_decisions_are_the_models_one_prefix_at_a_time(run: Run, model: PretrainedTransformer, monkeypatch) -> None:
+    monkeypatch.setattr(divergence, "_CHUNK", 2)
+    context = walks([group[1] for group in divergence.variations(run, heldout=False)[:3]])
+    length = context.actions.shape[1]
+    query = np.random.default_rng(1).integers(0, 9, size=(3, length + 1))
+    decided = divergence.model_decisions(model, context, query, size=3)
+    for b, t in itertools.product(range(3), range(length + 1)):
+        seen = Transitions(*(torch.from_numpy(a[b : b + 1, :t].copy()) for a in context))
+        state = torch.tensor([[divmod(int(query[b, t]), 3)]], dtype=torch.float32)
+        with torch.inference_mode():
+            law = model.decide(state, model.encode(seen))[0, 0].double().softmax(dim=0)
+        np.testing.assert_allclose(decided[b, t], law.numpy(), atol=1e-5)
+
+
+def test_the_first_law_is_the_one_trained_on(run: Run) -> None:
+    """Every training goal has its own adversaries; held-out goals are added with theirs, numbered after."""
+    split = splits.split(run)
+    groups = [splits.variations(run, i, task) for i, task in enumerate((*split.train, *split.test))]
+    assert divergence.variations(run, heldout=False) == groups[:7] and divergence.variations(run, heldout=True) == groups[7:]
+    for heldout, known in ((False, groups[:7]), (True, groups)):
+        h, _ = divergence.hypotheses(run, heldout)
+        flat = [v for group in known for v in group]
+        assert h.goal.tolist() == [3 * int(v.task.vector("goal")[0]) + int(v.task.vector("goal")[1]) for v in flat]
+        assert h.p.tolist() == [0.0 if v.adversary == NULL else v.adversary.number("p") for v in flat]
+        q = [[0.2] * 5 if v.adversary == NULL else argmax_law(v.adversary.vector("alpha")) for v in flat]
+        np.testing.assert_allclose(h.q, q)
+
+
+def test_by_the_second_law_goals_and_adversaries_are_independent(run: Run) -> None:
+    for heldout, goals in ((False, 7), (True, 9)):
+        first, second = divergence.hypotheses(run, heldout)
+        p, q = second.p.reshape(goals, -1), second.q.reshape(goals, -1, ACTIONS)
+        assert (second.goal.reshape(goals, -1) == first.goal.reshape(goals, 2)[:, :1]).all()
+        assert (p == p[0]).all() and (q == q[0]).all()
+        assert p.shape[1] == 16 and (p == 0).mean() == (first.p == 0).mean() == 0.5
+        assert len(set(p[0][p[0] > 0])) == 8 and 0 < p[0].max() <= run.adversary.p_max
+        assert not set(p[0][p[0] > 0]) & set(first.p)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"method": "dpt"}, {"adversary": AdversaryConfig(count=1)}, {"adversary": AdversaryConfig(count=2, p_max=0.0)}],
+)
+def test_without_disturbance_in_training_there_is_none_in_the_contexts(run, model, monkeypatch, change) -> None:
+    monkeypatch.setattr(divergence, "CONTEXTS", 2)
+    run = dataclasses.replace(run, **change)
+    found = [pair for heldout in (False, True) for pair in divergence.divergences(run, model, heldout)]
+    assert [(one.kind, one.p) for pair in found for one in pair] == [(kind, 0.0) for kind in (*KINDS, *KINDS) for _ in LAWS]
+    assert all((h.p == 0).all() for h in divergence.hypotheses(run, heldout=True))
+
+
+class Diary(RandomPolicy):
+    """Notes the end of every step that it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__(ACTIONS)
+        self.done: list[bool] = []
+
+    def observe(self, *transition: object) -> None:
+        self.done.append(bool(transition[-1]))
+
+
+def test_walks_start_anywhere_and_deployments_in_the_origin(run: Run) -> None:
+    rows = [group[1] for group in divergence.variations(run, heldout=False)] * 6
+    again = {}
+    for kind in KINDS:
+        agent = Diary()
+        context = divergence.contexts(kind, rows, lambda _, agent=agent: agent, np.random.default_rng(0).spawn(len(rows)))
+        starts = context.observations[:, :: run.darkroom.horizon]
+        assert context.actions.shape == (42, 16) and starts.shape == (42, 2, 2)
+        np.testing.assert_array_equal(context.observations[:, 1:8], context.next_observations[:, :7])
+        if kind == "on policy":
+            assert (starts == 0).all()
+            assert agent.done == [*[False] * 7, True] * 2, "the second episode is not the same agent's"
+        else:
+            assert agent.done == []
+            assert all(len({tuple(cell) for cell in starts[:, n].tolist()}) == 9 for n in (0, 1))
+            assert (starts[:, 0] != starts[:, 1]).any()
+        again[kind] = (context.actions[:, 1:8] == context.actions[:, :7]).mean()
+    assert abs(again["random walk"] - 0.2) < 0.1 < again["persistent walk"] - 0.6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_disturbs_a_context_is_its_own_adversary(run: Run, kind: str) -> None:
+    down = Adversary.of("dirichlet", p=0.5, alpha=(0.1, 0.1, 0.1, 2.0, 0.1))
+    rows = [Variation(group[0].task, a) for group in divergence.variations(run, heldout=False) for a in (NULL, down)]
+    context = walks(rows, kind=kind)
+    overridden = []
+    for b, variation in enumerate(rows):
+        steps = history(context, b)
+        assert all(likelihood(variation, one) > 0 for one in steps)
+        overridden.append(sum(likelihood(rows[b - b % 2], one) == 0 for one in steps))
+    assert sum(overridden[0::2]) == 0 and sum(overridden[1::2]) > 7
+
+
+@pytest.mark.parametrize("heldout", [False, True])
+def test_contexts_share_out_the_goals_each_under_one_of_its_adversaries(run, model, monkeypatch, heldout) -> None:
+    monkeypatch.setattr(divergence, "CONTEXTS", 14)
+    run = dataclasses.replace(run, adversary=AdversaryConfig(count=3))
+    asked = []
+    real = divergence.contexts
+    monkeypatch.setattr(divergence, "contexts", lambda kind, rows, *rest: asked.append((kind, rows)) or real(kind, rows, *rest))
+    found = [(one.kind, one.p) for one, _ in divergence.divergences(run, model, heldout)]
+    assert [kind for kind, _ in asked] == [kind for kind, _ in found] and found == [(k, p) for p in (0.0, 0.2) for k in KINDS]
+    groups = divergence.variations(run, heldout)
+    for (_, p), (_, rows) in zip(found, asked, strict=True):
+        assert [v.task for v in rows] == [groups[i % len(groups)][0].task for i in range(14)]
+        if p == 0:
+            assert all(v.adversary == NULL for v in rows)
+        else:
+            chosen = [
+                [a.adversary.replace(p=p) for a in groups[i % len(groups)][1:]].index(v.adversary) for i, v in enumerate(rows)
+            ]
+            assert set(chosen) == {0, 1}
+
+
+class Exact(PretrainedTransformer):
+    """Acts as an untrained model, but decides in given contexts as the exact posterior by one law."""
+
+    def know(self, run: Run, h: Hypotheses) -> None:
+        soft = run.darkroom.labels == "soft"
+        self.h, self.labels = h, soft_labels(h, GAMMA, SLACK) if soft else heuristic_labels(h)
+
+    def forward(self, context: Transitions, queries: torch.Tensor, prefix: torch.Tensor) -> torch.Tensor:
+        assert (prefix == torch.arange(prefix.shape[1])).all()
+        query = cell_numbers(queries.numpy(), self.h.size)
+        return torch.from_numpy(
+            divergence.exact_decisions(self.h, self.labels, Context(*(a.numpy() for a in context)), query)
+        ).log()
+
+
+class Uniform(PretrainedTransformer):
+    """Decides nothing."""
+
+    def forward(self, context: Transitions, queries: torch.Tensor, prefix: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(*prefix.shape, ACTIONS)
+
+
+@pytest.mark.parametrize(("heldout", "labels"), [(False, "soft"), (True, "soft"), (True, "heuristic")])
+@pytest.mark.parametrize("law", range(len(LAWS)))
+def test_a_model_that_is_the_exact_posterior_diverges_by_nothing(run, monkeypatch, heldout, labels, law) -> None:
+    monkeypatch.setattr(divergence, "CONTEXTS", 9)
+    run = dataclasses.replace(run, darkroom=dataclasses.replace(run.darkroom, labels=labels))
+    model = Exact(splits.spec(run), run.model).eval()
+    model.know(run, divergence.hypotheses(run, heldout)[law])
+    found = list(zip(*divergence.divergences(run, model, heldout), strict=True))
+    assert all(np.abs(one.kl).max() < 1e-6 for one in found[law])
+    assert any(one.kl.mean() > 1e-3 for one in found[1 - law]), "the two laws are one"
+
+
+def test_the_divergence_of_a_uniform_model_is_what_a_loop_says(run: Run, monkeypatch) -> None:
+    monkeypatch.setattr(divergence, "CONTEXTS", 5)
+    asked: list[Context] = []
+    real = divergence.contexts
+    monkeypatch.setattr(divergence, "contexts", lambda *given: asked.append(real(*given)) or asked[-1])
+    found = list(divergence.divergences(run, Uniform(splits.spec(run), run.model).eval(), heldout=False))
+    for (one, other), context in zip(found, asked, strict=True):
+        assert one.kl.shape == one.met.shape == (5, 17)
+        for b, t in itertools.product(range(5), range(17)):
+            assert one.met[b, t] == other.met[b, t] == any(context.rewards[b, :t] > 0)
+            slow = sum(p * math.log(p / 0.2) for p in one.exact[b, t].tolist() if p > 0)
+            assert one.kl[b, t] == pytest.approx(slow)
+    assert {bool(m) for one, _ in found for m in one.met.ravel()} == {False, True}
+
+
+def made(kind: str, p: float, kl: list[list[float]], met: list[list[bool]]) -> Divergence:
+    """A divergence of these nats: the exact decision is certain, the model's probability of it exp(-nats)."""
+    sure = np.exp(-np.array(kl))
+    exact = np.broadcast_to(np.eye(2)[0], (*sure.shape, 2)).copy()
+    return Divergence(kind, p, exact, np.stack([sure, 1 - sure], axis=2), np.array(met))
+
+
+def test_the_summary_is_split_by_whether_the_goal_was_met() -> None:
+    one = made("random walk", 0.0, [[1.0, 2.0, 3.0], [4.0, 5.0, 9.0]], [[False, True, True], [False, False, True]])
+    two = made("on policy", 0.2, [[6.0, 6.0, 6.0], [8.0, 8.0, 8.0]], [[False] * 3, [False] * 3])
+    found = divergence.summary([one, two])
+    assert found[""] == pytest.approx(66 / 12)
+    assert found["_goal_met"] == pytest.approx((2 + 3 + 9) / 3)
+    assert found["_goal_unmet"] == pytest.approx((1 + 4 + 5 + 42) / 9)
+    first, second = found["_cells"]
+    assert {k: v for k, v in first.items() if k in ("kind", "p")} == {"kind": "random walk", "p": 0.0}
+    assert [first[k] for k in ("kl", "goal_met", "goal_unmet", "met")] == pytest.approx([4.0, 14 / 3, 10 / 3, 0.5])
+    assert second["goal_met"] is None and second["met"] == 0.0
+    # Of context means 2 and 6, and 6 and 8.
+    errors = (np.std([2, 6], ddof=1) / math.sqrt(2), np.std([6, 8], ddof=1) / math.sqrt(2))
+    assert [first["standard_error"], second["standard_error"]] == pytest.approx(errors)
+    assert found["_standard_error"] == pytest.approx(math.hypot(*errors) / 2)
+
+
+def test_curves_are_means_by_prefix_and_by_the_exact_probability() -> None:
+    exact = np.array([[[0.0, 1.0], [0.25, 0.75]], [[0.0, 1.0], [0.28, 0.72]]])
+    model = np.array([[[0.1, 0.9], [0.4, 0.6]], [[0.3, 0.7], [0.2, 0.8]]])
+    one = Divergence("random walk", 0.2, exact, model, np.zeros((2, 2), bool))
+    found = divergence.curves([one], bins=10)
+    (curve,) = found["by_prefix"]
+    assert (curve["kind"], curve["p"]) == ("random walk", 0.2)
+    np.testing.assert_allclose(curve["kl"], one.kl.mean(axis=0))
+    np.testing.assert_allclose(found["agreement"]["exact"], [0.0, 0.265, 0.735, 1.0])
+    np.testing.assert_allclose(found["agreement"]["model"], [0.2, 0.3, 0.7, 0.8])
+
+
+def result(returns: np.ndarray, p: float = 0.0) -> Result:
+    """Returns of two episodes with these means, by goal and seed."""
+    return Result("x", p, returns[:, :, None] * [0.5, 1.5], np.ones(len(returns)))
+
+
+def test_a_gap_is_a_ratio_of_means_of_pairs() -> None:
+    rng = np.random.default_rng(0)
+    exact = rng.uniform(1, 100, size=(6, 2))
+    scaled = divergence.gap(result(0.8 * exact), result(exact), seed=0)
+    assert [scaled[k] for k in ("gap", "low", "high")] == pytest.approx([-0.2] * 3), "the pairs came apart"
+    assert [scaled["model"], scaled["exact"]] == pytest.approx([0.8 * exact.mean(), exact.mean()])
+    noisy = 0.8 * exact + rng.normal(0, 3, size=exact.shape) + [8, -8]
+    found = divergence.gap(result(noisy), result(exact), seed=0)
+    assert found["gap"] == pytest.approx(noisy.sum() / exact.sum() - 1)
+    slow = []
+    for _ in range(4000):
+        above = below = 0.0
+        for goal in rng.integers(0, 6, size=6):
+            for seed in rng.integers(0, 2, size=2):
+                above, below = above + noisy[goal, seed], below + exact[goal, seed]
+        slow.append(above / below - 1)
+    low, high = np.percentile(slow, (2.5, 97.5))
+    assert [found["low"], found["high"]] == pytest.approx([low, high], abs=0.1 * (high - low))
+
+
+def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch) -> None:
+    monkeypatch.setattr(divergence, "RESAMPLES", 300)
+    rng, covered, widths, gaps = np.random.default_rng(0), 0, [], []
+    for _ in range(200):
+        exact = rng.uniform(20, 100, size=(20, 1)) + rng.normal(0, 5, size=(20, 2))
+        found = divergence.gap(result(0.9 * exact + rng.normal(0, 5, size=(20, 2))), result(exact), seed=0)
+        covered += found["low"] <= -0.1 <= found["high"]
+        widths.append(found["high"] - found["low"])
+        gaps.append(found["gap"])
+    assert 0.88 < covered / 200 <= 1
+    assert np.mean(widths) < 2 * 2 * 1.96 * np.std(gaps)
+
+
+def test_there_is_no_ratio_to_nothing() -> None:
+    with pytest.raises(ConfigError, match=r"return is 0 at p = 0\.4: no ratio to it; try more --episodes"):
+        divergence.gap(result(np.ones((2, 2)), 0.4), result(np.zeros((2, 2)), 0.4), seed=0)
+
+
+def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) -> None:
+    run = dataclasses.replace(run, evaluate=EvaluateConfig(episodes=4, seeds=5, p=(0.0, 0.4), prior="uniform"))
+    for goals in (splits.split(run).test, splits.split(run).train[:3]):
+        met: list[tuple[Variation, ...]] = []
+
+        def act(rows, met=met) -> ExactAgent:
+            met.append(tuple(rows))
+            return evaluate.exact(run, "paper")(rows)
+
+        same = divergence.gaps(run, act, goals)
+        assert list(same) == ["0", "0.4"]
+        assert all(row["gap"] == row["low"] == row["high"] == 0 and row["exact"] > 0 for row in same.values())
+        for p, rows in zip((0.0, 0.4), met, strict=True):
+            adversary = Adversary.of("uniform", p=p) if p else NULL
+            assert rows == tuple(Variation(splits.deployed(t), adversary) for t in goals for _ in range(5))
+    worse = divergence.gaps(run, evaluate.random, splits.split(run).test)
+    assert all(row["high"] < 0 for row in worse.values())
