@@ -88,7 +88,7 @@ class Worker:
         drain_s: float,
     ) -> None:
         """Do a job, each trajectory within ``deadline_s``; waiting for others does not count."""
-        self._job, self._weights = job.label, job.weights
+        self._job, self._weights = job.label, job.policy_version
         made: set[Identity] = set()
         try:
             work = jobs.do(job, _Waiting(policy, watchdog), self.name, self._tell, beliefs)
@@ -154,7 +154,7 @@ class Worker:
                     "job": self._job,
                     "doing": self._doing,
                     "reached": self._reached,
-                    "weights": self._weights,
+                    "policy_version": self._weights,
                     "pid": os.getpid(),
                     "time": time.time(),
                 }

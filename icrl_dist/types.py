@@ -140,7 +140,7 @@ class Identity(NamedTuple):
         return (STAGES.index(self.stage), self.round, self.task, self.variation, self.trial)
 
     @property
-    def produces(self) -> int:
+    def next_version(self) -> int:
         """First version of the weights that is fitted to it: 0 for ``pretrain``, j + 1 for round j."""
         return self.round + 1 if self.stage == "adapt" else 0
 
@@ -185,9 +185,9 @@ class Trajectory:
 
     identity: Identity
     variation: Variation
-    weights: int
+    policy_version: int
     """Version of the weights that acted; -1 for a policy without weights."""
-    digest: str
+    weights_digest: str
     """Digest of those weights; empty for a policy without weights."""
     worker: str
     actions: Int16[np.ndarray, " H"] | Float32[np.ndarray, "H A"]
@@ -201,7 +201,7 @@ class Trajectory:
     labels: Float32[np.ndarray, "Q A"]
     """A distribution over actions at each query state; of vectors, the right one."""
     taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
-    """The actions taken at the last R query states, which lie in stretches (zeta of eq. 6), one
+    """The actions taken at the last R query states, which lie in windows (zeta of eq. 6), one
     after another; the first Q - R states stand alone."""
     gained: Float32[np.ndarray, " R"]
     """The reward that each of them brought."""
@@ -259,7 +259,7 @@ class Job:
     """The K variations of the first task, then those of the next, and so on."""
     trials: int
     """Episodes in each variation."""
-    weights: int
+    policy_version: int
     """Weights version that must act; -1 for none."""
     seed: int
     settings: Params = ()

@@ -1,4 +1,4 @@
-"""What the learner must remember to go on: weights, optimiser, and where it stood."""
+"""What the learner must remember to go on: weights, optimizer, and where it stood."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
 from icrl_dist.problems import splits
 from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.stream.wire import weights_digest
-from icrl_dist.training.fit import Optimiser
+from icrl_dist.training.fit import Optimizer
 from icrl_dist.types import Spec, Weights
 
 PARTIAL = "partial.npz"
@@ -35,7 +35,7 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
         "seed": run.seed,
         "split_seed": room.split_seed,
         "horizon": spec.horizon,
-        "stretch": run.model.stretch,
+        "window": run.model.window,
         **_tasks(run),
         "threads": threads,
         "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},
@@ -51,11 +51,11 @@ def _tasks(run: Run) -> dict[str, Any]:
     return {"train_tasks": plain[0], "test_tasks": plain[1]}
 
 
-def save(path: Path, model: PretrainedTransformer, opt: Optimiser, about: Mapping[str, Any]) -> None:
-    """Weights, the optimiser's moments, and the manifest, atomically."""
+def save(path: Path, model: PretrainedTransformer, opt: Optimizer, about: Mapping[str, Any]) -> None:
+    """Weights, the optimizer's moments, and the manifest, atomically."""
     weights = weights_of(model)
     arrays = {f"model/{name}": value for name, value in weights.items()}
-    arrays |= {f"optimiser/{name}": value.cpu().numpy() for name, value in opt.state().items()}
+    arrays |= {f"optimizer/{name}": value.cpu().numpy() for name, value in opt.state().items()}
     save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights_digest(weights)}))
 
 
@@ -64,10 +64,10 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
     return load_checkpoint(path).manifest
 
 
-def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: Optimiser) -> Mapping[str, Any]:
-    """Load what ``save`` wrote into model and optimiser; returns the manifest.
+def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: Optimizer) -> Mapping[str, Any]:
+    """Load what ``save`` wrote into model and optimizer; returns the manifest.
 
-    Raises ConfigError for a checkpoint of another spec, another model size or another optimiser.
+    Raises ConfigError for a checkpoint of another spec, another model size or another optimizer.
     """
     checkpoint = load_checkpoint(path)
     theirs = spec_from(checkpoint.manifest["spec"])
@@ -78,9 +78,9 @@ def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: Optimiser
     except RuntimeError as error:
         raise ConfigError(f"{path}: a checkpoint of another model ({' '.join(str(error).split())})") from None
     try:
-        opt.load({name: torch.from_numpy(np.array(value)) for name, value in checkpoint.part("optimiser").items()})
+        opt.load({name: torch.from_numpy(np.array(value)) for name, value in checkpoint.part("optimizer").items()})
     except ValueError as error:
-        raise ConfigError(f"{path}: a checkpoint of another optimiser ({error}): it has the run's optim.muon") from None
+        raise ConfigError(f"{path}: a checkpoint of another optimizer ({error}): it has the run's optim.muon") from None
     return checkpoint.manifest
 
 

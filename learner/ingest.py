@@ -52,8 +52,10 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
     if trajectory.variation != job.variation(identity):
         raise Rejected("unexpected", f"{identity}: comes from another variation than its job's")
-    if (trajectory.weights, trajectory.digest) != (job.weights, digest):
-        raise Rejected("stale-weights", f"{identity}: weights {trajectory.weights} acted, the job names {job.weights}")
+    if (trajectory.policy_version, trajectory.weights_digest) != (job.policy_version, digest):
+        raise Rejected(
+            "stale-weights", f"{identity}: weights {trajectory.policy_version} acted, the job names {job.policy_version}"
+        )
 
 
 def _finite(array: np.ndarray) -> bool:
@@ -152,7 +154,7 @@ class Inbox:
                 elif job is None:
                     raise Rejected("unexpected", f"{identity}: nobody asked for it")
                 else:
-                    check(trajectory, job, self._spec, self._digest_of(job.weights))
+                    check(trajectory, job, self._spec, self._digest_of(job.policy_version))
                     good[identity] = trajectory
             except (wire.WireError, Rejected) as error:
                 self._refuse(query, error)

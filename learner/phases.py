@@ -22,11 +22,11 @@ class Plan:
 
     def ask(self, phase: Phase) -> tuple[Job, ...]:
         """The phase's jobs, with the numbers that it was first asked for with."""
-        return self.method.ask(self._lineage.run_of(phase.produces), phase)
+        return self.method.ask(self._lineage.run_of(phase.next_version), phase)
 
     def next(self, version: int) -> Phase | None:
         """The first phase that is not fitted, or whose data is not whole, given the newest version."""
-        return next((phase for phase in self.phases if phase.produces > version or not self.whole(phase)), None)
+        return next((phase for phase in self.phases if phase.next_version > version or not self.whole(phase)), None)
 
     def look_again(self) -> None:
         """Look at every phase's data once more, for some may have been lost."""
@@ -49,7 +49,11 @@ class Plan:
     def ahead(self, phase: Phase, version: int) -> list[Phase]:
         """The phases after this one whose work may go out already: ``stream.staleness``."""
         newest = version + self._staleness
-        return [p for p in self.phases if p.produces > max(version, phase.produces) and version >= 0 and p.acting <= newest]
+        return [
+            p
+            for p in self.phases
+            if p.next_version > max(version, phase.next_version) and version >= 0 and p.policy_version <= newest
+        ]
 
     def have(self, job: Job) -> list[Identity]:
         """What need not be asked for: what is stored, and what was given up before."""
@@ -62,10 +66,10 @@ class Plan:
 
         One T^j acts in all trials of a job, so what is stored of it decides.
         """
-        if job.weights < 0:
-            return job.weights
+        if job.policy_version < 0:
+            return job.policy_version
         acted = self._store.ledger.acted(job.stage, job.round, (job.task, job.task + job.tasks))
-        return acted[0] if acted else min(version, job.weights)
+        return acted[0] if acted else min(version, job.policy_version)
 
     def give_up(self, variations: dict[str, str]) -> None:
         """Leave variations out from now on; some of their trials may be there, and which ones is chance."""

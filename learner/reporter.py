@@ -76,7 +76,7 @@ class Herald:
         if identity.stage == "adapt" or self._run.problem != "darkroom":  # a random walk in the dark may well find nothing
             place = identity.task, identity.variation, identity.trial
             with self._lock:
-                self._alerts.returned(place, trajectory.weights, trajectory.episode_return)
+                self._alerts.returned(place, trajectory.policy_version, trajectory.episode_return)
 
     def fitted(self, loss: float, seconds: float) -> None:
         """The newest version of the weights is fitted and published."""

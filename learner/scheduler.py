@@ -175,7 +175,7 @@ class Board:
         if slot.blame >= DEATHS - 1 and len(slot.job.variations) > 1:
             slot = self._split(phase, slot)
         if acting is not None and not slot.pinned:
-            slot.job = dataclasses.replace(slot.job, weights=acting(slot.job))
+            slot.job = dataclasses.replace(slot.job, policy_version=acting(slot.job))
         slot.pinned = True
         slot.worker, slot.since, slot.allowed = worker, now, self._allowed(slot)
         slot.reached, slot.before = 0, max(slot.before, slot.reached)

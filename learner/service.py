@@ -70,7 +70,7 @@ class Service:
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
-        self._opt = fit.Optimiser(self.model, run.optim)
+        self._opt = fit.Optimizer(self.model, run.optim)
         self.version = files.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
@@ -139,7 +139,7 @@ class Service:
             self._board.received(identity, time.monotonic())
             done = self._board.done(identity.stage, identity.round)
         if identity.stage == "adapt":
-            self._lag = identity.round - trajectory.weights
+            self._lag = identity.round - trajectory.policy_version
         self._herald.stored(trajectory)
         if done:
             self._changed.set()
@@ -169,12 +169,12 @@ class Service:
     def _run_phases(self) -> dict[str, Any]:
         self._herald.about(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
         while (phase := self._plan.next(self.version)) is not None:
-            if phase.produces <= self.version:
+            if phase.next_version <= self.version:
                 lost = ", ".join(job.label for job in self._plan.incomplete(phase))
                 self._herald.event({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
             try:
                 self._collect(phase)
-                if phase.produces > self.version:
+                if phase.next_version > self.version:
                     self._fit(phase)
             except Damaged as error:
                 self._herald.event({"event": "note", "text": str(error)})
@@ -242,7 +242,7 @@ class Service:
                 f"quarantined; first: {next(iter(blamed.values()))}"
             )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
-        quality = label_quality(self._run, phase, self.store) if phase.produces > self.version else {}
+        quality = label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
         if quality:
             self._herald.labelled(phase.round, quality)
 
@@ -254,18 +254,18 @@ class Service:
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
 
         def batch(step: int) -> batches.Batch:
-            key = (_FIT_DRAWS, phase.produces, step)
+            key = (_FIT_DRAWS, phase.next_version, step)
             rng = np.random.default_rng(np.random.SeedSequence(self._run.seed, spawn_key=key))
             torch.manual_seed(int(rng.integers(2**31)))
-            return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
+            return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.windows)
 
         def progress(step: int, loss: float) -> None:
             self._partial = step  # damage may end this fit: it is taken up from here
             self._progress("fit", phase, step, phase.steps, loss=loss, force=step == phase.steps)
             if step % 50 == 0 or step == phase.steps:
-                self._metrics.write(step, f"fit/{phase.produces}", loss=loss)
+                self._metrics.write(step, f"fit/{phase.next_version}", loss=loss)
             if self._stop.is_set() or step % 1000 == 0:
-                self._save(partial, produces=phase.produces, step=step)
+                self._save(partial, next_version=phase.next_version, step=step)
             self._check()
 
         first = self._partial
@@ -274,7 +274,7 @@ class Service:
         finally:
             torch.set_num_threads(torch_threads)
         self._partial = 0
-        self.version = phase.produces
+        self.version = phase.next_version
         self.store.seal()
         where = {
             "dataset": self.store.manifest(),
@@ -300,7 +300,7 @@ class Service:
             checkpoints.restore(files.version_file(self._folder, self.version), self._spec, self.model, self._opt)
             self._publish()
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
-        if partial.exists() and checkpoints.read_manifest(partial)["produces"] == self.version + 1:
+        if partial.exists() and checkpoints.read_manifest(partial)["next_version"] == self.version + 1:
             self._partial = checkpoints.restore(partial, self._spec, self.model, self._opt)["step"]
 
     def _tell_repairs(self) -> None:

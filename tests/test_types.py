@@ -18,8 +18,8 @@ def trajectory(horizon: int = 3, **changes: Any) -> Trajectory:
     values: dict[str, Any] = {
         "identity": Identity("pretrain", 0, 0, 0, 0),
         "variation": Variation(Task.of("darkroom", size=3)),
-        "weights": -1,
-        "digest": "",
+        "policy_version": -1,
+        "weights_digest": "",
         "worker": "test",
         "observations": np.zeros((horizon + 1, 2), np.float32),
         "actions": np.zeros(horizon, np.int16),

@@ -23,8 +23,8 @@ from pathlib import Path
 _INLINE, _RAY = ("--engine", "inline"), ("--engine", "ray", "--actors", "2")
 _FEW = ("--evaluate.episodes", "3", "--evaluate.seeds", "1", "--learner.threads", "1")
 _COMMITTED = (
-    *("--pretrain.contexts", "320", "--pretrain.steps", "30", "--practice.rounds", "1", "--practice.trials", "2"),
-    *("--practice.steps", "10", "--optim.transitions", "800", "--optim.batch", "8"),
+    *("--pretrain.contexts", "320", "--pretrain.steps", "30", "--dagger.rounds", "1", "--dagger.trials", "2"),
+    *("--dagger.steps", "10", "--optim.transitions", "800", "--optim.batch", "8"),
 )
 _GAME = (
     *("--sac.steps", "1600", "--sac.random-steps", "200", "--sac.warmup", "300", "--sac.update-every", "4"),

@@ -29,7 +29,7 @@ class InContextAgent:
 
     ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` says what happened.  Deployed by
     ``paper`` (Algorithm 1) that joins the context D_on when the episode is done; by ``committed``,
-    the default for a model trained on stretches, at once.
+    the default for a model trained on windows, at once.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ def shipped(name: str | Path) -> Path:
 
 
 def slim(checkpoint: Checkpoint) -> Checkpoint:
-    """What deployment needs of a checkpoint: the weights and where they come from, not the optimiser or the dataset's list."""
+    """What deployment needs of a checkpoint: the weights and where they come from, not the optimizer or the dataset's list."""
     manifest = {key: value for key, value in checkpoint.manifest.items() if key != "dataset"}
     return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith(("model/", "outcomes/"))}, manifest)
 

@@ -148,7 +148,7 @@ def trained(kind: str, variations: tuple[Variation, ...], config: SACConfig, rep
         if note or next(told) % 10 == 0:
             report(f"{kind}: {text}")
 
-    asked = (*cache.settings(config), ("misled", 0.0), ("queries", 1), ("stretch", 1), ("stretches", 0))
+    asked = (*cache.settings(config), ("decoy_fraction", 0.0), ("queries", 1), ("window", 1), ("windows", 0))
     for _ in train_expert(Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, asked, len(variations)), "bench", tell):
         pass  # what is wanted is in the cache
     return [history for one in variations if (history := cache.any_kept(one, config, 0)) is not None]

@@ -60,12 +60,12 @@ def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
 
 
 def training(rounds: int) -> dict[str, float]:
-    """Contexts and labelled queries a CPU-second through forward, backward and optimiser, in turns."""
+    """Contexts and labelled queries a CPU-second through forward, backward and optimizer, in turns."""
     law = Law(0)
     torch.manual_seed(0)
     step, labels = _our_step(law, "cpu", OPTIM.batch)
     model = peer.Peer(SPEC)
-    opt, drawn = peer.optimiser(model), law.draw(0, 0, peer.BATCH, 1).tensors()
+    opt, drawn = peer.optimizer(model), law.draw(0, 0, peer.BATCH, 1).tensors()
     ours, theirs = [], []
     for turn in range(rounds + 1):
         measured = _times(step, 8), _times(lambda: peer.train_step(model, opt, *drawn), 5)
@@ -139,7 +139,7 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
 def _our_step(law: Law, device: str, batch: int) -> tuple[Callable[[], object], int]:
     """A training step on one drawn batch, and its labelled queries."""
     model = PretrainedTransformer(SPEC, MODEL).to(device).train()
-    opt = fit.Optimiser(model, OPTIM)
+    opt = fit.Optimizer(model, OPTIM)
     drawn = law.draw(0, 0, batch, OPTIM.queries)
     data = drawn.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=drawn.query.shape))
 

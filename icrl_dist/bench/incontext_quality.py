@@ -151,7 +151,7 @@ def ours(seed: int, report: Report = lambda text: None, steps: int = STEPS, clos
             raise _Enough
         watch.go()
 
-    opt = fit.Optimiser(model, OPTIM)
+    opt = fit.Optimizer(model, OPTIM)
     watch.go()
     try:
         fit.fit(model, opt, OPTIM, OPTIM.learning_rate, steps, batch, look)
@@ -167,7 +167,7 @@ def theirs(
     law, watch, curve = Law(seed), _Watch(), []
     torch.manual_seed(seed)
     model = peer.Peer(SPEC)
-    opt = peer.optimiser(model)
+    opt = peer.optimizer(model)
     held_out = law.draw(1, 0, HELD_OUT, 1)
     floor, steps = law.floor(held_out), contexts // peer.BATCH
     for step in range(1, steps + 1):

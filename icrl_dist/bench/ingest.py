@@ -170,12 +170,12 @@ class _Learner:
         one = example()
         size, actions = one.observations.shape[1], one.labels.shape[1]
         spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))
-        job = Job("adapt", *one.identity[:3], (one.variation,), 1, one.weights, seed=0)
+        job = Job("adapt", *one.identity[:3], (one.variation,), 1, one.policy_version, seed=0)
 
         def note(_: Trajectory) -> None:
             stored.append(time.monotonic())
 
-        return Inbox(store, spec, LIMIT, lambda _: job, lambda _: one.digest, note, self._fail)
+        return Inbox(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, self._fail)
 
     def _put(self, query: Query) -> None:
         assert self._inbox is not None

@@ -65,7 +65,7 @@ class Peer(nn.Module):
         return logits
 
 
-def optimiser(model: Peer) -> torch.optim.AdamW:
+def optimizer(model: Peer) -> torch.optim.AdamW:
     """AdamW at the official rate."""
     return torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
 

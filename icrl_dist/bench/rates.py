@@ -179,7 +179,7 @@ class _EnoughSeen(Exception):  # noqa: N818
 
 
 def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, budget_s: float) -> float:
-    """Seconds of an optimiser step, the drawing of its batch included; 0 if the phase has no fit."""
+    """Seconds of an optimizer step, the drawing of its batch included; 0 if the phase has no fit."""
     if not phase.steps:
         return 0.0
     pools = METHODS[run.method].learn(run, dataclasses.replace(phase, round=0), data)
@@ -187,7 +187,7 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
 
     def batch(step: int) -> batches.Batch:
         rng = np.random.default_rng(step)
-        return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.stretches)
+        return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.windows)
 
     def progress(step: int, loss: float) -> None:
         times.append(time.perf_counter())
@@ -195,7 +195,7 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        fit.fit(model, fit.Optimiser(model, optim), optim, 1e-6, 200, batch, progress)
+        fit.fit(model, fit.Optimizer(model, optim), optim, 1e-6, 200, batch, progress)
     return float(np.mean(np.diff(times[2:])))  # contexts differ in length from step to step: the mean, not the median
 
 
@@ -210,7 +210,7 @@ def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
             spec,
             run.stream.max_message_bytes,
             lambda _: dataclasses.replace(job, trials=1 << 30),
-            lambda _: few[0].digest,
+            lambda _: few[0].weights_digest,
             lambda _: None,
             acknowledged.put,
         )

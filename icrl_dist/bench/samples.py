@@ -32,16 +32,16 @@ def made_up(job: Job) -> list[Trajectory]:
     rows = job.rows()[: max(2, job.tasks)]
     chosen = list(job.variations[: len(rows)])
     ran = episode(registry.batch(chosen), evaluate.random_vectors(chosen), [np.random.default_rng(r) for r in range(len(rows))])
-    queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
-    count, actions = queries + stretches * length, ran.actions.shape[-1]
+    queries, windows, length = (int(str(job.setting(name))) for name in ("queries", "windows", "window"))
+    count, actions = queries + windows * length, ran.actions.shape[-1]
     for row, (task, variation) in enumerate(rows):
         for trial in range(job.trials):
             made.append(
                 Trajectory(
                     identity=next(iter(job.identities()))._replace(task=task, variation=variation, trial=trial),
                     variation=chosen[row],
-                    weights=job.weights,
-                    digest="",
+                    policy_version=job.policy_version,
+                    weights_digest="",
                     worker="plan",
                     observations=ran.observations[row],
                     actions=ran.actions[row],
@@ -49,8 +49,8 @@ def made_up(job: Job) -> list[Trajectory]:
                     adversary=ran.adversary[row],
                     queries=ran.observations[row][rng.integers(0, len(ran.actions[row]), count)],
                     labels=rng.uniform(-1, 1, (count, actions)).astype(np.float32),
-                    taken=np.zeros((stretches * length, actions), np.float32),
-                    gained=np.zeros(stretches * length, np.float32),
+                    taken=np.zeros((windows * length, actions), np.float32),
+                    gained=np.zeros(windows * length, np.float32),
                     origin="expert",
                 )
             )

@@ -193,12 +193,12 @@ def _inbox(store: Store, count: int, stored: list[float], failures: queue.Simple
     one = example()
     size, actions = one.observations.shape[1], one.labels.shape[1]
     spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))
-    job = Job("adapt", *one.identity[:2], 0, (one.variation,) * count, 1, one.weights, seed=0, tasks=count)
+    job = Job("adapt", *one.identity[:2], 0, (one.variation,) * count, 1, one.policy_version, seed=0, tasks=count)
 
     def note(_: Trajectory) -> None:
         stored.append(time.monotonic())
 
-    return Inbox(store, spec, LIMIT, lambda _: job, lambda _: one.digest, note, failures.put)
+    return Inbox(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, failures.put)
 
 
 @contextlib.contextmanager

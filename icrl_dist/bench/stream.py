@@ -40,8 +40,8 @@ def example(trial: int = 0) -> Trajectory:
     return Trajectory(
         identity=Identity("adapt", 0, 0, 0, trial),
         variation=Variation(Task.of("dmc", problem="walker-run", mass=5.0), Adversary.of("force", strength=1.0)),
-        weights=0,
-        digest="0" * 64,
+        policy_version=0,
+        weights_digest="0" * 64,
         worker="bench",
         observations=rng.normal(size=(steps + 1, observation)).astype(np.float32),
         actions=np.zeros(steps, np.int16),

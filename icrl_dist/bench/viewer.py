@@ -88,8 +88,8 @@ def _episodes(worker: int, streams: int) -> list[list[Trajectory]]:
             Trajectory(
                 identity=Identity("adapt", 0, stream // 8, stream % 8, trial),
                 variation=Variation(task, adversary),
-                weights=0,
-                digest="0" * 64,
+                policy_version=0,
+                weights_digest="0" * 64,
                 worker=f"w{worker}",
                 observations=np.zeros((101, 2), np.float32),
                 actions=np.zeros(100, np.int16),

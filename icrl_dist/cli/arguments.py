@@ -69,7 +69,7 @@ class Evaluate:
     deploy: Deployment | None = None
     """``paper``: Algorithm 1, the context frozen within an episode; ``committed``: every transition
     joins the context at once, and a guess once acted on is kept.  Committed if not given, for an
-    agent that was trained on stretches (model.stretch); the posterior suite is about ``paper``."""
+    agent that was trained on windows (model.window); the posterior suite is about ``paper``."""
     episodes: int | None = None
     """Online episodes; the run's own number if not given (posterior: 40)."""
     seeds: int | None = None
@@ -178,11 +178,11 @@ class Bench:
     quick: bool = False
     """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
     little and 3 episodes instead of 10 (disturbance), 2 pairs of short windows instead of 8 (monitor)."""
-    bite: float | None = None
+    drop: float | None = None
     """disturbance: instead, the strength at which that share of the return is lost, as in 0.25; solved once
-    a problem and kept for ``control.strength`` of later runs, as ``bite:0.25``."""
+    a problem and kept for ``control.strength`` of later runs, as ``drop:0.25``."""
     steps: int | None = None
-    """Steps of the experts' training (disturbance --bite), or those of it with updates (experts --device cuda)."""
+    """Steps of the experts' training (disturbance --drop), or those of it with updates (experts --device cuda)."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """experts: ``cuda`` measures 160 experts on a GPU beside stable-baselines3 on one core, and trains an
     expert set of the paper for a while to tell how long it takes; ``auto``: on a GPU if there is one."""

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def bench(arguments: Bench, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
     from icrl_dist.bench import (
-        bite,
         broadcast,
         disturbance,
+        drop,
         env,
         experts,
         experts_gpu,
@@ -43,13 +43,13 @@ def bench(arguments: Bench, console: Console) -> int:
         "recovery",
     ):
         raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
-    if (arguments.name != "disturbance" or arguments.quick) and arguments.bite is not None:
-        raise ConfigError(f"--bite {arguments.bite:g}: it belongs to `bench disturbance`, without --quick")
+    if (arguments.name != "disturbance" or arguments.quick) and arguments.drop is not None:
+        raise ConfigError(f"--drop {arguments.drop:g}: it belongs to `bench disturbance`, without --quick")
     if arguments.name != "experts" and arguments.device != "cpu":
         raise ConfigError(f"--device {arguments.device}: it belongs to `bench experts`")
-    if arguments.bite is None and arguments.device == "cpu" and arguments.steps is not None:
+    if arguments.drop is None and arguments.device == "cpu" and arguments.steps is not None:
         raise ConfigError(
-            f"--steps {arguments.steps}: it belongs to `bench disturbance --bite` and `bench experts --device cuda`"
+            f"--steps {arguments.steps}: it belongs to `bench disturbance --drop` and `bench experts --device cuda`"
         )
     if arguments.device != "cpu" and arguments.steps is not None and arguments.steps < 1:
         raise ConfigError(f"--steps {arguments.steps}: must be above 0")
@@ -87,10 +87,10 @@ def bench(arguments: Bench, console: Console) -> int:
             text = (experts_gpu if on_gpu else experts).describe(result)
         case "disturbance":
             say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
-            if arguments.bite is None:
+            if arguments.drop is None:
                 text = disturbance.describe(result := disturbance.run(arguments.problem, arguments.quick, say))
             else:
-                text = bite.describe(result := bite.run(arguments.bite, arguments.problem, arguments.steps, say))
+                text = drop.describe(result := drop.run(arguments.drop, arguments.problem, arguments.steps, say))
         case "monitor":
             with console.status("monitor"):
                 result = monitor.run(arguments.folder, *((2, 2.0) if arguments.quick else ()))

@@ -53,18 +53,18 @@ def do(job: Job, policies: Policies, worker: str, tell: Tell = unheard, look: Lo
 
 
 def random_context(job: Job, worker: str) -> Iterator[Trajectory]:
-    """Contexts D^{i,k} of behaviour policies, query states and their labels (Algorithm 2, lines 8 to 12).
+    """Contexts D^{i,k} of behavior policies, query states and their labels (Algorithm 2, lines 8 to 12).
 
-    Settings: ``behaviours``, taken by turns from trial to trial; ``queries`` a trajectory,
-    ``labels`` (soft, sampled, heuristic), ``gamma``, ``slack``; ``stretches`` a trajectory, of
-    ``stretch`` states.
+    Settings: ``behaviors``, taken by turns from trial to trial; ``queries`` a trajectory,
+    ``labels`` (soft, sampled, heuristic), ``gamma``, ``slack``; ``windows`` a trajectory, of
+    ``window`` states.
     """
     labeller = _Labeller(job)
     identities = list(job.identities())
     rngs = [identity.rng(job.seed) for identity in identities]
     env = registry.batch([job.variation(identity) for identity in identities])
-    behaviours = str(job.setting("behaviours")).split(",")
-    kinds = [behaviours[identity.trial % len(behaviours)] for identity in identities]
+    behaviors = str(job.setting("behaviors")).split(",")
+    kinds = [behaviors[identity.trial % len(behaviors)] for identity in identities]
     ran = episode(env, Walks(labeller.size, env.spec.horizon, kinds, rngs), rngs)
     for row, (identity, known) in enumerate(zip(identities, labeller(identities, rngs), strict=True)):
         yield _trajectory(job, identity, ran, row, worker, "", known)
@@ -77,7 +77,7 @@ def adapt(job: Job, policies: Policies, worker: str, look: Look | None = None) -
     ``labels`` and what goes with it, as for ``random_context``, or ``none``: then T^j's own later
     actions become labels, which is the learner's choice to make.
     """
-    model, digest = policies.at(job.weights)
+    model, digest = policies.at(job.policy_version)
     context = ContextConfig(max=int(_number(job, "context_max")), keep="all")
     env = registry.batch(job.variations)
     trial, shown = 0, env.batch - 1
@@ -112,34 +112,34 @@ class _Known(NamedTuple):
 
 def _nothing(spec: Spec) -> _Known:
     zeros = np.zeros((0, spec.observation), np.float32), np.zeros((0, spec.actions), np.float32)
-    taken = _NO_STRETCH[0] if spec.discrete else np.zeros((0, spec.actions), np.float32)
-    return _Known(*zeros, taken, _NO_STRETCH[1], "none")
+    taken = _NO_WINDOW[0] if spec.discrete else np.zeros((0, spec.actions), np.float32)
+    return _Known(*zeros, taken, _NO_WINDOW[1], "none")
 
 
-_NO_STRETCH = np.zeros(0, np.int16), np.zeros(0, np.float32)
+_NO_WINDOW = np.zeros(0, np.int16), np.zeros(0, np.float32)
 
 
 class _Labeller:
-    """Random query states of a trajectory's variation, stretches from random states on, and their labels."""
+    """Random query states of a trajectory's variation, windows from random states on, and their labels."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
         self._hypotheses = Hypotheses.of(job.variations)
         self.size = self._hypotheses.size
         self._mode, self._queries = job.setting("labels"), int(_number(job, "queries"))
-        self._stretches, self._length = int(_number(job, "stretches")), int(_number(job, "stretch"))
+        self._windows, self._length = int(_number(job, "windows")), int(_number(job, "window"))
         self._place = {row: index for index, row in enumerate(job.rows())}
         self._states = cells(self.size)
         if self._mode == "heuristic":
             self._table = heuristic_labels(self._hypotheses)
         else:
             self._table = soft_labels(self._hypotheses, _number(job, "gamma"), _number(job, "slack"))
-        if self._stretches:
-            self._guesses = self._undisturbed(job)
+        if self._windows:
+            self._decoys = self._undisturbed(job)
 
     def _undisturbed(self, job: Job) -> Float32[np.ndarray, "M C A"]:
         """The optimal policies of the undisturbed tasks that may be guessed."""
-        cells = job.setting("guesses")
+        cells = job.setting("decoys")
         assert isinstance(cells, tuple)
         tasks = [job.variations[0].task.replace(goal=divmod(int(cell), self.size)) for cell in cells]
         hypotheses = Hypotheses.of([Variation(task) for task in tasks])
@@ -148,7 +148,7 @@ class _Labeller:
     def __call__(self, identities: Sequence[Identity], rngs: Sequence[np.random.Generator]) -> list[_Known]:
         place = np.array([self._place[identity.task, identity.variation] for identity in identities])
         alone = [self._alone(p, rng) for p, rng in zip(place.tolist(), rngs, strict=True)]
-        if not self._stretches:
+        if not self._windows:
             return alone
         states, taken, gained = self._follow(place, rngs)
         labels = self._table[place[:, None], cell_numbers(states, self.size)]
@@ -172,25 +172,25 @@ class _Labeller:
         if self._mode == "sampled":
             labels = np.eye(labels.shape[1], dtype=np.float32)[sample(labels, rng.random(len(query)))]
         origin = "heuristic" if self._mode == "heuristic" else "optimal"
-        return _Known(self._states[query], labels, *_NO_STRETCH, origin)
+        return _Known(self._states[query], labels, *_NO_WINDOW, origin)
 
     def _follow(
         self, place: Int[np.ndarray, " B"], rngs: Sequence[np.random.Generator]
     ) -> tuple[Float32[np.ndarray, "B R S"], Int16[np.ndarray, "B R"], Float32[np.ndarray, "B R"]]:
-        """States, actions and rewards of each row's stretches, one after another, from random states on.
+        """States, actions and rewards of each row's windows, one after another, from random states on.
 
         The labelling policy acts, or that of a wrong guess.
         """
-        misled, stretches, guesses = _number(self._job, "misled"), self._stretches, len(self._guesses)
-        drawn = [(rng.random(stretches), rng.integers(0, guesses, size=stretches)) for rng in rngs]
-        wrong, guess = (np.concatenate(column) for column in zip(*drawn, strict=True))
-        rows = place.repeat(stretches)
-        policy = np.where((wrong < misled)[:, None, None], self._guesses[guess], self._table[rows])
+        decoy_fraction, windows, decoys = _number(self._job, "decoy_fraction"), self._windows, len(self._decoys)
+        drawn = [(rng.random(windows), rng.integers(0, decoys, size=windows)) for rng in rngs]
+        wrong, decoy = (np.concatenate(column) for column in zip(*drawn, strict=True))
+        rows = place.repeat(windows)
+        policy = np.where((wrong < decoy_fraction)[:, None, None], self._decoys[decoy], self._table[rows])
         short = [self._job.variations[p] for p in rows.tolist()]
         short = [Variation(v.task.replace(start="random", horizon=self._length), v.adversary) for v in short]
-        chance = [rng for rng in rngs for _ in range(stretches)]
+        chance = [rng for rng in rngs for _ in range(windows)]
         ran = episode(registry.batch(short), OptimalAgent(policy, self.size), chance)
-        states = ran.observations[:, :-1].reshape(len(place), stretches * self._length, -1)
+        states = ran.observations[:, :-1].reshape(len(place), windows * self._length, -1)
         return states, ran.actions.reshape(len(place), -1), ran.rewards.reshape(len(place), -1)
 
 
@@ -213,8 +213,8 @@ def _trajectory(
     return Trajectory(
         identity=identity,
         variation=job.variation(identity),
-        weights=job.weights,
-        digest=digest,
+        policy_version=job.policy_version,
+        weights_digest=digest,
         worker=worker,
         observations=ran.observations[row],
         actions=ran.actions[row],

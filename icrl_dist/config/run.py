@@ -67,27 +67,27 @@ class PretrainConfig:
     contexts: int = 80000
     """Episodes in all, the same for every method and every K (appendix C.1); of a SAC expert's history
     no more than its training has."""
-    behaviours: tuple[Literal["random", "persistent", "goals", "sweep"], ...] = ("random",)
+    behaviors: tuple[Literal["random", "persistent", "goals", "sweep"], ...] = ("random",)
     """Who walks through the contexts, by turns: ``random`` actions (the paper's); ``persistent``
     walks, which mostly go on as before; walks to random ``goals``, with a rest there; a ``sweep``
     through cells not yet visited."""
     queries: int = 16
     """Labelled query states an episode."""
-    stretches: int = 0
-    """Stretches of ``model.stretch`` states an episode, in which the optimal policy acts from a
+    windows: int = 0
+    """Windows of ``model.window`` states an episode, in which the optimal policy acts from a
     random state on."""
-    misled: float = 0.3
-    """Share of the stretches in which another training task's optimal policy acts, while labels are
+    decoy_fraction: float = 0.3
+    """Share of the windows in which another training task's optimal policy acts, while labels are
     this task's: from them T_theta learns to let go of a guess that was wrong."""
     steps: int = 20000
-    """Optimiser steps."""
+    """Optimizer steps."""
 
 
 @dataclass(frozen=True)
-class PracticeConfig:
+class DAggerConfig:
     """Further rounds of pretraining on histories that T_theta makes itself (DPT and ICAG; ICAA has its own).
 
-    No behaviour policy searches as a deployed T_theta does, so its own long contexts are foreign
+    No behavior policy searches as a deployed T_theta does, so its own long contexts are foreign
     to it.  T^j is deployed in every training variation (Algorithm 1); the labels remain the
     optimal policy's, as in D_pre.
     """
@@ -97,7 +97,7 @@ class PracticeConfig:
     trials: int = 20
     """Episodes of a history; each round's contexts are its first few, up to all."""
     steps: int = 4000
-    """Optimiser steps a round."""
+    """Optimizer steps a round."""
     learning_rate: float = 1e-3
     """Peak learning rate of a round."""
     new_fraction: float = 0.5
@@ -143,21 +143,21 @@ class ModelConfig:
     fourier: int = 0
     """Sine and cosine pairs added to each observation component; 0 gives the scaled values
     only, which keep no gap between training and held-out goals (docs/decisions.md)."""
-    stretch: int = 1
-    """States of a stretch: T_theta also reads what was done in the stretch so far (zeta of eq. 6), so
+    window: int = 1
+    """States of a window: T_theta also reads what was done in the window so far (zeta of eq. 6), so
     that a guess once acted on is kept.  1: none, as in the paper's experiments."""
     dropout: float = 0.0
     """Dropout on attention and feed-forward outputs."""
 
 
 def default_deployment(model: ModelConfig) -> Deployment:
-    """``committed`` for a model that is trained on stretches."""
-    return "committed" if model.stretch > 1 else "paper"
+    """``committed`` for a model that is trained on windows."""
+    return "committed" if model.window > 1 else "paper"
 
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """The optimiser (appendix B.2: AdamW, weight decay 1e-4, learning rate 1e-3, batch 128)."""
+    """The optimizer (appendix B.2: AdamW, weight decay 1e-4, learning rate 1e-3, batch 128)."""
 
     learning_rate: float = 1e-3
     """Peak learning rate."""
@@ -174,8 +174,8 @@ class OptimConfig:
     """Transitions a step, at most: of longer contexts fewer fit in; 0 for no limit."""
     queries: int = 32
     """(prefix, query) pairs a context; each sees its own random prefix (eq. 1, many times)."""
-    stretches: int = 0
-    """Stretches a context (``model.stretch``), each with its own random prefix."""
+    windows: int = 0
+    """Windows a context (``model.window``), each with its own random prefix."""
     episodes: int = 4
     """Episodes in a training context, at most; each step draws its own number."""
     warmup: int = 200
@@ -272,7 +272,7 @@ class Run:
     sac: SACConfig = field(default_factory=SACConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
-    practice: PracticeConfig = field(default_factory=PracticeConfig)
+    dagger: DAggerConfig = field(default_factory=DAggerConfig)
     icaa: ICAAConfig = field(default_factory=ICAAConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)

@@ -43,14 +43,14 @@ class ControlConfig:
     """Steps an episode; 0: the problem's own, 200 in DeepMind Control, 500 in Meta-World."""
     strength: float | str = 1.0
     """Strength of a pretraining adversary: 1 is Table 2's largest force, or the full ``disturbance``.
-    ``bite:0.25``: the smallest at which the undisturbed experts lose a quarter of their return, as
-    ``icrl-dist bench disturbance --bite`` has measured it."""
+    ``drop:0.25``: the smallest at which the undisturbed experts lose a quarter of their return, as
+    ``icrl-dist bench disturbance --drop`` has measured it."""
     histories: Literal["sac", "scripted"] = "sac"
     """What contexts are: episodes of SAC experts' trainings (appendix C.2), or, in Meta-World, of the
     scripted policy, told the right goal and wrong ones by turns, with noise
     (``problems.metaworld.scripted_contexts``)."""
     solved: str = ""
-    """What a bite came to when the run was read, as PROBLEM/FORCES/bite:SHARE=STRENGTH; not for you to set."""
+    """What a drop came to when the run was read, as PROBLEM/FORCES/drop:SHARE=STRENGTH; not for you to set."""
     forces: Literal["paper", "qarl"] = "paper"
     """DeepMind Control: where and how hard an adversary pushes, by Table 2 or by QARL's code."""
     disturbance: float = 0.01

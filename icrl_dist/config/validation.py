@@ -26,7 +26,7 @@ def validate(run: Run, source: str) -> None:
     if run.problem not in PROBLEMS:
         known = f"choose one of {', '.join(PROBLEMS)}"
         raise ConfigError(f"{source}: problem = {run.problem!r}{nearest(run.problem, PROBLEMS)}: {known}")
-    room, icaa, practice, optim = run.darkroom, run.icaa, run.practice, run.optim
+    room, icaa, dagger, optim = run.darkroom, run.icaa, run.dagger, run.optim
     need(room.size >= 2, "darkroom.size", room.size, "a room has at least 2 cells a side")
     need(room.horizon >= 1, "darkroom.horizon", room.horizon, "an episode has at least 1 step")
     need(0 < room.train_fraction < 1, "darkroom.train_fraction", room.train_fraction, "use a share between 0 and 1")
@@ -53,19 +53,21 @@ def validate(run: Run, source: str) -> None:
         _validate_control(run, need)
     need(run.pretrain.contexts >= train, "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})")
     need(0 <= icaa.context_trials < icaa.trials, "icaa.context_trials", icaa.context_trials, "must be below icaa.trials")
-    need(len(run.pretrain.behaviours) > 0, "pretrain.behaviours", run.pretrain.behaviours, "name at least one")
+    need(len(run.pretrain.behaviors) > 0, "pretrain.behaviors", run.pretrain.behaviors, "name at least one")
     need(icaa.rounds >= 0, "icaa.rounds", icaa.rounds, "at least 0")
-    need(0 <= run.pretrain.misled <= 1, "pretrain.misled", run.pretrain.misled, "a share lies in [0, 1]")
-    need(0 <= practice.new_fraction <= 1, "practice.new_fraction", practice.new_fraction, "a share lies in [0, 1]")
+    need(
+        0 <= run.pretrain.decoy_fraction <= 1, "pretrain.decoy_fraction", run.pretrain.decoy_fraction, "a share lies in [0, 1]"
+    )
+    need(0 <= dagger.new_fraction <= 1, "dagger.new_fraction", dagger.new_fraction, "a share lies in [0, 1]")
     need(0 <= optim.beta2 < 1, "optim.beta2", optim.beta2, "must lie in [0, 1)")
     need(0 <= icaa.new_fraction <= 1, "icaa.new_fraction", icaa.new_fraction, "a share lies in [0, 1]")
     need(run.model.heads > 0, "model.heads", run.model.heads, "must be above 0")
-    need(run.model.stretch > 0, "model.stretch", run.model.stretch, "at least 1, which is none")
-    for where, stretches in (("pretrain.stretches", run.pretrain.stretches), ("optim.stretches", optim.stretches)):
-        remedy = "above 0 exactly if model.stretch is above 1"
-        need((stretches > 0) == (run.model.stretch > 1), where, stretches, remedy)
+    need(run.model.window > 0, "model.window", run.model.window, "at least 1, which is none")
+    for where, windows in (("pretrain.windows", run.pretrain.windows), ("optim.windows", optim.windows)):
+        remedy = "above 0 exactly if model.window is above 1"
+        need((windows > 0) == (run.model.window > 1), where, windows, remedy)
     horizon = room.horizon if run.problem == "darkroom" else sac.horizon(run.problem, run.control.horizon)
-    need(run.model.stretch <= horizon, "model.stretch", run.model.stretch, f"at most the horizon, {horizon} steps")
+    need(run.model.window <= horizon, "model.window", run.model.window, f"at most the horizon, {horizon} steps")
     need(run.model.width % run.model.heads == 0, "model.heads", run.model.heads, "must divide model.width")
     need(run.context.max >= horizon, "context.max", run.context.max, "must hold at least one episode")
     need(0 <= run.model.dropout < 1, "model.dropout", run.model.dropout, "a probability below 1")
@@ -83,9 +85,9 @@ def validate(run: Run, source: str) -> None:
     positive = {
         "pretrain.queries": run.pretrain.queries,
         "pretrain.steps": run.pretrain.steps,
-        "practice.trials": practice.trials,
-        "practice.steps": practice.steps,
-        "practice.learning_rate": practice.learning_rate,
+        "dagger.trials": dagger.trials,
+        "dagger.steps": dagger.steps,
+        "dagger.learning_rate": dagger.learning_rate,
         "icaa.steps": icaa.steps,
         "model.layers": run.model.layers,
         "model.width": run.model.width,
@@ -109,7 +111,7 @@ def validate(run: Run, source: str) -> None:
         "darkroom.split_seed": room.split_seed,
         "darkroom.label_slack": room.label_slack,
         "model.fourier": run.model.fourier,
-        "practice.rounds": practice.rounds,
+        "dagger.rounds": dagger.rounds,
         "optim.transitions": optim.transitions,
         "optim.muon": optim.muon,
         "optim.weight_decay": optim.weight_decay,
@@ -150,16 +152,14 @@ def _validate_control(run: Run, need: Need) -> None:
         need(0 <= control.disturbance <= 0.1, "control.disturbance", control.disturbance, "0 to 0.1 metres")
     alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
     need(
-        not (run.pretrain.stretches and run.pretrain.misled and alone),
-        "pretrain.misled",
-        run.pretrain.misled,
+        not (run.pretrain.windows and run.pretrain.decoy_fraction and alone),
+        "pretrain.decoy_fraction",
+        run.pretrain.decoy_fraction,
         f"0, or a stream.job_tasks that leaves none of the {count} tasks alone in a job: another's expert misleads",
     )
     need(control.horizon >= 0, "control.horizon", control.horizon, "at least 0, which is the problem's own")
     if isinstance(control.strength, float):
         need(0 <= control.strength < math.inf, "control.strength", control.strength, "must not be negative, and be finite")
     elif run.problem.startswith("metaworld"):
-        need(control.disturbance > 0, "control.disturbance", control.disturbance, "a bite needs something to multiply")
-    need(
-        run.practice.rounds == 0, "practice.rounds", run.practice.rounds, "only Dark Room's labels can be had of new histories"
-    )
+        need(control.disturbance > 0, "control.disturbance", control.disturbance, "a drop needs a distance to multiply")
+    need(run.dagger.rounds == 0, "dagger.rounds", run.dagger.rounds, "only Dark Room's labels can be had of new histories")

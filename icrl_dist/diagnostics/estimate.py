@@ -37,7 +37,7 @@ class PhaseRates:
     stored_bytes: float
     """Bytes a trajectory on the learner's disk."""
     fit_steps: int
-    """Optimiser steps of the fit."""
+    """Optimizer steps of the fit."""
     fit_step_s: float
     """Seconds a step, on the learner."""
 

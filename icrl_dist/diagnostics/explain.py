@@ -33,7 +33,7 @@ def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, 
         raise ConfigError(f"{folder}: has no trajectory {identity}; `icrl-dist explain {folder}` lists what it has") from None
     finally:
         store.close()
-    produced = identity.produces
+    produced = identity.next_version
     seed = lineage.run_of(produced).seed
     answer: dict[str, Any] = {
         **ledger_line(row, seed),
@@ -46,9 +46,9 @@ def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, 
         "from_ancestor": produced <= max((newest for newest, _ in lineage.ancestors), default=-1),
         "intact": wire.trajectory_digest(trajectory) == row.sha256,
     }
-    if row.weights >= 0:
-        manifest = load_checkpoint(checkpoint_file(folder, row.weights)).manifest
-        answer["weights_intact"] = manifest["weights_digest"] == row.digest
+    if row.policy_version >= 0:
+        manifest = load_checkpoint(checkpoint_file(folder, row.policy_version)).manifest
+        answer["weights_intact"] = manifest["weights_digest"] == row.weights_digest
     if rerun:
         answer["rerun_equal"] = _again(folder, lineage.run_of(produced), row) == row.sha256
     return answer
@@ -59,7 +59,7 @@ def ledger(folder: Path) -> Iterator[dict[str, Any]]:
     store, lineage = _opened(folder)
     try:
         for row in store.ledger:
-            yield ledger_line(row, lineage.run_of(row.identity.produces).seed)
+            yield ledger_line(row, lineage.run_of(row.identity.next_version).seed)
     finally:
         store.close()
 
@@ -70,8 +70,8 @@ def ledger_line(row: Row, seed: int) -> dict[str, Any]:
         "identity": str(row.identity),
         "seed": seed,
         "spawn_key": list(row.identity.key()),
-        "weights": row.weights,
-        "weights_digest": row.digest,
+        "policy_version": row.policy_version,
+        "weights_digest": row.weights_digest,
         "worker": row.worker,
         "label_origin": "self" if row.origin == "none" else row.origin,
         "sha256": row.sha256,
@@ -83,7 +83,11 @@ def ledger_line(row: Row, seed: int) -> dict[str, Any]:
 
 def describe(answer: dict[str, Any]) -> str:
     """The answer for people, a line a fact."""
-    acted = f"T^{answer['weights']} ({answer['weights_digest'][:16]})" if answer["weights"] >= 0 else "a policy without weights"
+    acted = (
+        f"T^{answer['policy_version']} ({answer['weights_digest'][:16]})"
+        if answer["policy_version"] >= 0
+        else "a policy without weights"
+    )
     if "weights_intact" in answer:
         acted += ", whose checkpoint is there" if answer["weights_intact"] else ", whose checkpoint holds OTHER weights"
     origin = {"self": "later trials of its own variation (Algorithm 3, line 14)", "optimal": "the variation's optimal policy"}
@@ -134,7 +138,7 @@ def _again(folder: Path, run: Run, row: Row) -> str:
     for phase in method.phases(run):
         for job in method.ask(run, phase) if (phase.stage, phase.round) == row.identity[:2] else ():
             if (row.identity.task, row.identity.variation) in job.rows():
-                repeated = dataclasses.replace(job, weights=row.weights)
+                repeated = dataclasses.replace(job, policy_version=row.policy_version)
                 for trajectory in jobs.do(repeated, _Checkpoints(folder), "explain"):
                     if trajectory.identity == row.identity:
                         return wire.trajectory_digest(trajectory)

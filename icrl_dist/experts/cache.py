@@ -44,7 +44,7 @@ class History:
     labels: Float32[np.ndarray, "E H A"]
     """The right action at each of the first H states: the expert's mean; in Meta-World the scripted policy's."""
     led_actions: Float32[np.ndarray, "G H A"]
-    """G further episodes, which stretches are cut from (zeta of eq. 6): in each the expert acted, without chance of its own."""
+    """G further episodes, which windows are cut from (zeta of eq. 6): in each the expert acted, without chance of its own."""
     led_observations: Float32[np.ndarray, "G H+1 S"]
     led_rewards: Float32[np.ndarray, "G H"]
     led_labels: Float32[np.ndarray, "G H A"]

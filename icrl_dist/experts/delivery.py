@@ -1,6 +1,6 @@
-"""What a history becomes on its way to the learner: episodes, query states and stretches, with their labels.
+"""What a history becomes on its way to the learner: episodes, query states and windows, with their labels.
 
-Stretches are cut from episodes that an expert led (zeta of eq. 6): the variation's own, or, for a guess of
+Windows are cut from episodes that an expert led (zeta of eq. 6): the variation's own, or, for a guess of
 the task that is wrong, another task's, while labels are the variation's own.
 """
 
@@ -20,7 +20,7 @@ from icrl_dist.rollout.recorder import Recorder
 from icrl_dist.types import Identity, Job, Trajectory
 
 _KNOWN = 1
-"""Part of the key of what is drawn for query states and stretches: the trajectory's own key draws its episode."""
+"""Part of the key of what is drawn for query states and windows: the trajectory's own key draws its episode."""
 
 Act = Callable[[np.ndarray], np.ndarray]
 """Mean actions (N, E, A) of N experts in E states of each (N, E, S)."""
@@ -31,18 +31,18 @@ def delivered(job: Job, found: Sequence[History], worker: str, act: Act | None) 
 
     ``act`` is what leads and labels, or None for Meta-World's scripted policy.
     """
-    misled = _misled(job, act)
+    decoys = _decoys(job, act)
     for row, (task, variation) in enumerate(job.rows()):
         history = found[row]
-        led = _Led.of(history, {name: column[row] for name, column in misled.items()})
+        led = _Led.of(history, {name: column[row] for name, column in decoys.items()})
         chosen = np.linspace(0, len(history.rewards) - 1, job.trials).round().astype(int)
         for trial, episode in enumerate(chosen.tolist()):
             identity = Identity(job.stage, job.round, task, variation, trial)
             yield Trajectory(
                 identity=identity,
                 variation=job.variation(identity),
-                weights=job.weights,
-                digest="",
+                policy_version=job.policy_version,
+                weights_digest="",
                 worker=worker,
                 observations=history.observations[episode],
                 actions=history.actions[episode],
@@ -65,23 +65,23 @@ class _Led:
     """Which another task's expert led."""
 
     @classmethod
-    def of(cls, history: History, misled: dict[str, np.ndarray]) -> _Led:
-        """The variation's own, and those of ``misled`` that did not break down."""
+    def of(cls, history: History, decoys: dict[str, np.ndarray]) -> _Led:
+        """The variation's own, and those of ``decoy_fraction`` that did not break down."""
         own = {name: getattr(history, f"led_{name}") for name in ("actions", "observations", "rewards", "labels")}
-        others = {name: misled[name][misled["whole"]] if misled else column[:0] for name, column in own.items()}
+        others = {name: decoys[name][decoys["whole"]] if decoys else column[:0] for name, column in own.items()}
         both = {name: np.concatenate([column, others[name]]) for name, column in own.items()}
         return cls(**both, wrong=np.arange(len(both["actions"])) >= len(own["actions"]))
 
 
 def _known(job: Job, history: History, led: _Led, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Query states of the history and stretches of what experts led, with their labels: a trajectory's last arrays."""
-    queries, stretches, length = (int(str(job.setting(name))) for name in ("queries", "stretches", "stretch"))
+    """Query states of the history and windows of what experts led, with their labels: a trajectory's last arrays."""
+    queries, windows, length = (int(str(job.setting(name))) for name in ("queries", "windows", "window"))
     place = np.unravel_index(rng.integers(history.rewards.size, size=queries), history.rewards.shape)
-    wrong = rng.random(stretches) < float(str(job.setting("misled")))
+    wrong = rng.random(windows) < float(str(job.setting("decoy_fraction")))
     right_ones, wrong_ones = np.flatnonzero(~led.wrong), np.flatnonzero(led.wrong)
     episodes, at = [], []
-    for misled in wrong.tolist():
-        episodes += [int(rng.choice(wrong_ones if misled and len(wrong_ones) else right_ones))] * length
+    for decoys in wrong.tolist():
+        episodes += [int(rng.choice(wrong_ones if decoys and len(wrong_ones) else right_ones))] * length
         first = int(rng.integers(led.rewards.shape[1] - length + 1))
         at += list(range(first, first + length))
     rest = np.array(episodes, int), np.array(at, int)
@@ -117,12 +117,12 @@ def lead(env: Batch, act: Act | None, seeds: Sequence[int], by: Sequence[int]) -
     return columns
 
 
-def _misled(job: Job, act: Act | None) -> dict[str, np.ndarray]:
+def _decoys(job: Job, act: Act | None) -> dict[str, np.ndarray]:
     """``LED`` episodes of each variation that the next task's expert leads; none if nobody asks for them or there is no other.
 
     Begun as those of the variation's own expert are.
     """
-    if job.tasks == 1 or not int(str(job.setting("stretches"))) or not float(str(job.setting("misled"))):
+    if job.tasks == 1 or not int(str(job.setting("windows"))) or not float(str(job.setting("decoy_fraction"))):
         return {}
     seeds = [own_seed(variation, job.seed) for variation in job.variations]
     by = np.roll(np.arange(len(seeds)), -(len(seeds) // job.tasks))

@@ -52,8 +52,8 @@ def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajec
     """Histories D^{i,k} of SAC experts of each variation, query states and labels (Algorithm 2, lines 8 to 12).
 
     All of a job's experts train together, in lockstep; they, and so the histories, are known when
-    the last step is made.  Settings: those of ``settings``; ``queries`` a trajectory; ``stretches``
-    a trajectory, of ``stretch`` states, a share ``misled`` of them led by another task's expert.  Raises
+    the last step is made.  Settings: those of ``settings``; ``queries`` a trajectory; ``windows``
+    a trajectory, of ``window`` states, a share ``decoy_fraction`` of them led by another task's expert.  Raises
     RuntimeError for a variation whose simulation keeps breaking down.
     """
     config = sac_of(job)

@@ -18,7 +18,7 @@ import numpy as np
 from icrl_dist.config.run import Deployment, Run, default_deployment
 from icrl_dist.experts import cache
 from icrl_dist.problems import splits
-from icrl_dist.training.batches import Examples, Pool, Shelf, Shelved, Stretches
+from icrl_dist.training.batches import Examples, LabelledWindows, Pool, Shelf, Shelved
 from icrl_dist.types import Job, Params, Task, Trajectory, Variation
 
 
@@ -29,19 +29,19 @@ class Phase:
     stage: str
     round: int
     steps: int
-    """Optimiser steps of the fit."""
+    """Optimizer steps of the fit."""
     learning_rate: float
     """Peak learning rate of the fit."""
 
     @property
-    def acting(self) -> int:
+    def policy_version(self) -> int:
         """Version of the weights that act: T^j in round j of ``adapt``, none in ``pretrain``."""
         return self.round if self.stage == "adapt" else -1
 
     @property
-    def produces(self) -> int:
+    def next_version(self) -> int:
         """Version of the weights after the fit: 0 after ``pretrain``, j + 1 after round j."""
-        return self.acting + 1
+        return self.policy_version + 1
 
 
 Key = tuple[str, int, int, int]
@@ -75,8 +75,8 @@ def _pretrain_only(run: Run) -> tuple[Phase, ...]:
     return (Phase("pretrain", 0, run.pretrain.steps, run.optim.learning_rate),)
 
 
-def _then_practice(run: Run) -> tuple[Phase, ...]:
-    rounds = (Phase("adapt", j, run.practice.steps, run.practice.learning_rate) for j in range(run.practice.rounds))
+def _then_dagger(run: Run) -> tuple[Phase, ...]:
+    rounds = (Phase("adapt", j, run.dagger.steps, run.dagger.learning_rate) for j in range(run.dagger.rounds))
     return (*_pretrain_only(run), *rounds)
 
 
@@ -84,25 +84,28 @@ def _labelling(run: Run) -> Params:
     """What a collector must know to label queries."""
     room = run.darkroom
     goals = (task.vector("goal") for task in splits.split(run).train)
-    misled: Params = (("guesses", tuple(int(x) * room.size + int(y) for x, y in goals)), ("misled", run.pretrain.misled))
+    decoy_fraction: Params = (
+        ("decoys", tuple(int(x) * room.size + int(y) for x, y in goals)),
+        ("decoy_fraction", run.pretrain.decoy_fraction),
+    )
     return (
-        *(misled if run.pretrain.stretches else ()),
+        *(decoy_fraction if run.pretrain.windows else ()),
         ("gamma", room.gamma),
         ("labels", room.labels),
         ("queries", run.pretrain.queries),
         ("slack", room.label_slack),
-        ("stretch", run.model.stretch),
-        ("stretches", run.pretrain.stretches),
+        ("window", run.model.window),
+        ("windows", run.pretrain.windows),
     )
 
 
 def _of_histories(run: Run) -> Params:
     """The same in a continuous game."""
     return (
-        ("misled", run.pretrain.misled),
+        ("decoy_fraction", run.pretrain.decoy_fraction),
         ("queries", run.pretrain.queries),
-        ("stretch", run.model.stretch),
-        ("stretches", run.pretrain.stretches),
+        ("window", run.model.window),
+        ("windows", run.pretrain.windows),
     )
 
 
@@ -114,7 +117,7 @@ def _random_contexts(run: Run, phase: Phase, variations: Callable[[int, Task], t
     episodes than its training has.
     """
     if run.problem == "darkroom":
-        kind, settings = "random_context", (("behaviours", ",".join(run.pretrain.behaviours)), *_labelling(run))
+        kind, settings = "random_context", (("behaviors", ",".join(run.pretrain.behaviors)), *_labelling(run))
     else:
         kind, settings = "train_expert", (*_of_histories(run), *cache.settings(run.sac))
         if run.control.histories == "scripted":
@@ -135,19 +138,21 @@ def _jobs(
     for first in range(0, len(chosen), together):
         group = chosen[first : first + together]
         flat = tuple(v for variations in group for v in variations)
-        jobs.append(Job(kind, phase.stage, phase.round, first, flat, trials, phase.acting, run.seed, settings, len(group)))
+        jobs.append(
+            Job(kind, phase.stage, phase.round, first, flat, trials, phase.policy_version, run.seed, settings, len(group))
+        )
     return tuple(jobs)
 
 
-def _practice(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
+def _dagger(run: Run, phase: Phase, variations: Callable[[int, Task], tuple[Variation, ...]]) -> tuple[Job, ...]:
     """T^j makes a history in every training variation, started as at test; its queries are labelled as D_pre's.
 
     By every rule that it may be deployed by, job by job, for each makes histories of its own
     kind; two of three by Algorithm 1, whose histories D_pre is least like.
     """
     chosen = [variations(i, splits.deployed(task)) for i, task in enumerate(splits.split(run).train)]
-    jobs = _jobs(run, phase, "adapt", chosen, run.practice.trials, _labelling(run))
-    rules: tuple[Deployment, ...] = ("paper", "committed", "paper") if run.model.stretch > 1 else ("paper",)
+    jobs = _jobs(run, phase, "adapt", chosen, run.dagger.trials, _labelling(run))
+    rules: tuple[Deployment, ...] = ("paper", "committed", "paper") if run.model.window > 1 else ("paper",)
     return tuple(
         dataclasses.replace(job, settings=(*job.settings, *_deployment(run, rules[(phase.round + number) % len(rules)])))
         for number, job in enumerate(jobs)
@@ -160,12 +165,12 @@ def _deployment(run: Run, rule: Deployment) -> Params:
 
 
 def _labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
-    """A variation's episodes with the queries and stretches that were labelled when they were collected."""
+    """A variation's episodes with the queries and windows that were labelled when they were collected."""
     alone = np.concatenate([np.arange(len(t.queries)) < len(t.queries) - len(t.taken) for t in trials])
     names = ("queries", "labels", "taken", "gained")
     queries, labels, taken, gained = (np.concatenate([getattr(t, name) for t in trials]) for name in names)
-    stretches = Stretches.cut(run.model.stretch, queries[~alone], taken, gained, labels[~alone])
-    return Examples.of(trials, queries[alone], labels[alone], trials[0].identity.stage == "adapt", stretches)
+    windows = LabelledWindows.cut(run.model.window, queries[~alone], taken, gained, labels[~alone])
+    return Examples.of(trials, queries[alone], labels[alone], trials[0].identity.stage == "adapt", windows)
 
 
 def _shelf(run: Run, data: Dataset) -> Shelf[Key]:
@@ -188,19 +193,19 @@ def _undisturbed(run: Run, index: int, task: Task, round: int = 0) -> tuple[Vari
 
 
 def _dpt_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
-    asked = _random_contexts if phase.stage == "pretrain" else _practice
+    asked = _random_contexts if phase.stage == "pretrain" else _dagger
     return asked(run, phase, functools.partial(_undisturbed, run))
 
 
 def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
-    """D_pre, and in a round of practice the histories of this and all earlier rounds."""
+    """D_pre, and in a DAgger round the histories of this and all earlier rounds."""
     shelf = _shelf(run, data)
     pretrain = Pool(1.0, Shelved(shelf, data.variations("pretrain", 0)), run.optim.episodes)
     if phase.stage == "pretrain":
         return (pretrain,)
     cache = [key for j in range(phase.round + 1) for key in data.variations("adapt", j)]
-    share = run.practice.new_fraction
-    return dataclasses.replace(pretrain, share=1 - share), Pool(share, Shelved(shelf, cache), run.practice.trials)
+    share = run.dagger.new_fraction
+    return dataclasses.replace(pretrain, share=1 - share), Pool(share, Shelved(shelf, cache), run.dagger.trials)
 
 
 # ICAG (section 4.1, Algorithm 2): K variations of every task, labels from each variation's
@@ -208,7 +213,7 @@ def _pretrain_learn(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
 
 
 def _icag_ask(run: Run, phase: Phase) -> tuple[Job, ...]:
-    asked = _random_contexts if phase.stage == "pretrain" else _practice
+    asked = _random_contexts if phase.stage == "pretrain" else _dagger
     return asked(run, phase, functools.partial(splits.variations, run))
 
 
@@ -266,11 +271,11 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
     queries = np.concatenate([t.observations[:-1] for t in later])
     actions = np.concatenate([t.actions for t in later])
     labels = actions if actions.ndim == 2 else np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
-    length, horizon = run.model.stretch, len(later[0].actions)
+    length, horizon = run.model.window, len(later[0].actions)
     whole = np.arange(len(later) * horizon).reshape(-1, horizon)[:, : horizon // length * length].ravel()
     gained = np.concatenate([t.rewards for t in later])
-    stretches = Stretches.cut(length, queries[whole], actions[whole], gained[whole], labels[whole])
-    return Examples.of(contexts, queries, labels, run.icaa.context == "history", stretches)
+    windows = LabelledWindows.cut(length, queries[whole], actions[whole], gained[whole], labels[whole])
+    return Examples.of(contexts, queries, labels, run.icaa.context == "history", windows)
 
 
 def _nothing_learned(run: Run, phase: Phase, data: Dataset) -> tuple[Pool, ...]:
@@ -281,8 +286,8 @@ METHODS: dict[str, Method] = {
     "experts": Method(
         lambda run: (Phase("pretrain", 0, 0, run.optim.learning_rate),), _icag_ask, _nothing_learned, splits.variations
     ),
-    "dpt": Method(_then_practice, _dpt_ask, _pretrain_learn, _undisturbed),
-    "icag": Method(_then_practice, _icag_ask, _pretrain_learn, splits.variations),
+    "dpt": Method(_then_dagger, _dpt_ask, _pretrain_learn, _undisturbed),
+    "icag": Method(_then_dagger, _icag_ask, _pretrain_learn, splits.variations),
     "icaa": Method(_icaa_phases, _icaa_ask, _icaa_learn, splits.variations),
 }
 

@@ -30,8 +30,8 @@ class Transitions(NamedTuple):
     rewards: Float[Tensor, "B T"]
 
 
-class Stretches(NamedTuple):
-    """R stretches of each of B contexts: L states in a row, the action taken at each, and its reward (zeta of eq. 6)."""
+class Windows(NamedTuple):
+    """R windows of each of B contexts: L states in a row, the action taken at each, and its reward (zeta of eq. 6)."""
 
     states: Float[Tensor, "B R L S"]
     taken: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
@@ -39,7 +39,7 @@ class Stretches(NamedTuple):
 
 
 class PretrainedTransformer(nn.Module):
-    """T_theta(a | s_query, D) of eq. (1), and with ``model.stretch`` T_theta(a | s_query, D, zeta) of eq. (6)."""
+    """T_theta(a | s_query, D) of eq. (1), and with ``model.window`` T_theta(a | s_query, D, zeta) of eq. (6)."""
 
     low: Tensor
     scale: Tensor
@@ -54,7 +54,7 @@ class PretrainedTransformer(nn.Module):
         features = spec.observation * (1 + 2 * config.fourier)
         self.embed_transition = nn.Linear(2 * features + spec.actions + 1, config.width)
         self.embed_query = nn.Linear(features, config.width)
-        if config.stretch > 1:
+        if config.window > 1:
             self.embed_taken = nn.Linear(features + spec.actions + 1, config.width)
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
         self.head = nn.Linear(config.width, self.reads.outputs)
@@ -88,8 +88,8 @@ class PretrainedTransformer(nn.Module):
         embedded: Tensor = self.embed_transition(token)
         return embedded
 
-    def stretch_tokens(self, of: Stretches) -> Float[Tensor, "B R L D"]:
-        """The embedded tokens of stretches: a state, and what was done in the state before it and gained by it."""
+    def window_tokens(self, of: Windows) -> Float[Tensor, "B R L D"]:
+        """The embedded tokens of windows: a state, and what was done in the state before it and gained by it."""
         states = self.features(of.states)
         before = torch.cat([states, self.reads.features(of.taken), of.gained.unsqueeze(-1)], dim=-1)[..., :-1, :]
         tokens: Tensor = self.embed_query(states) + F.pad(self.embed_taken(before), (0, 0, 1, 0))
@@ -110,11 +110,11 @@ class PretrainedTransformer(nn.Module):
         logits: Tensor = self.head(self.trunk.query(self.embed_query(self.features(queries)), cache, seen))
         return logits
 
-    def follow(self, of: Stretches, cache: Cache, prefix: Int[Tensor, "B R"]) -> Float[Tensor, "B R L O"]:
-        """Outputs at every state of stretches, given a prefix of the context and what was done before in the stretch."""
+    def follow(self, of: Windows, cache: Cache, prefix: Int[Tensor, "B R"]) -> Float[Tensor, "B R L O"]:
+        """Outputs at every state of windows, given a prefix of the context and what was done before in the window."""
         length = of.states.shape[2]
         seen = _seen(prefix.repeat_interleave(length, dim=1), cache)
-        states = self.trunk.query(self.stretch_tokens(of).flatten(1, 2), cache, seen, length)
+        states = self.trunk.query(self.window_tokens(of).flatten(1, 2), cache, seen, length)
         logits: Tensor = self.head(states).unflatten(1, (-1, length))
         return logits
 
@@ -156,10 +156,10 @@ class Deployed:
         self._decoder.append(self._model.tokens(transitions))
 
     @torch.inference_mode()
-    def follow(self, of: Stretches, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
-        """Outputs at the last state of one stretch a context, given the whole context; one transition may arrive before."""
+    def follow(self, of: Windows, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
+        """Outputs at the last state of one window a context, given the whole context; one transition may arrive before."""
         joined = None if arrived is None else self._model.tokens(arrived)[:, 0]
-        self.state = self._decoder.stretch(self._model.stretch_tokens(of)[:, 0], joined)
+        self.state = self._decoder.window(self._model.window_tokens(of)[:, 0], joined)
         return F.linear(self.state, *self._head)
 
     @torch.inference_mode()

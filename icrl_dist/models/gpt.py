@@ -1,9 +1,9 @@
 """A causal GPT-2 trunk in two forms: ``GPT`` to train, ``Decoder`` to deploy.
 
 Context tokens come first and see only earlier context tokens; query tokens come after, and
-each sees its own prefix of the context, those before it in its stretch, and itself.  So one
+each sees its own prefix of the context, those before it in its window, and itself.  So one
 encoding of a context serves many queries in training, and a decision costs one token in
-deployment, or as many as its stretch is long.
+deployment, or as many as its window is long.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ class GPT(nn.Module):
         return cache
 
     def query(
-        self, x: Float[Tensor, "B Q D"], cache: Cache, seen: Bool[Tensor, "B #Q T"] | None = None, stretch: int = 1
+        self, x: Float[Tensor, "B Q D"], cache: Cache, seen: Bool[Tensor, "B #Q T"] | None = None, window: int = 1
     ) -> Float[Tensor, "B Q D"]:
         """Final states of query tokens x, each seeing the context tokens ``seen`` and itself.
 
-        ``seen=None`` shows every query the whole context.  Every ``stretch`` tokens in a row are a
-        stretch: each of them also sees those of it that come before.
+        ``seen=None`` shows every query the whole context.  Every ``window`` tokens in a row are a
+        window: each of them also sees those of it that come before.
         """
         for block, (keys, values) in zip(self.blocks, cache, strict=True):
             assert isinstance(block, Block)
@@ -91,24 +91,24 @@ class GPT(nn.Module):
             to_context = (q @ keys.transpose(2, 3)) * scale
             if seen is not None:
                 to_context = to_context.masked_fill(~seen[:, None], float("-inf"))
-            weight = torch.cat([to_context, _own(q, k, stretch) * scale], dim=-1).softmax(dim=-1)
-            to_context, to_own = weight[..., :-stretch], weight[..., -stretch:]
-            own = to_own * v if stretch == 1 else (_stretches(to_own, stretch) @ _stretches(v, stretch)).flatten(2, 3)
+            weight = torch.cat([to_context, _own(q, k, window) * scale], dim=-1).softmax(dim=-1)
+            to_context, to_own = weight[..., :-window], weight[..., -window:]
+            own = to_own * v if window == 1 else (_windows(to_own, window) @ _windows(v, window)).flatten(2, 3)
             x = block.finish(x, to_context @ values + own)
         result: Tensor = self.norm(x)
         return result
 
 
-def _stretches(x: Float[Tensor, "B N Q d"], stretch: int) -> Float[Tensor, "B N R L d"]:
-    return x.reshape(*x.shape[:2], -1, stretch, x.shape[3])
+def _windows(x: Float[Tensor, "B N Q d"], window: int) -> Float[Tensor, "B N R L d"]:
+    return x.reshape(*x.shape[:2], -1, window, x.shape[3])
 
 
-def _own(q: Float[Tensor, "B N Q d"], k: Float[Tensor, "B N Q d"], stretch: int) -> Float[Tensor, "B N Q L"]:
-    """How each query scores the tokens of its own stretch: -inf for those after it."""
-    if stretch == 1:
+def _own(q: Float[Tensor, "B N Q d"], k: Float[Tensor, "B N Q d"], window: int) -> Float[Tensor, "B N Q L"]:
+    """How each query scores the tokens of its own window: -inf for those after it."""
+    if window == 1:
         return (q * k).sum(-1, keepdim=True)
-    scores = _stretches(q, stretch) @ _stretches(k, stretch).transpose(3, 4)
-    return scores.masked_fill(~_causal(stretch, q.device), float("-inf")).flatten(2, 3)
+    scores = _windows(q, window) @ _windows(k, window).transpose(3, 4)
+    return scores.masked_fill(~_causal(window, q.device), float("-inf")).flatten(2, 3)
 
 
 def _causal(length: int, device: torch.device) -> Bool[Tensor, "L L"]:
@@ -220,8 +220,8 @@ class Decoder:
             mixed = F.scaled_dot_product_attention(q, tokens, tokens, attn_mask=seen, is_causal=past == 0, scale=1.0)
             x = layer.finish(x, mixed.transpose(1, 2).flatten(2))
 
-    def stretch(self, x: Float[Tensor, "B L D"], arrived: Float[Tensor, "B D"] | None = None) -> Float[Tensor, "B D"]:
-        """Final state of the last token of one stretch a context: each sees its context, those before it, and itself.
+    def window(self, x: Float[Tensor, "B L D"], arrived: Float[Tensor, "B D"] | None = None) -> Float[Tensor, "B D"]:
+        """Final state of the last token of one window a context: each sees its context, those before it, and itself.
 
         A token that has ``arrived`` joins the context first.
         """

@@ -111,7 +111,7 @@ class Curves:
         returns = validation.numbers(told.get("returns"), _TOGETHER)
         if len(trials) != len(returns):
             raise Odd("schema")
-        weights, digest = validation.integer(told.get("weights"), -1), validation.text(told.get("digest"), 64)
+        weights, digest = validation.integer(told.get("policy_version"), -1), validation.text(told.get("weights_digest"), 64)
         place, phase = (identity.task, identity.variation), _phase(identity)
         known = self._curves[place].parts.get(phase) if place in self._curves else None
         about = known.about if known is not None and known.about is not None else About.of(told)
@@ -218,7 +218,7 @@ def _of_variation(name: str) -> Identity:
 def _origin(
     place: Place, phase: str, trial: int, earned: float, weights: int, digest: str, worker: str, time: float
 ) -> dict[str, Any]:
-    said = {"weights": weights, "digest": digest, "worker": worker, "time": time}
+    said = {"policy_version": weights, "weights_digest": digest, "worker": worker, "time": time}
     return {"identity": f"{phase}/{place[0]}/{place[1]}/{trial}", "episode_return": earned, **said}
 
 

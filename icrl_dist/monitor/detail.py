@@ -79,14 +79,19 @@ def _episode(episode: dict[str, Any]) -> list[Line]:
 
 
 def _lineage(rows: list[dict[str, Any]], width: int) -> list[Line]:
-    columns = (("identity", 20), ("return", 8), ("weights", 7), ("digest", 14), ("worker", max(10, width - 56)))
+    columns = (("identity", 20), ("return", 8), ("version", 7), ("weights_digest", 14), ("worker", max(10, width - 56)))
     found: list[Line] = [[(" LINEAGE", TITLE), ("  the newest first: which weights acted, and where", DIM)]]
-    found.append([(" " + " ".join(cell(name, wide, name in ("return", "weights")) for name, wide in columns), DIM)])
+    found.append([(" " + " ".join(cell(name, wide, name in ("return", "version")) for name, wide in columns), DIM)])
     for row in reversed(rows):
-        weights = f"T^{row['weights']}" if row["weights"] >= 0 else "none"
-        cells = (row["identity"], number(row["episode_return"]), weights, row["digest"][:12] or "-", row["worker"])
-        style = WARNING if row["weights"] < 0 and row["identity"].startswith("adapt") else PLAIN
+        weights = f"T^{row['policy_version']}" if row["policy_version"] >= 0 else "none"
+        cells = (row["identity"], number(row["episode_return"]), weights, row["weights_digest"][:12] or "-", row["worker"])
+        style = WARNING if row["policy_version"] < 0 and row["identity"].startswith("adapt") else PLAIN
         found.append(
-            [(" " + " ".join(cell(t, w, n in ("return", "weights")) for t, (n, w) in zip(cells, columns, strict=True)), style)]
+            [
+                (
+                    " " + " ".join(cell(t, w, n in ("return", "version")) for t, (n, w) in zip(cells, columns, strict=True)),
+                    style,
+                )
+            ]
         )
     return found

@@ -17,7 +17,7 @@ class Pace:
 
     def __init__(self) -> None:
         self.phases: list[tuple[str, int, int]] = []
-        """Stage, round and optimiser steps of every phase of the run, in order."""
+        """Stage, round and optimizer steps of every phase of the run, in order."""
         self.rates: dict[str, float] = {}
         """The newest point, by name of series."""
         self._points: deque[tuple[int, int, float, dict[str, float | None]]] = deque(maxlen=_POINTS)

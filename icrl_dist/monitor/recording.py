@@ -77,12 +77,12 @@ class Recording:
     def _from_metrics(self) -> Iterator[Message]:
         method = METHODS[self._run.method]
         phases = method.phases(self._run)
-        asked = {phase.produces: method.ask(self._run, phase) for phase in phases}
+        asked = {phase.next_version: method.ask(self._run, phase) for phase in phases}
         expected = {version: sum(job.trials * len(job.variations) for job in jobs) for version, jobs in asked.items()}
         told_of = about(self._run, phases, [job for jobs in asked.values() for job in jobs])
         yield self._said(self.begin, "run", "run", **told_of, began=self.begin)
         version, stored = -1, 0
-        of = {phase.produces: phase for phase in phases}
+        of = {phase.next_version: phase for phase in phases}
         for row in self._rows:
             now, stage, step = row["time"], row["stage"], row["step"]
             if stage in ("event", "alert"):
@@ -130,7 +130,14 @@ class Recording:
     def _beat(self, now: float, row: Row, episodes: int, steps: int) -> Message:
         job = "/".join(map(str, row.identity[:3]))
         counts = {"episodes": episodes, "trajectories": episodes, "steps": steps, "resent": 0, "pid": 0}
-        said = {"worker": row.worker, "job": job, "doing": "", "weights": row.weights, "memory_mb": 0.0, "peak_mb": 0.0}
+        said = {
+            "worker": row.worker,
+            "job": job,
+            "doing": "",
+            "policy_version": row.policy_version,
+            "memory_mb": 0.0,
+            "peak_mb": 0.0,
+        }
         return self._said(now, f"worker/{_part(row.worker)}", "worker", **said, **counts)
 
     def _said(self, now: float, topic: str, kind: str, **fields: Any) -> Message:

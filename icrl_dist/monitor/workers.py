@@ -28,7 +28,7 @@ class _Row:
     """When it had done how many steps and episodes."""
 
 
-_NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0, "weights": -1}
+_NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0, "policy_version": -1}
 
 
 class Staff:
@@ -44,7 +44,7 @@ class Staff:
         said: dict[str, Any] = {name: validation.integer(message.get(name), 0) for name in _COUNTS}
         said |= {name: validation.text(message.get(name)) for name in ("job", "doing")}
         said |= {name: validation.number(message.get(name)) for name in ("memory_mb", "peak_mb")}
-        said["weights"] = validation.integer(message.get("weights", -1), -1)
+        said["policy_version"] = validation.integer(message.get("policy_version", -1), -1)
         row = self._row(validation.text(message.get("worker")), now)
         if row.said["pid"] not in (0, said["pid"]):
             row.restarts += 1
@@ -88,7 +88,7 @@ class Staff:
         """
         rows = [_told(name, row, now, over, self._beats) for name, row in sorted(self._rows.items())]
         for row in rows:
-            row["lag"] = max(0, version - row["weights"]) if row["weights"] >= 0 and row["job"] else 0
+            row["lag"] = max(0, version - row["policy_version"]) if row["policy_version"] >= 0 and row["job"] else 0
         return rows
 
 

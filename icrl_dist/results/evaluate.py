@@ -179,8 +179,8 @@ def offline(run: Run, agents: Mapping[str, PretrainedTransformer], deploy: Deplo
         optimum = optimal_returns(Hypotheses.of(chosen))
         rows, ids = _rows(run, chosen, level)
         env = registry.batch(rows)
-        for source, behaviour in (("random", random), ("expert", optimal(run))):
-            data = episode(env, behaviour(rows), [i.rng(run.seed) for i in ids])
+        for source, behavior in (("random", random), ("expert", optimal(run))):
+            data = episode(env, behavior(rows), [i.rng(run.seed) for i in ids])
             shape = (len(chosen), run.evaluate.seeds, 1)
             results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
             ran = {}

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int16, Int64
 
 from icrl_dist.config.run import ConfigError, ContextConfig, Deployment, default_deployment
-from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Stretches, Transitions
+from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, Windows
 from icrl_dist.models.heads import sample
 from icrl_dist.problems.registry import Batch
 
@@ -61,7 +61,7 @@ class RandomActor:
 
 
 class RandomPolicy:
-    """Uniform over the actions: the behaviour policy of the pretraining contexts."""
+    """Uniform over the actions: the behavior policy of the pretraining contexts."""
 
     def __init__(self, actions: int) -> None:
         self._uniform = np.full(actions, 1.0 / actions)
@@ -194,7 +194,7 @@ class CommittedPolicy(InContextPolicy):
 
     zeta is what the agent did last in this episode, as if the optimal policy had done it (eq. 6):
     what T_theta has begun to do it goes on with.  It lets go of a guess by itself when the guess
-    proves wrong, because it also trained on stretches that wrong guesses led (``pretrain.misled``).
+    proves wrong, because it also trained on windows that wrong guesses led (``pretrain.decoy_fraction``).
     """
 
     def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
@@ -206,11 +206,11 @@ class CommittedPolicy(InContextPolicy):
             self._deployed.append(self._one(step))
         arrived = self._one(self._pending[-1]) if self._read < len(self._pending) else None
         self._read = len(self._pending)
-        past = self._pending[1 - self.model.config.stretch :]
+        past = self._pending[1 - self.model.config.window :]
         nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
         columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
         states, taken, _, gained = (np.stack(column, axis=1)[:, None] for column in columns)
-        return self._deployed.follow(Stretches(*self._tensors(states, taken, gained)), arrived)
+        return self._deployed.follow(Windows(*self._tensors(states, taken, gained)), arrived)
 
     def _running(self) -> list[tuple[np.ndarray, ...]]:
         return self._pending
@@ -242,13 +242,13 @@ def in_context(
 
     ``watch`` is told of every decision once its outcome is observed.
 
-    Raises ConfigError for ``committed`` if it was not trained on stretches.
+    Raises ConfigError for ``committed`` if it was not trained on windows.
     """
     rule = deploy or default_deployment(model.config)
-    if rule == "committed" and model.config.stretch == 1:
+    if rule == "committed" and model.config.window == 1:
         raise ConfigError(
-            "deploy 'committed': this agent never trained on stretches (model.stretch = 1); "
-            "deploy it by 'paper', or train with model.stretch, pretrain.stretches and optim.stretches"
+            "deploy 'committed': this agent never trained on windows (model.window = 1); "
+            "deploy it by 'paper', or train with model.window, pretrain.windows and optim.windows"
         )
     return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context, watch)
 

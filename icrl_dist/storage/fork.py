@@ -76,7 +76,7 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
     ancestors = [(newest, a) for newest, a in lineage.ancestors if newest < version] + [(version, lineage.run_of(version))]
 
     def keep(identity: Identity) -> bool:
-        return identity.produces <= version
+        return identity.next_version <= version
 
     adopt(theirs / "dataset", folder / "dataset", keep)
     store = Store(folder / "dataset")

@@ -30,9 +30,9 @@ class Row:
     """Byte at which its payload begins."""
     length: int
     """Bytes of its payload."""
-    weights: int
+    policy_version: int
     """Version of the weights that acted; -1 for a policy without weights."""
-    digest: str
+    weights_digest: str
     """Digest of those weights."""
     worker: str
     origin: str
@@ -43,7 +43,17 @@ class Row:
     @classmethod
     def of(cls, trajectory: Trajectory, segment: int, offset: int, length: int) -> Row:
         t = trajectory
-        return cls(t.identity, segment, offset, length, t.weights, t.digest, t.worker, t.origin, wire.trajectory_digest(t))
+        return cls(
+            t.identity,
+            segment,
+            offset,
+            length,
+            t.policy_version,
+            t.weights_digest,
+            t.worker,
+            t.origin,
+            wire.trajectory_digest(t),
+        )
 
 
 class Ledger:
@@ -60,7 +70,17 @@ class Ledger:
     def enter(self, rows: Iterable[Row]) -> None:
         """Take rows in; a second row of the same identity is ignored."""
         values = (
-            (*r.identity.key(), r.segment, r.offset, r.length, r.weights, r.digest, r.worker, r.origin, bytes.fromhex(r.sha256))
+            (
+                *r.identity.key(),
+                r.segment,
+                r.offset,
+                r.length,
+                r.policy_version,
+                r.weights_digest,
+                r.worker,
+                r.origin,
+                bytes.fromhex(r.sha256),
+            )
             for r in rows
         )
         with self._lock:

@@ -98,13 +98,13 @@ class Names:
 def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
     """Frames to write: of names that are new in this segment, and of the trajectory."""
     t, fresh, numbers = trajectory, [], []
-    for value in (t.variation, t.digest, t.worker, t.origin):
+    for value in (t.variation, t.weights_digest, t.worker, t.origin):
         number, new = names.number(value)
         numbers.append(number)
         fresh.append(new)
     shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.taken))
     disturbance = () if t.adversary.ndim == 1 else (t.adversary.shape[1],)
-    head = msgpack.packb([*t.identity.key(), t.weights, *numbers, *shape, *disturbance])
+    head = msgpack.packb([*t.identity.key(), t.policy_version, *numbers, *shape, *disturbance])
     return b"".join(fresh), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
 
 
@@ -144,8 +144,8 @@ def decode(payload: bytes, names: Names) -> Trajectory:
     return Trajectory(
         identity=Identity(STAGES[stage], round_, task, variation, trial),
         variation=names.variation(phi),
-        weights=weights,
-        digest=names.text(digest),
+        policy_version=weights,
+        weights_digest=names.text(digest),
         worker=names.text(worker),
         origin=names.text(origin),
         **arrays,

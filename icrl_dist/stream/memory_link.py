@@ -1,4 +1,4 @@
-"""Links within one process: the same behaviour as between machines, timeouts included."""
+"""Links within one process: the same behavior as between machines, timeouts included."""
 
 from __future__ import annotations
 

@@ -23,15 +23,15 @@ def trajectories(finished: Iterable[Trajectory], time: float) -> bytes:
     worker = ""
     for one in finished:
         worker = one.worker
-        of = (*one.identity[:4], one.weights, one.digest)
+        of = (*one.identity[:4], one.policy_version, one.weights_digest)
         if of not in told:
             told[of] = {
                 "identity": "/".join(map(str, one.identity[:4])),
                 "problem": one.variation.task.kind,
                 "task": _plain(one.variation.task.params),
                 "adversary": {**_plain(one.variation.adversary.params), "kind": one.variation.adversary.kind},
-                "weights": one.weights,
-                "digest": one.digest,
+                "policy_version": one.policy_version,
+                "weights_digest": one.weights_digest,
                 **{name: [] for name in _COLUMNS},
             }
         for name, value in zip(_COLUMNS, (one.identity.trial, one.episode_return, len(one.actions)), strict=True):

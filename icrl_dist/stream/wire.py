@@ -68,8 +68,8 @@ def encode_trajectory(trajectory: Trajectory) -> bytes:
         {
             "identity": list(trajectory.identity),
             "variation": from_variation(trajectory.variation),
-            "weights": trajectory.weights,
-            "digest": trajectory.digest,
+            "policy_version": trajectory.policy_version,
+            "weights_digest": trajectory.weights_digest,
             "worker": trajectory.worker,
             "origin": trajectory.origin,
             "arrays": {name: from_array(array) for name, array in arrays.items()},
@@ -90,8 +90,8 @@ def decode_trajectory(data: bytes, limit: int) -> Trajectory:
     return Trajectory(
         identity=_to_identity(fields["identity"]),
         variation=to_variation(fields["variation"]),
-        weights=integer(fields["weights"], "weights", -1, _LARGEST),
-        digest=text(fields["digest"], "digest"),
+        policy_version=integer(fields["policy_version"], "policy_version", -1, _LARGEST),
+        weights_digest=text(fields["weights_digest"], "weights_digest"),
         worker=text(fields["worker"], "worker"),
         origin=text(fields["origin"], "origin"),
         **arrays,
@@ -103,8 +103,8 @@ def trajectory_digest(trajectory: Trajectory) -> str:
     head = [
         list(trajectory.identity),
         from_variation(trajectory.variation),
-        trajectory.weights,
-        trajectory.digest,
+        trajectory.policy_version,
+        trajectory.weights_digest,
         trajectory.origin,
     ]
     return _hash(head, trajectory.arrays().items())
@@ -151,7 +151,7 @@ def encode_job(job: Job) -> bytes:
             "task": job.task,
             "variations": [from_variation(v) for v in job.variations],
             "trials": job.trials,
-            "weights": job.weights,
+            "policy_version": job.policy_version,
             "seed": job.seed,
             "settings": _from_params(job.settings),
             "tasks": job.tasks,
@@ -170,7 +170,7 @@ def decode_job(data: bytes, limit: int = SMALL) -> Job:
         task=integer(fields["task"], "task", 0),
         variations=tuple(to_variation(v) for v in as_list(fields["variations"], "variations")),
         trials=integer(fields["trials"], "trials", 0),
-        weights=integer(fields["weights"], "weights", -1),
+        policy_version=integer(fields["policy_version"], "policy_version", -1),
         seed=integer(fields["seed"], "seed", 0),
         settings=_to_params(fields["settings"], "settings"),
         tasks=integer(fields["tasks"], "tasks", 1),
@@ -196,9 +196,21 @@ def decode_message(data: bytes, limit: int = SMALL) -> tuple[str, dict[str, Any]
 
 
 _ALWAYS = {"v", "kind"}
-_TRAJECTORY = _ALWAYS | {"identity", "variation", "weights", "digest", "worker", "origin", "arrays"}
+_TRAJECTORY = _ALWAYS | {"identity", "variation", "policy_version", "weights_digest", "worker", "origin", "arrays"}
 _WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}
-_JOB = _ALWAYS | {"job", "stage", "round", "task", "variations", "trials", "weights", "seed", "settings", "tasks", "first"}
+_JOB = _ALWAYS | {
+    "job",
+    "stage",
+    "round",
+    "task",
+    "variations",
+    "trials",
+    "policy_version",
+    "seed",
+    "settings",
+    "tasks",
+    "first",
+}
 
 
 def _fields(data: bytes, limit: int, kind: str, names: Set[str]) -> dict[str, Any]:

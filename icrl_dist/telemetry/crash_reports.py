@@ -59,7 +59,7 @@ def raised(worker: str, job: Job, identity: Identity | None, error: BaseExceptio
         "exception": _text(f"{type(error).__name__}: {error}"[:_LINE] + f" ({Path(place.filename).name}:{place.lineno})"),
         "seed": job.seed,
         "spawn_key": list(identity.key()) if identity else [],
-        "weights": job.weights,
+        "policy_version": job.policy_version,
         "variations": len(job.variations),
         **memory(),
         "traceback": _text("".join(traceback.format_exception(error))[-_TEXT:]),

@@ -21,7 +21,7 @@ STAGES = {
     "collect": "once a phase is collected; `step` is the version that will be fitted to it",
     "ingest": "once a second while a phase is collected; `step` is the version that will be fitted to it",
     "labels": "once a round is collected whose labels are the model's own, in Dark Room; `step` is the round",
-    "fit": "every 50 optimiser steps, as stage `fit/VERSION`; `step` is the optimiser step",
+    "fit": "every 50 optimizer steps, as stage `fit/VERSION`; `step` is the optimizer step",
     "version": "once a version of the weights is fitted; `step` is the version",
 }
 """When a row is written, by the first part of its stage's name."""
@@ -50,9 +50,9 @@ NAMES: dict[str, dict[str, str]] = {
         "label_return": "mean return of the trials that gave labels",
         "optimum": "mean optimal return of the variations",
     },
-    "fit": {"loss": "loss of eq. (1) of this optimiser step's batch, nats (squared error or nats of a Gaussian for vectors)"},
+    "fit": {"loss": "loss of eq. (1) of this optimizer step's batch, nats (squared error or nats of a Gaussian for vectors)"},
     "version": {
-        "loss": "loss of the fit's last optimiser step",
+        "loss": "loss of the fit's last optimizer step",
         "seconds": "wall time of the fit, seconds",
     },
 }

@@ -15,8 +15,8 @@ from icrl_dist.types import Trajectory
 K = TypeVar("K", bound=Hashable)
 
 
-class Stretches(NamedTuple):
-    """R stretches of L states, what was done and gained in them (zeta of eq. 6), and the labels; or of each of B contexts."""
+class LabelledWindows(NamedTuple):
+    """R windows of L states, what was done and gained in them (zeta of eq. 6), and the labels; or of each of B contexts."""
 
     states: Float32[np.ndarray, "*B R L S"]
     taken: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
@@ -31,8 +31,8 @@ class Stretches(NamedTuple):
         taken: Integer[np.ndarray, " N"] | Float32[np.ndarray, "N A"],
         gained: Float32[np.ndarray, " N"],
         labels: Float32[np.ndarray, "N A"],
-    ) -> Stretches:
-        """What happened in a row as stretches of this length; what is left at the end is not used."""
+    ) -> LabelledWindows:
+        """What happened in a row as windows of this length; what is left at the end is not used."""
         whole = len(taken) // length * length
         columns = states, _actions(taken), gained, labels
         return cls(*(c[:whole].reshape(-1, length, *c.shape[1:]) for c in columns))
@@ -58,7 +58,7 @@ class Examples:
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
     history: bool
-    stretches: Stretches | None = None
+    windows: LabelledWindows | None = None
 
     @classmethod
     def of(
@@ -67,7 +67,7 @@ class Examples:
         queries: Float32[np.ndarray, "Q S"],
         labels: Float32[np.ndarray, "Q A"],
         history: bool = False,
-        stretches: Stretches | None = None,
+        windows: LabelledWindows | None = None,
     ) -> Examples:
         """Raises ValueError without an episode or without a label."""
         if not episodes or not len(queries):
@@ -79,13 +79,13 @@ class Examples:
             np.asarray(queries, np.float32),
             np.asarray(labels, np.float32),
             history,
-            stretches,
+            windows,
         )
 
     @property
     def nbytes(self) -> int:
         own = (self.actions, self.observations, self.rewards, self.queries, self.labels)
-        return sum(array.nbytes for array in (*own, *(self.stretches or ())))
+        return sum(array.nbytes for array in (*own, *(self.windows or ())))
 
 
 class Shelf(Generic[K]):
@@ -153,7 +153,7 @@ class Pool:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """B contexts of up to T transitions, zero-padded at the end, and N queries and R stretches of each.
+    """B contexts of up to T transitions, zero-padded at the end, and N queries and R windows of each.
 
     Padding needs no mask: context tokens see only earlier ones, and ``prefix`` never
     reaches beyond a context's real length.
@@ -166,8 +166,8 @@ class Batch:
     queries: Float32[np.ndarray, "B N S"]
     labels: Float32[np.ndarray, "B N A"]
     prefix: Int64[np.ndarray, "B N"]
-    stretches: Stretches | None = None
-    stretch_prefix: Int64[np.ndarray, "B R"] | None = None
+    windows: LabelledWindows | None = None
+    window_prefix: Int64[np.ndarray, "B R"] | None = None
 
 
 def draw(
@@ -176,9 +176,9 @@ def draw(
     batch: int,
     queries: int,
     transitions: int = 0,
-    stretches: int = 0,
+    windows: int = 0,
 ) -> Batch:
-    """A training batch: random variations, random contexts of them, random prefixes, queries and stretches.
+    """A training batch: random variations, random contexts of them, random prefixes, queries and windows.
 
     A batch comes from one pool, drawn by share, and its contexts have the same drawn number of
     episodes (at most what the variation has), so little is padding.  It has ``batch`` contexts,
@@ -203,10 +203,10 @@ def draw(
 
     asked, labels, prefix = (np.stack([row[column] for row in rows]) for column in (4, 5, 6))
     made = Batch(padded(0), padded(1), padded(2), padded(3), asked, labels, prefix)
-    if stretches:
-        drawn = [_stretches(rng, examples, length, stretches) for examples, length in zip(chosen, lengths, strict=True)]
+    if windows:
+        drawn = [_windows(rng, examples, length, windows) for examples, length in zip(chosen, lengths, strict=True)]
         columns = (np.stack(column) for column in zip(*(of for of, _ in drawn), strict=True))
-        made = replace(made, stretches=Stretches(*columns), stretch_prefix=np.stack([prefix for _, prefix in drawn]))
+        made = replace(made, windows=LabelledWindows(*columns), window_prefix=np.stack([prefix for _, prefix in drawn]))
     return made
 
 
@@ -227,10 +227,10 @@ def _context(rng: np.random.Generator, examples: Examples, count: int, queries: 
     )
 
 
-def _stretches(rng: np.random.Generator, examples: Examples, length: int, count: int) -> tuple[Stretches, np.ndarray]:
-    """Random stretches, and a random prefix of the context for each.  Raises ValueError if there are none."""
-    of = examples.stretches
+def _windows(rng: np.random.Generator, examples: Examples, length: int, count: int) -> tuple[LabelledWindows, np.ndarray]:
+    """Random windows, and a random prefix of the context for each.  Raises ValueError if there are none."""
+    of = examples.windows
     if of is None or not len(of.states):
-        raise ValueError("optim.stretches: these examples have none; datasets without stretches cannot train model.stretch")
+        raise ValueError("optim.windows: these examples have none; datasets without windows cannot train model.window")
     chosen = rng.integers(0, len(of.states), size=count)
-    return Stretches(*(column[chosen] for column in of)), rng.integers(0, length + 1, size=count)
+    return LabelledWindows(*(column[chosen] for column in of)), rng.integers(0, length + 1, size=count)

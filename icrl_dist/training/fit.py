@@ -10,13 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from icrl_dist.config.run import OptimConfig
-from icrl_dist.models.dpt import PretrainedTransformer, Stretches, Transitions
+from icrl_dist.models.dpt import PretrainedTransformer, Transitions, Windows
 from icrl_dist.training import optimizers
 from icrl_dist.training.batches import Batch
 
 
 def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
-    """Eq. (1) over every (prefix, query) pair of a batch, and with stretches eq. (6), every label counting the same."""
+    """Eq. (1) over every (prefix, query) pair of a batch, and with windows eq. (6), every label counting the same."""
     device = model.low.device
 
     def put(array: object) -> Tensor:
@@ -25,16 +25,16 @@ def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
     context = Transitions(*map(put, (batch.observations, batch.actions, batch.next_observations, batch.rewards)))
     cache = model.encode(context)
     total = model.reads.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
-    if batch.stretches is not None:
-        states, taken, gained, labels = batch.stretches
-        followed = model.follow(Stretches(put(states), put(taken), put(gained)), cache, put(batch.stretch_prefix))
+    if batch.windows is not None:
+        states, taken, gained, labels = batch.windows
+        followed = model.follow(Windows(put(states), put(taken), put(gained)), cache, put(batch.window_prefix))
         count = states.shape[1] * states.shape[2]
         share = count / (count + batch.prefix.shape[1])
         total = (1 - share) * total + share * model.reads.loss(followed, put(labels))
     return total
 
 
-class Optimiser:
+class Optimizer:
     """AdamW of appendix B.2; with ``optim.muon``, Muon for the trunk's matrices and AdamW for the rest."""
 
     def __init__(self, model: PretrainedTransformer, config: OptimConfig) -> None:
@@ -65,7 +65,7 @@ class Optimiser:
         }
 
     def load(self, remembered: Mapping[str, Tensor]) -> None:
-        """The inverse of ``state``.  Raises ValueError for another optimiser's."""
+        """The inverse of ``state``.  Raises ValueError for another optimizer's."""
         groups = [part.state_dict()["param_groups"] for part, _ in self._parts]
         places = {(number, index) for number, (group,) in enumerate(groups) for index in group["params"]}
         states: dict[tuple[int, int], dict[str, Tensor]] = {}
@@ -89,7 +89,7 @@ def rate(step: int, steps: int, warmup: int) -> float:
 
 def fit(
     model: PretrainedTransformer,
-    opt: Optimiser,
+    opt: Optimizer,
     config: OptimConfig,
     learning_rate: float,
     steps: int,
@@ -99,7 +99,7 @@ def fit(
 ) -> float:
     """Minimise eq. (1) for ``steps`` steps at peak rate ``learning_rate``; ``batch(step)`` draws the data.
 
-    A step depends on its number, the weights and the optimiser alone, so a fit stopped after
+    A step depends on its number, the weights and the optimizer alone, so a fit stopped after
     ``first`` steps goes on as if it had never stopped.  Returns the mean loss of the last
     tenth.  Raises FloatingPointError if the loss stops being a number.
     """

@@ -1,4 +1,4 @@
-"""torch's optimisers, without torch's compiler.
+"""torch's optimizers, without torch's compiler.
 
 Methods that the compiler shall leave alone import it to say so, when they are first called:
 as many seconds as the import of torch itself, and 70 MB, in every process that learns.
@@ -16,7 +16,7 @@ _Kind = TypeVar("_Kind", bound=Optimizer)
 
 
 def _uncompiled(kind: type[_Kind]) -> type[_Kind]:
-    """The optimiser with those methods that torch wrapped."""
+    """The optimizer with those methods that torch wrapped."""
     for name in ("add_param_group", "state_dict", "load_state_dict", "zero_grad"):
         setattr(kind, name, inspect.unwrap(getattr(kind, name)))
     setattr(kind, "step", torch.no_grad()(inspect.unwrap(kind.step)))  # noqa: B010

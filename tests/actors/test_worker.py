@@ -185,7 +185,7 @@ def test_a_worker_gives_up_when_the_learner_stays_away(hub):
 
 @pytest.fixture
 def committed_run(small_run):
-    more = {"model": {"stretch": 3}, "pretrain": {"stretches": 1}, "optim": {"stretches": 1}}
+    more = {"model": {"window": 3}, "pretrain": {"windows": 1}, "optim": {"windows": 1}}
     parts = {name: dataclasses.replace(getattr(small_run, name), **numbers) for name, numbers in more.items()}
     return dataclasses.replace(small_run, **parts)
 

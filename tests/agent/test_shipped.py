@@ -15,17 +15,17 @@ from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.problems import splits
 from icrl_dist.results import evaluate
 from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
-from icrl_dist.training.fit import Optimiser
+from icrl_dist.training.fit import Optimizer
 from learner import checkpoints
 
 
 @pytest.fixture
 def folder(small_run, tmp_path):
-    """A run folder with versions 0 and 1, optimiser and list of data included."""
+    """A run folder with versions 0 and 1, optimizer and list of data included."""
     for version in (0, 1):
         torch.manual_seed(version)
         model = PretrainedTransformer(splits.spec(small_run), small_run.model)
-        opt = Optimiser(model, small_run.optim)
+        opt = Optimizer(model, small_run.optim)
         sum(p.sum() for p in model.parameters()).backward()
         opt.step(1e-3)
         about = checkpoints.manifest(small_run, splits.spec(small_run), version, 1)
@@ -109,8 +109,8 @@ def test_what_is_evaluated_is_named_once(capsys, tmp_path):
 def test_what_an_agent_was_not_trained_for_is_refused_in_one_line(folder, capsys):
     assert main.main(["evaluate", str(folder), "--deploy", "committed"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "model.stretch = 1" in line and "'paper'" in line
-    assert load_checkpoint(version_file(folder, 1)).manifest["stretch"] == 1
+    assert "model.window = 1" in line and "'paper'" in line
+    assert load_checkpoint(version_file(folder, 1)).manifest["window"] == 1
 
 
 def test_a_file_of_that_name_does_not_hide_the_shipped_agent(tmp_path, monkeypatch):

@@ -22,8 +22,8 @@ def test_it_reports_its_rate() -> None:
 
 def test_every_row_is_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    real = env.envs.batch
-    monkeypatch.setattr(env.envs, "batch", lambda variations: seen.extend(variations) or real(variations))
+    real = env.registry.batch
+    monkeypatch.setattr(env.registry, "batch", lambda variations: seen.extend(variations) or real(variations))
     env.run(batch=32, seconds=0.001)
     assert len(seen) == 32
     assert all(v.adversary.kind == "dirichlet" and v.adversary.number("p") > 0 for v in seen)

@@ -161,7 +161,8 @@ def test_nobody_waits_for_what_only_the_evaluation_needs(tmp_path):
     """Until both programs have ended, ``train`` has imported no torch."""
     script = """
 import sys
-from icrl_dist import cli, launch
+from icrl_dist.cli import main as cli
+from icrl_dist.launch import train as launch
 
 def interrupted(*_):
     print(*(name for name in ("torch", "scipy", "matplotlib", "mujoco") if name in sys.modules))

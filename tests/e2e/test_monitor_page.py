@@ -85,7 +85,7 @@ class Plane:
     def told(self, variation, trial, earned, kind="uniform", problem="darkroom", round=0, p=0.25, **fields):
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
         adversary = {"kind": kind} if kind == "null" else {"kind": kind, "p": p}
-        about = {"problem": problem, "task": room, "adversary": adversary, "weights": 0, "digest": "ab" * 32}
+        about = {"problem": problem, "task": room, "adversary": adversary, "policy_version": 0, "weights_digest": "ab" * 32}
         told = {"identity": f"adapt/{round}/{variation}", **about, "trials": [trial], "returns": [earned], "steps": [8]}
         return wire.encode_message("trajectories", **{"worker": "w0", "time": time.time(), "variations": [told], **fields})
 
@@ -178,7 +178,7 @@ def test_hostile_messages_are_text_or_nothing(page):
         counts = dict.fromkeys(("episodes", "steps", "resent", "trajectories", "pid"), 1)
         said = {"job": MARKUP, "doing": MARKUP, "memory_mb": 1.0, "peak_mb": 1.0}
         run.say("worker", **{**counts, **said, "worker": MARKUP})
-        run.returned("0/0", 0, 1.0, kind=MARKUP, problem=MARKUP, worker=MARKUP, digest=MARKUP)
+        run.returned("0/0", 0, 1.0, kind=MARKUP, problem=MARKUP, worker=MARKUP, weights_digest=MARKUP)
         run.returned("0/0", 2**40, 1.0, kind=MARKUP, problem=MARKUP)
         run.say("event", what=MARKUP, text=MARKUP, time=1e300)
         run.say("event", what="alert", alert=MARKUP, active=True, text=MARKUP)

@@ -78,8 +78,8 @@ def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undi
     digests = [checkpoints.read_manifest(version_file(folder, version))["weights_digest"] for version in range(2)]
     for t in trajectories:
         if t.identity.stage == "adapt":
-            assert (t.weights, t.digest) == (t.identity.round, digests[t.identity.round])
-    assert {t.weights for t in trajectories} == {-1, 0, 1}
+            assert (t.policy_version, t.weights_digest) == (t.identity.round, digests[t.identity.round])
+    assert {t.policy_version for t in trajectories} == {-1, 0, 1}
 
 
 def test_ray_and_inline_end_with_the_same_bytes(undisturbed, reference):

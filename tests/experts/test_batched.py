@@ -72,7 +72,7 @@ def apart(model, other, part):
     return max(float((a - b).detach().abs().max()) for a, b in pairs)
 
 
-def optimisers(model):
+def optimizers(model):
     return [model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer]
 
 
@@ -107,8 +107,8 @@ def test_the_gradients_are_each_experts_own_sum_and_no_mean(tmp_path, monkeypatc
     for batch, noise in drawn(SMALL, 3):
         engine.update(batch, noise)
     ours = opened(engine, 1, tmp_path / "after.zip")
-    assert len(optimisers(ours)) == len(optimisers(model)) == 3
-    for one, other in zip(optimisers(ours), optimisers(model), strict=True):
+    assert len(optimizers(ours)) == len(optimizers(model)) == 3
+    for one, other in zip(optimizers(ours), optimizers(model), strict=True):
         assert len(one.state) == len(other.state)
         for mine, theirs in zip(one.state.values(), other.state.values(), strict=True):
             assert mine["step"] == theirs["step"] == 3

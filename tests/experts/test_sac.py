@@ -29,8 +29,8 @@ class Corridor(gymnasium.Env):
 
 
 def rates(model):
-    optimisers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
-    return tuple(optimiser.param_groups[0]["lr"] for optimiser in optimisers)
+    optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
+    return tuple(optimizer.param_groups[0]["lr"] for optimizer in optimizers)
 
 
 def test_an_expert_has_the_papers_numbers():

@@ -75,7 +75,7 @@ def test_contexts_are_episodes_of_the_training_and_labels_what_its_expert_would_
     for t in sent:
         row = job.variations.index(t.variation)
         history = found[row]
-        assert history.rewards.shape == (EPISODES, HORIZON) and t.origin == "expert" and t.weights == -1
+        assert history.rewards.shape == (EPISODES, HORIZON) and t.origin == "expert" and t.policy_version == -1
         number = [0, 4, 9][t.identity.trial]  # evenly spaced, from the first random one to the last
         for name in ("observations", "actions", "rewards", "adversary"):
             np.testing.assert_array_equal(getattr(t, name), getattr(history, name)[number])
@@ -155,7 +155,7 @@ def test_what_decides_a_history_decides_where_it_is_kept(run, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(cache.metadata, "version", lambda name: "0")
         assert cache.key(job.variations[0], run.sac, 0, "lockstep") != one, "other physics is other data"
-    monkeypatch.setattr(cache.code, "digest_of", lambda parts: "other")
+    monkeypatch.setattr(cache.version, "digest_of", lambda parts: "other")
     assert cache.key(job.variations[0], run.sac, 0, "lockstep") != one, "so is other code"
 
 
@@ -205,7 +205,7 @@ class Breaking:
 @pytest.mark.parametrize("always", [False, True])
 def test_episodes_that_broke_down_are_no_data(run, monkeypatch, always):
     real = registry.batch
-    monkeypatch.setattr(train.envs, "batch", lambda variations: Breaking(real(variations), always))
+    monkeypatch.setattr(train.registry, "batch", lambda variations: Breaking(real(variations), always))
     job = asked(run)[0]
     if always:
         with pytest.raises(RuntimeError, match="breaks down in every episode"):
@@ -219,7 +219,7 @@ def test_episodes_that_broke_down_are_no_data(run, monkeypatch, always):
 def test_an_evaluation_counts_what_broke_down_and_says_whose_expert_is_missing(run, monkeypatch, tmp_path):
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, episodes=3, seeds=1, p=(0.0, 1.0)))
     real = registry.batch
-    monkeypatch.setattr(evaluate.envs, "batch", lambda variations: Breaking(real(variations), False))
+    monkeypatch.setattr(evaluate.registry, "batch", lambda variations: Breaking(real(variations), False))
     results = evaluate.online(run, {"random": evaluate.random_vectors})
     assert [result.broken for result in results] == [4, 4] and results[0].row()["broken"] == 4
     monkeypatch.undo()
@@ -239,7 +239,7 @@ def test_a_rollout_that_broke_down_is_no_data(run, monkeypatch):
     policies = Fixed(splits.spec(icaa), icaa.model)
     assert len(list(jobs.do(job, policies, "w"))) == len(list(job.identities()))
     real = registry.batch
-    monkeypatch.setattr(jobs.envs, "batch", lambda variations: Breaking(real(variations), True))
+    monkeypatch.setattr(jobs.registry, "batch", lambda variations: Breaking(real(variations), True))
     with pytest.raises(RuntimeError, match=r"adapt/0/0/1/0, adapt/0/1/1/0: the simulation broke down"):
         list(jobs.do(job, policies, "w"))
 
@@ -322,9 +322,9 @@ def test_a_training_says_how_far_it_is_and_a_cache_what_it_saved(run):
 
 @pytest.fixture
 def stretched(run):
-    model = dataclasses.replace(run.model, stretch=4)
-    fit = dataclasses.replace(run.pretrain, stretches=5, misled=0.5)
-    return dataclasses.replace(run, model=model, pretrain=fit, optim=dataclasses.replace(run.optim, stretches=2))
+    model = dataclasses.replace(run.model, window=4)
+    fit = dataclasses.replace(run.pretrain, windows=5, decoy_fraction=0.5)
+    return dataclasses.replace(run, model=model, pretrain=fit, optim=dataclasses.replace(run.optim, windows=2))
 
 
 def test_stretches_are_cut_from_episodes_that_experts_led_some_of_them_another_tasks(stretched):
@@ -355,9 +355,9 @@ def test_stretches_are_cut_from_episodes_that_experts_led_some_of_them_another_t
 
 def test_nobody_can_be_misled_in_a_job_of_one_task(stretched):
     alone = dataclasses.replace(stretched, stream=dataclasses.replace(stretched.stream, job_tasks=1))
-    with pytest.raises(ConfigError, match=r"pretrain\.misled = 0\.5: 0, or a stream\.job_tasks that leaves none"):
+    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: 0, or a stream\.job_tasks that leaves none"):
         validate(alone, "x")
-    validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, misled=0.0)), "x")
+    validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, decoy_fraction=0.0)), "x")
 
 
 def test_a_model_of_vectors_trains_on_stretches_and_is_deployed_committed(stretched):
@@ -367,9 +367,9 @@ def test_a_model_of_vectors_trains_on_stretches_and_is_deployed_committed(stretc
     torch.manual_seed(0)
     model = PretrainedTransformer(splits.spec(stretched), stretched.model)
     draws = lambda step: context.draw(np.random.default_rng(step), pools, 8, 8, 0, 2)  # noqa: E731
-    taken = draws(0).stretches.taken
+    taken = draws(0).windows.taken
     assert taken.shape == (8, 2, 4, 2) and taken.dtype == np.float32
-    opt = fit.Optimiser(model, stretched.optim)
+    opt = fit.Optimizer(model, stretched.optim)
     before = np.mean([fit.batch_loss(model, draws(1000 + n)).item() for n in range(8)])
     fit.fit(model, opt, stretched.optim, 3e-3, 60, draws)
     after = np.mean([fit.batch_loss(model, draws(1000 + n)).item() for n in range(8)])

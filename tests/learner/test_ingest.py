@@ -128,8 +128,8 @@ def broken(trajectory):
                 variation=dataclasses.replace(trajectory.variation, task=trajectory.variation.task.replace(goal=(0, 0), size=4))
             ),
         ),
-        ("stale-weights", changed(weights=3)),
-        ("stale-weights", changed(digest="f" * 64)),
+        ("stale-weights", changed(policy_version=3)),
+        ("stale-weights", changed(weights_digest="f" * 64)),
     ]
 
 

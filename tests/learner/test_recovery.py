@@ -158,7 +158,7 @@ def test_explain_checks_everything_that_is_left(parent):
     folder, result, run = parent
     answer = explain.explain(folder, Identity("adapt", 1, 3, 2, 1), rerun=True)
     assert answer["rerun_equal"] and answer["intact"] and answer["weights_intact"] and not answer["from_ancestor"]
-    assert (answer["weights"], answer["worker"], answer["label_origin"]) == (1, "w0", "self")
+    assert (answer["policy_version"], answer["worker"], answer["label_origin"]) == (1, "w0", "self")
     assert answer["learned_by"] == ["T^2"] and answer["spawn_key"] == [1, 1, 3, 2, 1] and answer["seed"] == run.seed
     early = explain.explain(folder, Identity("pretrain", 0, 3, 0, 1), rerun=True)
     assert early["learned_by"] == ["T^0", "T^1", "T^2"] and early["label_origin"] == "optimal" and early["rerun_equal"]

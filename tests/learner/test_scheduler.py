@@ -174,7 +174,7 @@ def test_duplicates_and_strangers_count_for_nothing(board, jobs):
 
 @pytest.fixture
 def later(jobs):
-    return [dataclasses.replace(job, kind="adapt", stage="adapt", round=1, weights=1) for job in jobs]
+    return [dataclasses.replace(job, kind="adapt", stage="adapt", round=1, policy_version=1) for job in jobs]
 
 
 def test_phases_are_open_together_and_the_first_goes_first(board, jobs, later):
@@ -227,17 +227,17 @@ def test_a_job_acts_with_the_weights_of_its_first_lease_ever_after(board, later)
     def acting(job):
         return newest["version"]
 
-    assert leased(board, "a", acting=acting).weights == 3
+    assert leased(board, "a", acting=acting).policy_version == 3
     newest["version"] = 4
-    assert leased(board, "b", acting=acting).weights == 4
+    assert leased(board, "b", acting=acting).policy_version == 4
     kill(board, "a")
     again = leased(board, "c", acting=acting)
-    assert (again.task, again.weights) == (later[0].task, 3)
-    assert board.wants(next(iter(later[0].identities()))).weights == 3
+    assert (again.task, again.policy_version) == (later[0].task, 3)
+    assert board.wants(next(iter(later[0].identities()))).policy_version == 3
     kill(board, "c")
     board.lease("d", 0.0, acting)
     parts = [leased(board, f"p{i}", acting=acting) for i in range(6)]
-    assert {part.weights for part in parts if part.task in (later[0].task, later[0].task + 1)} == {3}
+    assert {part.policy_version for part in parts if part.task in (later[0].task, later[0].task + 1)} == {3}
 
 
 # Deadlines.

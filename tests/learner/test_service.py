@@ -58,9 +58,9 @@ def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small
     for identity in [row.identity for row in store.ledger]:
         t = store.read(identity)
         if identity.stage == "adapt":
-            assert (t.weights, t.digest) == (identity.round, versions[identity.round]["weights_digest"])
+            assert (t.policy_version, t.weights_digest) == (identity.round, versions[identity.round]["weights_digest"])
         else:
-            assert (t.weights, t.digest) == (-1, "")
+            assert (t.policy_version, t.weights_digest) == (-1, "")
     adapt = 7 * 3 * (small_run.icaa.trials + 1)
     assert undisturbed["trajectories"] == len(store) == 42 + 2 * adapt
     store.close()
@@ -76,12 +76,12 @@ def test_repeating_a_run_gives_the_same_bytes_and_another_seed_others(small_run,
 
 @pytest.mark.parametrize("when", [("collect", 0, 20), ("fit", 0, 4), ("collect", 2, 40), ("fit", 2, 3)])
 def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, undisturbed, when, monkeypatch):
-    what, produces, step = when
+    what, next_version, step = when
     stopped = []
 
     def stop_at(event):
         at = event.get("stage"), event.get("version", -2) + 1
-        if event["event"] == "progress" and at == (what, produces) and event["step"] >= step and not stopped:
+        if event["event"] == "progress" and at == (what, next_version) and event["step"] >= step and not stopped:
             stopped.append(event)
             made[0].stop()
 
@@ -95,7 +95,7 @@ def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, u
     assert stopped
     if what == "fit":
         partial = checkpoints.read_manifest(folder / "checkpoints" / checkpoints.PARTIAL)
-        assert partial["produces"] == produces and 0 < partial["step"] < small_run.pretrain.steps
+        assert partial["next_version"] == next_version and 0 < partial["step"] < small_run.pretrain.steps
     assert same(run_inline(small_run, folder, resume=True), undisturbed)
 
 

@@ -35,7 +35,7 @@ class Office:
         self.acting = None
         link = hub()
         lock = threading.Lock()
-        act = lambda job: self.acting if self.acting is not None else job.weights  # noqa: E731
+        act = lambda job: self.acting if self.acting is not None else job.policy_version  # noqa: E731
         self.desk = Desk(run, folder, link, KEYS, self.board, lock, self.events.append, self.failures.append, act)
         self.link = hub()
 
@@ -111,8 +111,8 @@ def test_who_asks_gets_a_job_with_its_deadline_then_wait_then_stop(office):
 
 def test_the_service_says_which_weights_a_job_acts_with(office):
     office.acting = 5
-    assert wire.decode_job(office.ask("w0")[1]["job"]).weights == 5
-    assert office.board.wants(next(iter(office.jobs[0].identities()))).weights == 5
+    assert wire.decode_job(office.ask("w0")[1]["job"]).policy_version == 5
+    assert office.board.wants(next(iter(office.jobs[0].identities()))).policy_version == 5
 
 
 def test_counters_are_the_newest_of_every_worker_and_never_fall(office, hub):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.collect import jobs
-from icrl_dist.config.run import PracticeConfig
+from icrl_dist.config.run import DAggerConfig
 from icrl_dist.methods.recipes import METHODS, self_labelled
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
@@ -59,7 +59,7 @@ def test_every_method_shares_out_the_same_number_of_contexts(small_run):
         assert sum(job.tasks for job in asked) == len(splits.split(small_run).train)
         assert all(job.tasks <= small_run.stream.job_tasks for job in asked)
         assert sum(len(job.variations) * job.trials for job in asked) == small_run.pretrain.contexts
-        assert all(job.weights == -1 for job in asked)
+        assert all(job.policy_version == -1 for job in asked)
 
 
 def test_dpt_and_d0_of_icaa_have_no_disturbance_and_icag_has_k_adversaries(small_run):
@@ -80,7 +80,7 @@ def test_dpt_and_d0_of_icaa_have_no_disturbance_and_icag_has_k_adversaries(small
 def test_icaa_rolls_out_version_j_in_round_j_and_produces_j_plus_1(small_run):
     run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, rounds=2))
     phases = METHODS["icaa"].phases(run)
-    assert [(p.stage, p.round, p.acting, p.produces) for p in phases] == [
+    assert [(p.stage, p.round, p.policy_version, p.next_version) for p in phases] == [
         ("pretrain", 0, -1, 0),
         ("adapt", 0, 0, 1),
         ("adapt", 1, 1, 2),
@@ -88,7 +88,7 @@ def test_icaa_rolls_out_version_j_in_round_j_and_produces_j_plus_1(small_run):
     ]
     for phase in phases[1:]:
         for job in METHODS["icaa"].ask(run, phase):
-            assert job.weights == phase.round
+            assert job.policy_version == phase.round
             assert job.trials == run.icaa.trials + 1
             assert all(v.task.vector("start") == (0, 0) for v in job.variations)
 
@@ -98,7 +98,7 @@ def test_a_job_delivers_exactly_its_identities_and_one_version_acts_in_all(small
     method = METHODS["icaa"]
     wanted = [i for phase in method.phases(small_run) for job in method.ask(small_run, phase) for i in job.identities()]
     assert sorted(t.identity for t in trajectories) == sorted(wanted)
-    assert {(t.identity.round, t.weights, t.digest) for t in trajectories if t.identity.stage == "adapt"} == {
+    assert {(t.identity.round, t.policy_version, t.weights_digest) for t in trajectories if t.identity.stage == "adapt"} == {
         (0, 0, "digest 0"),
         (1, 1, "digest 1"),
     }
@@ -175,12 +175,16 @@ def test_each_round_learns_from_d0_and_all_rounds_so_far(small_run, collected):
 
 def test_practice_adds_own_histories_from_the_origin_with_optimal_labels(small_run):
     """Rounds after D_pre: T^j acts, the optimal policy labels, contexts are histories as deployed."""
-    practice = PracticeConfig(rounds=2, trials=3, steps=7, learning_rate=0.5, new_fraction=0.25)
-    run = dataclasses.replace(small_run, method="icag", practice=practice)
+    dagger = DAggerConfig(rounds=2, trials=3, steps=7, learning_rate=0.5, new_fraction=0.25)
+    run = dataclasses.replace(small_run, method="icag", dagger=dagger)
     method, data = METHODS["icag"], Kept([])
     policies = Fixed(splits.spec(run), run.model)
     phases = method.phases(run)
-    assert [(p.stage, p.acting, p.produces) for p in phases] == [("pretrain", -1, 0), ("adapt", 0, 1), ("adapt", 1, 2)]
+    assert [(p.stage, p.policy_version, p.next_version) for p in phases] == [
+        ("pretrain", -1, 0),
+        ("adapt", 0, 1),
+        ("adapt", 1, 2),
+    ]
     assert [(p.steps, p.learning_rate) for p in phases[1:]] == [(7, 0.5)] * 2
     variations = [v for i, task in enumerate(splits.split(run).train) for v in splits.variations(run, i, splits.deployed(task))]
     for phase in phases:
@@ -188,14 +192,14 @@ def test_practice_adds_own_histories_from_the_origin_with_optimal_labels(small_r
         made = [t for job in asked for t in jobs.do(job, policies, "w")]
         data.trajectories += made
         pools = method.learn(run, phase, data)
-        assert [len(pool.examples) for pool in pools] == [len(variations), phase.produces * len(variations)][: len(pools)]
+        assert [len(pool.examples) for pool in pools] == [len(variations), phase.next_version * len(variations)][: len(pools)]
         assert len(pools) == 1 + (phase.stage == "adapt")
         if phase.stage == "pretrain":
             continue
         assert [v for job in asked for v in job.variations] == variations, "the variations of D_pre, not new ones"
         assert [pool.share for pool in pools] == [0.75, 0.25]
         assert [pool.episodes for pool in pools] == [run.optim.episodes, 3]
-        assert {(t.weights, t.digest) for t in made} == {(phase.round, f"digest {phase.round}")}
+        assert {(t.policy_version, t.weights_digest) for t in made} == {(phase.round, f"digest {phase.round}")}
         for t in made:
             assert (t.observations[0] == 0).all()
             truth = soft_labels(Hypotheses.of([t.variation]), run.darkroom.gamma, run.darkroom.label_slack)[0]
@@ -210,14 +214,14 @@ def test_practice_adds_own_histories_from_the_origin_with_optimal_labels(small_r
 
 
 def test_practice_makes_histories_by_every_rule_of_deployment(small_run):
-    """Job by job, and in each round other jobs by another; without stretches there is one rule."""
-    practice = PracticeConfig(rounds=3, trials=2)
-    plain = dataclasses.replace(small_run, method="icag", practice=practice)
+    """Job by job, and in each round other jobs by another; without windows there is one rule."""
+    dagger = DAggerConfig(rounds=3, trials=2)
+    plain = dataclasses.replace(small_run, method="icag", dagger=dagger)
     run = dataclasses.replace(
         plain,
-        model=dataclasses.replace(plain.model, stretch=3),
-        pretrain=dataclasses.replace(plain.pretrain, stretches=1),
-        optim=dataclasses.replace(plain.optim, stretches=1),
+        model=dataclasses.replace(plain.model, window=3),
+        pretrain=dataclasses.replace(plain.pretrain, windows=1),
+        optim=dataclasses.replace(plain.optim, windows=1),
     )
 
     def rules(run, number):
@@ -231,15 +235,15 @@ def test_practice_makes_histories_by_every_rule_of_deployment(small_run):
 
 
 def test_behaviours_take_turns(small_run):
-    """Trial n of every variation walks as behaviour n modulo their number."""
-    behaviours = ("sweep", "random")
-    run = dataclasses.replace(small_run, pretrain=dataclasses.replace(small_run.pretrain, behaviours=behaviours))
+    """Trial n of every variation walks as behavior n modulo their number."""
+    behaviors = ("sweep", "random")
+    run = dataclasses.replace(small_run, pretrain=dataclasses.replace(small_run.pretrain, behaviors=behaviors))
     found = {}
     for setting in (run, small_run):
         phase = METHODS["dpt"].phases(setting)[0]
         made = [t for job in METHODS["dpt"].ask(setting, phase) for t in jobs.do(job, Fixed, "w")]
-        found[setting.pretrain.behaviours] = {t.identity: t.actions.tolist() for t in made}
-    same = {i: actions == found["random",][i] for i, actions in found[behaviours].items()}
+        found[setting.pretrain.behaviors] = {t.identity: t.actions.tolist() for t in made}
+    same = {i: actions == found["random",][i] for i, actions in found[behaviors].items()}
     assert all(equal == (identity.trial % 2 == 1) for identity, equal in same.items()), "only the random walks are as they were"
 
 

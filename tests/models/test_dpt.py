@@ -310,7 +310,7 @@ def test_fit_learns_the_corridor() -> None:
     seen: list[tuple[int, float]] = []
     final = fit.fit(
         model,
-        fit.Optimiser(model, config),
+        fit.Optimizer(model, config),
         config,
         config.learning_rate,
         200,
@@ -331,7 +331,7 @@ def test_fit_stops_at_a_loss_that_is_no_number() -> None:
     with torch.no_grad():
         model.head.bias.fill_(math.nan)
     with pytest.raises(FloatingPointError, match=r"nan at step 0: lower the learning rate \(0\.25\)"):
-        fit.fit(model, fit.Optimiser(model, config), config, config.learning_rate, 3, lambda step: corridor_batch(pools, step))
+        fit.fit(model, fit.Optimizer(model, config), config, config.learning_rate, 3, lambda step: corridor_batch(pools, step))
 
 
 def test_rate_rises_then_falls_to_a_tenth() -> None:

@@ -18,8 +18,8 @@ def trajectory(identity="adapt/0/3/1/7", earned=2.0, worker="w0", task=ROOM, adv
     fields = {
         "identity": Identity.parse(identity),
         "variation": Variation(task, adversary),
-        "weights": 0,
-        "digest": "d" * 64,
+        "policy_version": 0,
+        "weights_digest": "d" * 64,
         "worker": worker,
         "actions": np.zeros(horizon, np.int16),
         "observations": np.stack([path, np.zeros_like(path)], axis=1),
@@ -37,7 +37,7 @@ def trajectory(identity="adapt/0/3/1/7", earned=2.0, worker="w0", task=ROOM, adv
 def beat(worker="w0", **changes):
     """A worker's heartbeat."""
     counts = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "pid": 7}
-    said = {"job": "adapt/0/3", "doing": "", "weights": 0, "memory_mb": 100.0, "peak_mb": 120.0, "time": 0.0}
+    said = {"job": "adapt/0/3", "doing": "", "policy_version": 0, "memory_mb": 100.0, "peak_mb": 120.0, "time": 0.0}
     return wire.encode_message("worker", **({"worker": worker} | counts | said | changes))
 
 

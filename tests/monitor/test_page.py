@@ -29,7 +29,7 @@ class Run(Watched):
 
     def returned(self, variation, trial, earned):
         named = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
-        columns = {"trials": [trial], "returns": [earned], "steps": [8], "weights": 0, "digest": "d" * 64}
+        columns = {"trials": [trial], "returns": [earned], "steps": [8], "policy_version": 0, "weights_digest": "d" * 64}
         told = {"identity": f"adapt/0/{variation}", "problem": "darkroom", **named, **columns}
         self.say("trajectories", worker="w0", variations=[told])
 
@@ -223,7 +223,12 @@ def test_a_variation_can_be_asked_for(run, page):
     assert status == 200 and headers["content-type"] == "application/json"
     assert detail["adversary"] == {"kind": "uniform", "p": 0.5} and detail["episode"] is None
     (made,) = detail["lineage"]
-    assert (made["identity"], made["worker"], made["weights"], made["digest"]) == ("adapt/0/3/1/0", "w0", 0, "d" * 64)
+    assert (made["identity"], made["worker"], made["policy_version"], made["weights_digest"]) == (
+        "adapt/0/3/1/0",
+        "w0",
+        0,
+        "d" * 64,
+    )
     for name in ("3/2", "3", "3/1/0", "a/b", "-3/1", "3/%31%2f..", "9" * 30 + "/0", "%C2%B2/0"):
         assert page.ask("GET", f"/variation/{name}")[0] == 404, name
 

@@ -90,7 +90,7 @@ def test_a_variation_tells_where_it_came_from_and_shows_its_newest_episode():
     watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/3/1/1", earned=3.0, worker="w1"), now=5.0)
     found = picture.variation("3/1")
     assert [line["identity"] for line in found["lineage"]] == ["adapt/0/3/1/0", "adapt/0/3/1/1"]
-    expected = {"episode_return": 3.0, "weights": 0, "digest": "d" * 64, "worker": "w1", "time": 5.0}
+    expected = {"episode_return": 3.0, "policy_version": 0, "weights_digest": "d" * 64, "worker": "w1", "time": 5.0}
     assert found["lineage"][-1] == {"identity": "adapt/0/3/1/1", **expected}
     drawing = found["episode"]["drawing"]
     assert drawing["path"] == [[min(step, 3), 0] for step in range(10)]
@@ -185,10 +185,10 @@ def test_a_workers_lag_is_that_of_the_weights_that_act_in_its_job():
     picture = Picture("demo")
     hear(picture, "learner", progress(version=3))
     for worker, said in {
-        "w0": {"weights": 1},
-        "w1": {"weights": 3},
-        "w2": {"weights": -1},
-        "w3": {"weights": 1, "job": ""},
+        "w0": {"policy_version": 1},
+        "w1": {"policy_version": 3},
+        "w2": {"policy_version": -1},
+        "w3": {"policy_version": 1, "job": ""},
     }.items():
         hear(picture, f"worker/{worker}", beat(worker, **said))
     assert [row["lag"] for row in picture.snapshot(0.0)["workers"]] == [2, 0, 0, 0]

@@ -29,8 +29,8 @@ def episode(task=0, variation=0, trial=0, earned=3, worker="w0", stage="adapt", 
     return Trajectory(
         identity=Identity(stage, 0, task, variation, trial),
         variation=Variation(room.task((2, 2), SIZE, HORIZON, (0, 0)), adversary),
-        weights=0 if stage == "adapt" else -1,
-        digest="ab" * 32 if stage == "adapt" else "",
+        policy_version=0 if stage == "adapt" else -1,
+        weights_digest="ab" * 32 if stage == "adapt" else "",
         worker=worker,
         actions=np.zeros(HORIZON, np.int16),
         observations=path,
@@ -117,7 +117,7 @@ class Watched:
 def run_folder(folder):
     """The folder of a finished run of smoke, as far as a recording needs it."""
     folder.mkdir(parents=True)
-    shutil.copy(str(resources.files("icrl_dist.runs") / "smoke.toml"), folder / "run.toml")
+    shutil.copy(str(resources.files("icrl_dist.config.runs") / "smoke.toml"), folder / "run.toml")
     store = Store(folder / "dataset")
     early = [episode(t, 0, trial, trial % 4, stage="pretrain") for t in range(3) for trial in range(8)]
     late = [episode(t, v, trial, (trial + t) % 6) for t in range(3) for v in range(2) for trial in range(8)]

@@ -1,4 +1,4 @@
-"""Stretches (zeta of eq. 6) and the committed deployment, each against a slow obvious loop."""
+"""Windows (zeta of eq. 6) and the committed deployment, each against a slow obvious loop."""
 
 import dataclasses
 import itertools
@@ -12,7 +12,7 @@ from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.collect import jobs
 from icrl_dist.config.run import ConfigError, ContextConfig, ModelConfig, OptimConfig
 from icrl_dist.methods.recipes import METHODS
-from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Stretches, Transitions
+from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, Windows
 from icrl_dist.models.heads import Gaussian
 from icrl_dist.problems import registry, splits
 from icrl_dist.problems.darkroom import room
@@ -28,10 +28,10 @@ HORIZON, LENGTH = 7, 4
 B, T, R = 3, 15, 2
 
 
-def build(spec, heads=2, stretch=LENGTH, scale=0.4):
+def build(spec, heads=2, window=LENGTH, scale=0.4):
     """A model whose every parameter matters."""
     torch.manual_seed(0)
-    model = PretrainedTransformer(spec, ModelConfig(3, heads, 16, stretch=stretch)).eval()
+    model = PretrainedTransformer(spec, ModelConfig(3, heads, 16, window=window)).eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.copy_(torch.randn_like(parameter) * scale)
@@ -48,10 +48,10 @@ def transitions(seed=0):
     return Transitions(states[:, :-1], torch.randint(0, 5, (B, T), generator=g), states[:, 1:], rewards)
 
 
-def stretches(seed=5):
+def windows(seed=5):
     g = torch.Generator().manual_seed(seed)
     states = torch.randint(0, 5, (B, R, LENGTH, 2), generator=g).float()
-    return Stretches(states, torch.randint(0, 5, (B, R, LENGTH), generator=g), torch.rand(B, R, LENGTH, generator=g))
+    return Windows(states, torch.randint(0, 5, (B, R, LENGTH), generator=g), torch.rand(B, R, LENGTH, generator=g))
 
 
 def part(of, *place):
@@ -60,7 +60,7 @@ def part(of, *place):
 
 @torch.no_grad()
 def test_the_first_state_of_a_stretch_is_a_query_alone_and_stretches_do_not_see_each_other():
-    model, whole, of = build(SPEC), transitions(), stretches()
+    model, whole, of = build(SPEC), transitions(), windows()
     prefix = torch.tensor([[0, 7], [3, T], [1, 2]])
     cache = model.encode(whole)
     together = model.follow(of, cache, prefix)
@@ -72,10 +72,10 @@ def test_the_first_state_of_a_stretch_is_a_query_alone_and_stretches_do_not_see_
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("column", Stretches._fields)
+@pytest.mark.parametrize("column", Windows._fields)
 @pytest.mark.parametrize("at", range(LENGTH))
 def test_what_happened_in_a_stretch_counts_for_what_comes_after_and_nothing_before(column, at):
-    model, of, cache = build(SPEC), stretches(), None
+    model, of, cache = build(SPEC), windows(), None
     cache = model.encode(transitions())
     value = getattr(of, column).clone()
     value[:, :, at] = (value[:, :, at] + 1) % 5
@@ -90,7 +90,7 @@ def test_what_happened_in_a_stretch_counts_for_what_comes_after_and_nothing_befo
 @pytest.mark.parametrize("together", [set(), {0, 7}, {9, 10}], ids=str)
 def test_a_context_that_grows_one_by_one_decides_as_in_training(heads, together):
     """Whether transitions arrive with a decision or (``together``) several at once."""
-    model, whole, of = build(SPEC, heads), transitions(), part(stretches(), slice(None), slice(0, 1))
+    model, whole, of = build(SPEC, heads), transitions(), part(windows(), slice(None), slice(0, 1))
     deployed, t = Deployed(model, B), 0
     while t < T:
         expected = model.follow(of, model.encode(part(whole, slice(None), slice(0, t + 1))), torch.full((B, 1), t + 1))
@@ -116,7 +116,7 @@ def outputs_of(model, history, zeta, state):
         torch.tensor(np.array(r, np.float32)).reshape(1, -1),
     )
     states = [z[0] for z in zeta] + [state]
-    of = Stretches(
+    of = Windows(
         torch.tensor(np.array(states, np.float32))[None, None],
         torch.tensor([z[1] for z in zeta] + [0])[None, None],
         torch.tensor([float(z[2]) for z in zeta] + [0.0])[None, None],
@@ -179,12 +179,12 @@ def test_every_transition_joins_the_context_at_once_and_asking_changes_nothing()
 
 
 def test_a_model_without_stretches_is_not_committed():
-    with pytest.raises(ConfigError, match=r"model\.stretch = 1") as caught:
-        InContextAgent(build(SPEC, stretch=1), {}, ContextConfig(), deploy="committed")
+    with pytest.raises(ConfigError, match=r"model\.window = 1") as caught:
+        InContextAgent(build(SPEC, window=1), {}, ContextConfig(), deploy="committed")
     assert "\n" not in str(caught.value)
     kinds = {1: InContextPolicy, LENGTH: CommittedPolicy}
-    for stretch, kind in kinds.items():
-        assert type(deployment.in_context(build(SPEC, stretch=stretch), 1, ContextConfig())) is kind
+    for window, kind in kinds.items():
+        assert type(deployment.in_context(build(SPEC, window=window), 1, ContextConfig())) is kind
     assert type(deployment.in_context(build(SPEC), 1, ContextConfig(), "paper")) is InContextPolicy
 
 
@@ -196,30 +196,30 @@ def run(small_run):
     return dataclasses.replace(
         small_run,
         method="icag",
-        pretrain=dataclasses.replace(small_run.pretrain, stretches=2, misled=0.5),
-        model=dataclasses.replace(small_run.model, stretch=LENGTH),
-        optim=dataclasses.replace(small_run.optim, stretches=3),
+        pretrain=dataclasses.replace(small_run.pretrain, windows=2, decoy_fraction=0.5),
+        model=dataclasses.replace(small_run.model, window=LENGTH),
+        optim=dataclasses.replace(small_run.optim, windows=3),
     )
 
 
-def collected(run, misled):
-    run = dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, misled=misled))
+def collected(run, decoy_fraction):
+    run = dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, decoy_fraction=decoy_fraction))
     phase = METHODS[run.method].phases(run)[0]
     return METHODS[run.method].ask(run, phase)
 
 
 def followed(run, t):
-    """States, actions, rewards and labels of a trajectory's stretches."""
+    """States, actions, rewards and labels of a trajectory's windows."""
     alone = len(t.queries) - len(t.taken)
     assert (alone, len(t.taken)) == (run.pretrain.queries, 2 * LENGTH)
     cells = cell_numbers(t.queries[alone:], 3).reshape(2, LENGTH)
     return cells, t.taken.reshape(2, LENGTH), t.gained.reshape(2, LENGTH), t.labels[alone:].reshape(2, LENGTH, -1)
 
 
-@pytest.mark.parametrize("misled", [0.0, 1.0])
-def test_stretches_are_lived_in_the_variation_and_labelled_for_it(run, misled):
+@pytest.mark.parametrize("decoy_fraction", [0.0, 1.0])
+def test_stretches_are_lived_in_the_variation_and_labelled_for_it(run, decoy_fraction):
     starts, right = set(), []
-    for job in collected(run, misled):
+    for job in collected(run, decoy_fraction):
         for t in jobs.do(job, None, "w"):
             truth = soft_labels(Hypotheses.of([t.variation]), run.darkroom.gamma, run.darkroom.label_slack)[0]
             cells, taken, gained, labels = followed(run, t)
@@ -231,7 +231,7 @@ def test_stretches_are_lived_in_the_variation_and_labelled_for_it(run, misled):
                 np.testing.assert_array_equal(next_cell(3)[cells[:, :-1], taken[:, :-1]], cells[:, 1:])
             right.append((np.take_along_axis(labels, taken[:, :, None].astype(np.int64), axis=2) > 0).mean())
     assert starts == set(range(9))
-    assert np.mean(right) == 1 if misled == 0 else np.mean(right) < 0.9
+    assert np.mean(right) == 1 if decoy_fraction == 0 else np.mean(right) < 0.9
 
 
 def test_a_trajectorys_stretches_are_its_own_whatever_the_job_holds(run):
@@ -251,7 +251,9 @@ def test_training_draws_stretches_of_the_contexts_variation():
 
     def examples(mark):
         states = np.full((4, LENGTH, 2), mark, np.float32) + np.arange(4, dtype=np.float32)[:, None, None] / 10
-        of = batches.Stretches(states, np.full((4, LENGTH), mark), states[..., 0], np.full((4, LENGTH, 5), mark, np.float32))
+        of = batches.LabelledWindows(
+            states, np.full((4, LENGTH), mark), states[..., 0], np.full((4, LENGTH, 5), mark, np.float32)
+        )
         flat = np.full((6, HORIZON), mark)
         return Examples(
             flat,
@@ -266,35 +268,35 @@ def test_training_draws_stretches_of_the_contexts_variation():
     pool = Pool(1.0, [examples(1), examples(2)], 3)
     chosen, prefixes = set(), set()
     for _ in range(30):
-        batch = batches.draw(rng, [pool], 8, 2, stretches=3)
-        assert batch.stretches.states.shape == (8, 3, LENGTH, 2)
+        batch = batches.draw(rng, [pool], 8, 2, windows=3)
+        assert batch.windows.states.shape == (8, 3, LENGTH, 2)
         for row in range(8):
             mark = batch.actions[row, 0]
-            assert (batch.stretches.taken[row] == mark).all() and (batch.stretches.labels[row] == mark).all()
-            assert ((batch.stretches.states[row] // 1) == mark).all()
-            np.testing.assert_array_equal(batch.stretches.gained[row], batch.stretches.states[row, :, :, 0])
-        chosen |= set(np.round(batch.stretches.states[:, :, 0, 0] % 1 * 10).astype(int).ravel().tolist())
-        prefixes |= set(batch.stretch_prefix.ravel().tolist())
+            assert (batch.windows.taken[row] == mark).all() and (batch.windows.labels[row] == mark).all()
+            assert ((batch.windows.states[row] // 1) == mark).all()
+            np.testing.assert_array_equal(batch.windows.gained[row], batch.windows.states[row, :, :, 0])
+        chosen |= set(np.round(batch.windows.states[:, :, 0, 0] % 1 * 10).astype(int).ravel().tolist())
+        prefixes |= set(batch.window_prefix.ravel().tolist())
     assert chosen == {0, 1, 2, 3} and prefixes == set(range(3 * HORIZON + 1))
-    with pytest.raises(ValueError, match="stretches"):
-        batches.draw(rng, [Pool(1.0, [dataclasses.replace(examples(1), stretches=None)], 1)], 2, 2, stretches=1)
+    with pytest.raises(ValueError, match="windows"):
+        batches.draw(rng, [Pool(1.0, [dataclasses.replace(examples(1), windows=None)], 1)], 2, 2, windows=1)
 
 
 def test_every_label_counts_the_same(run):
     model, rng = build(SPEC), np.random.default_rng(0)
-    whole, of = transitions(), stretches()
+    whole, of = transitions(), windows()
     labels, followed_labels = (rng.dirichlet([0.5] * 5, size=shape).astype(np.float32) for shape in ((B, 6), (B, R, LENGTH)))
-    prefix, stretch_prefix = rng.integers(0, T + 1, size=(B, 6)), rng.integers(0, T + 1, size=(B, R))
+    prefix, window_prefix = rng.integers(0, T + 1, size=(B, 6)), rng.integers(0, T + 1, size=(B, R))
     queries = rng.integers(0, 5, size=(B, 6, 2)).astype(np.float32)
     s, a, n, r = (column.numpy() for column in whole)
     batch = batches.Batch(
-        s, a, n, r, queries, labels, prefix, batches.Stretches(*(c.numpy() for c in of), followed_labels), stretch_prefix
+        s, a, n, r, queries, labels, prefix, batches.LabelledWindows(*(c.numpy() for c in of), followed_labels), window_prefix
     )
     cache, total = model.encode(whole), 0.0
     with torch.no_grad():
         law = model.decide(torch.tensor(queries), cache, torch.tensor(prefix)).log_softmax(-1).numpy()
         total -= (law * labels).sum()
-        law = model.follow(of, cache, torch.tensor(stretch_prefix)).log_softmax(-1).numpy()
+        law = model.follow(of, cache, torch.tensor(window_prefix)).log_softmax(-1).numpy()
         total -= (law * followed_labels).sum()
         assert fit.batch_loss(model, batch).item() == pytest.approx(total / (B * (6 + R * LENGTH)), rel=1e-5)
 
@@ -308,7 +310,7 @@ def test_own_trials_are_cut_into_stretches_that_do_not_cross_episodes(run):
     made = [t for t in jobs.do(job, policies, "w") if t.identity[2:4] == (job.task, 0)]
     from icrl_dist.methods.recipes import self_labelled
 
-    of = self_labelled(run, made).stretches
+    of = self_labelled(run, made).windows
     later = made[run.icaa.context_trials + 1 :]
     expected = [(t, h) for t in later for h in range(0, run.darkroom.horizon // LENGTH * LENGTH, LENGTH)]
     assert len(of.states) == len(expected)
@@ -372,7 +374,7 @@ class Anywhere(InContextPolicy):
 
 
 def lived(goal, rng, episodes):
-    """Examples of one goal: walks that random goals lead, and stretches, some of which another goal leads."""
+    """Examples of one goal: walks that random goals lead, and windows, some of which another goal leads."""
     walks, states = [], rng.uniform(-1, 1, size=(64, 2)).astype(np.float32)
     for _ in range(episodes):
         env = Valley([goal])
@@ -391,7 +393,7 @@ def lived(goal, rng, episodes):
         path.append(np.clip(path[-1] + 0.2 * Valley.right(path[-1], guess), -1, 1).astype(np.float32))
     along = np.stack(path, axis=1)
     near = (np.abs(along[:, 1:] - Valley.GOALS[goal]).sum(axis=2) < 0.4).astype(np.float32)
-    of = batches.Stretches(
+    of = batches.LabelledWindows(
         along[:, :-1], Valley.right(along[:, :-1], guess[:, None]), near, Valley.right(along[:, :-1], np.array(goal))
     )
     seen, acted, gained = (np.stack(column) for column in zip(*walks, strict=True))
@@ -402,11 +404,11 @@ def test_the_same_code_learns_and_deploys_a_game_of_continuous_actions():
     rng = np.random.default_rng(0)
     spec = Valley([0]).spec
     torch.manual_seed(0)
-    model = PretrainedTransformer(spec, ModelConfig(2, 1, 32, stretch=LENGTH))
-    optim = OptimConfig(learning_rate=8e-3, muon=5.0, batch=16, queries=32, stretches=8, episodes=2, beta2=0.98, warmup=20)
+    model = PretrainedTransformer(spec, ModelConfig(2, 1, 32, window=LENGTH))
+    optim = OptimConfig(learning_rate=8e-3, muon=5.0, batch=16, queries=32, windows=8, episodes=2, beta2=0.98, warmup=20)
     pool = Pool(1.0, [lived(goal, rng, 30) for goal in range(4)], optim.episodes)
-    opt = fit.Optimiser(model, optim)
-    fit.fit(model, opt, optim, 8e-3, 150, lambda step: batches.draw(np.random.default_rng(step), [pool], 16, 32, stretches=8))
+    opt = fit.Optimizer(model, optim)
+    fit.fit(model, opt, optim, 8e-3, 150, lambda step: batches.draw(np.random.default_rng(step), [pool], 16, 32, windows=8))
     goals, names = [0, 1, 2, 3] * 8, ("observations", "actions", "rewards")
 
     def earned(policy):

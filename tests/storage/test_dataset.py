@@ -75,12 +75,17 @@ def test_actions_may_be_vectors_in_one_segment_with_numbers(Store, tmp_path, tra
 def test_the_ledger_says_where_each_lies_and_where_it_comes_from(Store, tmp_path, trajectories):
     store = Store(tmp_path, seal_bytes=2000)
     for t in trajectories:
-        store.append([dataclasses.replace(t, worker=f"w{t.identity.trial}", weights=3, digest="d" * 64)])
+        store.append([dataclasses.replace(t, worker=f"w{t.identity.trial}", policy_version=3, weights_digest="d" * 64)])
     rows = list(store.ledger)
     assert [row.identity for row in rows] == [t.identity for t in trajectories]
     assert len({row.segment for row in rows}) > 2
     for row, t in zip(rows, trajectories, strict=True):
-        assert (row.worker, row.weights, row.digest, row.origin) == (f"w{t.identity.trial}", 3, "d" * 64, "optimal")
+        assert (row.worker, row.policy_version, row.weights_digest, row.origin) == (
+            f"w{t.identity.trial}",
+            3,
+            "d" * 64,
+            "optimal",
+        )
         assert row.sha256 == wire.trajectory_digest(store.read(row.identity)) and row == store.ledger[row.identity]
     first = trajectories[0].identity
     assert store.ledger.count("pretrain", 0) == len(trajectories) and store.ledger.count("adapt", 0) == 0
@@ -285,12 +290,12 @@ def test_another_runs_segments_are_shared_and_what_is_not_wanted_stays_away(Stor
 
 def test_checkpoints_round_trip_and_are_never_half_written(tmp_path, monkeypatch):
     path = tmp_path / "c.npz"
-    old = Checkpoint({"model/w": np.arange(6.0).reshape(2, 3), "optimiser/0/step": np.array(3.0)}, {"version": 1})
+    old = Checkpoint({"model/w": np.arange(6.0).reshape(2, 3), "optimizer/0/step": np.array(3.0)}, {"version": 1})
     save_checkpoint(path, old)
     back = load_checkpoint(path)
     assert back.manifest == {"version": 1}
     np.testing.assert_array_equal(back.part("model")["w"], old.arrays["model/w"])
-    assert set(back.part("optimiser")) == {"0/step"}
+    assert set(back.part("optimizer")) == {"0/step"}
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")

@@ -151,7 +151,7 @@ time.sleep(60)
 
 LEARNER = """
 import sys, time
-from icrl_dist.stream import batch
+from icrl_dist.stream import batching
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 known = set(open(sys.argv[2]).read().split())
@@ -164,7 +164,7 @@ def store(query):
     time.sleep(0.001)
     query.reply(b"stored")
 def take_apart(query):
-    for part in batch.split(query, 1 << 20):
+    for part in batching.split(query, 1 << 20):
         store(part)
 ZenohLink.listen(sys.argv[1]).serve(Keys("battery").data, take_apart)
 time.sleep(60)
@@ -237,8 +237,8 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
     episode = Trajectory(
         identity=Identity("adapt", 0, 3, 1, 7),
         variation=Variation(Task.of("darkroom", goal=(3, 4), size=10), Adversary.of("override", p=0.1)),
-        weights=2,
-        digest="ab",
+        policy_version=2,
+        weights_digest="ab",
         worker="w0",
         observations=np.zeros((3, 2), np.float32),
         actions=np.zeros(2, np.int16),
@@ -273,8 +273,8 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
         "adversary": {"kind": "override", "p": 0.1},
         "episode_return": 2.0,
         "steps": 2,
-        "weights": 2,
-        "digest": "ab",
+        "policy_version": 2,
+        "weights_digest": "ab",
         "worker": "w0",
         "time": 5.0,
     }

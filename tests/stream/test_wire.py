@@ -30,8 +30,8 @@ def trajectory(steps: int = 5, queries: int = 3, variation: Variation = VARIATIO
     return Trajectory(
         identity=Identity("adapt", 0, 3, 1, 7),
         variation=variation,
-        weights=2,
-        digest="ab",
+        policy_version=2,
+        weights_digest="ab",
         worker="w0",
         observations=rng.normal(size=(steps + 1, 2)).astype(np.float32),
         actions=rng.integers(0, 5, steps).astype(np.int16),
@@ -107,8 +107,8 @@ def test_the_digest_is_of_what_happened_and_not_of_who_ran_it() -> None:
     for change in (
         {"identity": one.identity._replace(trial=8)},
         {"variation": VARIATIONS[0]},
-        {"weights": 3},
-        {"digest": "ac"},
+        {"policy_version": 3},
+        {"weights_digest": "ac"},
         {"origin": "none"},
         {"rewards": rewards},
     ):
@@ -198,8 +198,8 @@ MALFORMED: list[tuple[str, str, bytes]] = [
     ("empty identity", "schema", repack(put("identity", []))),
     ("negative trial", "schema", repack(put("identity", 4, -1))),
     ("true as trial", "schema", repack(put("identity", 4, True))),
-    ("weights -2", "schema", repack(put("weights", -2))),
-    ("weights 1.0", "schema", repack(put("weights", 1.0))),
+    ("weights -2", "schema", repack(put("policy_version", -2))),
+    ("weights 1.0", "schema", repack(put("policy_version", 1.0))),
     ("no worker", "schema", repack(put("worker", None))),
     ("long worker", "not-msgpack", repack(put("worker", "x" * 100_000))),
     ("three in a variation", "schema", repack(put("variation", [["a", []]] * 3))),

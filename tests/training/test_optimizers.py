@@ -1,4 +1,4 @@
-"""The optimiser: whose update each parameter gets, and that a stopped fit goes on as if it had not stopped."""
+"""The optimizer: whose update each parameter gets, and that a stopped fit goes on as if it had not stopped."""
 
 import copy
 import dataclasses
@@ -13,7 +13,7 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.training import batches, fit, optimizers
 from icrl_dist.training.batches import Pool
-from icrl_dist.training.fit import Optimiser
+from icrl_dist.training.fit import Optimizer
 from learner import checkpoints
 from tests.methods.test_recipes import Fixed, Kept
 
@@ -47,7 +47,7 @@ def test_matrices_of_the_trunk_go_by_muon_and_the_rest_by_adamw(model, batch, mu
     plain: list[torch.optim.Optimizer] = [torch.optim.AdamW(rest, lr=1e-3, weight_decay=0.1, betas=(0.9, 0.9))]
     if matrices:
         plain.append(torch.optim.Muon(matrices.values(), lr=1e-3 * muon, weight_decay=0.0))
-    opt = Optimiser(model, dataclasses.replace(CONFIG, muon=muon))
+    opt = Optimizer(model, dataclasses.replace(CONFIG, muon=muon))
     for step in range(3):
         for one in (model, other):
             fit.batch_loss(one, batch(step)).backward()
@@ -62,7 +62,7 @@ def test_matrices_of_the_trunk_go_by_muon_and_the_rest_by_adamw(model, batch, mu
 
 def test_learning_imports_no_compiler(model, batch, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # whoever imports it now fails
-    opt = Optimiser(model, dataclasses.replace(CONFIG, muon=5.0))
+    opt = Optimizer(model, dataclasses.replace(CONFIG, muon=5.0))
     fit.batch_loss(model, batch(0)).backward()
     opt.step(1e-3)
     opt.load(opt.state())
@@ -80,9 +80,9 @@ def test_a_fit_taken_up_from_a_checkpoint_ends_with_the_same_weights(small_run, 
         if step == 5:
             checkpoints.save(tmp_path / "half.npz", model, opt, {**checkpoints.manifest(small_run, spec, 0, 1)})
 
-    opt = Optimiser(model, config)
+    opt = Optimizer(model, config)
     fit.fit(model, opt, config, 1e-2, 10, batch, half)
-    again = Optimiser(fresh, config)
+    again = Optimizer(fresh, config)
     checkpoints.restore(tmp_path / "half.npz", spec, fresh, again)
     fit.fit(fresh, again, config, 1e-2, 10, batch, first=5)
     for mine, theirs in zip(model.parameters(), fresh.parameters(), strict=True):
@@ -91,11 +91,11 @@ def test_a_fit_taken_up_from_a_checkpoint_ends_with_the_same_weights(small_run, 
 
 
 @pytest.mark.parametrize("muon", [0.0, 5.0])
-def test_a_checkpoint_of_the_other_optimiser_is_refused_in_one_line(small_run, model, batch, tmp_path, muon):
-    one, other = (Optimiser(model, dataclasses.replace(CONFIG, muon=m)) for m in (muon, 5.0 - muon))
+def test_a_checkpoint_of_the_other_optimizer_is_refused_in_one_line(small_run, model, batch, tmp_path, muon):
+    one, other = (Optimizer(model, dataclasses.replace(CONFIG, muon=m)) for m in (muon, 5.0 - muon))
     fit.batch_loss(model, batch(0)).backward()
     one.step(1e-3)
     spec = splits.spec(small_run)
     checkpoints.save(tmp_path / "one.npz", model, one, checkpoints.manifest(small_run, spec, 0, 1))
-    with pytest.raises(ConfigError, match=r"another optimiser .*: it has the run's optim.muon"):
+    with pytest.raises(ConfigError, match=r"another optimizer .*: it has the run's optim.muon"):
         checkpoints.restore(tmp_path / "one.npz", spec, model, other)

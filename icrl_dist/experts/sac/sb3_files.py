@@ -69,7 +69,7 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
     arrays = {"actor": actor, "critic": torch.stack([critic, critic]), "log_temperature": torch.zeros(())}
     arrays |= {f"{name}/{moment}": torch.zeros_like(arrays[name]) for name in TRAINED for moment in MOMENTS}
     arrays["target"] = torch.zeros_like(arrays["critic"])
-    state = _optimiser(model, "actor").state
+    state = _optimizer(model, "actor").state
     updates = int(next(iter(state.values()))["step"]) if state else 0
     with torch.no_grad():
         for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
@@ -87,17 +87,17 @@ def share(model: Expert, shapes: Shapes, arrays: Mapping[str, Tensor]) -> None:
 def count(model: Expert, updates: int) -> None:
     """Adam has made so many steps."""
     for name in TRAINED:
-        for state in _optimiser(model, name).state.values():
+        for state in _optimizer(model, name).state.values():
             state["step"].fill_(updates)
 
 
 def _begin(model: Expert, updates: int) -> None:
     """Adam's state after so many steps, with moments of zero."""
     for name in TRAINED:
-        optimiser = _optimiser(model, name)
-        for parameter in optimiser.param_groups[0]["params"]:
+        optimizer = _optimizer(model, name)
+        for parameter in optimizer.param_groups[0]["params"]:
             moments = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
-            optimiser.state[parameter] = {"step": torch.tensor(float(updates)), **moments}
+            optimizer.state[parameter] = {"step": torch.tensor(float(updates)), **moments}
 
 
 def _pairs(
@@ -122,7 +122,7 @@ def _pairs(
                         columns = slice(at, at := at + part.out_features)
                         yield weights[row, :, columns].T, _of(model, name, part.weight, moment)
                         yield bias[row, 0, columns], _of(model, name, part.bias, moment)
-        theirs = _optimiser(model, "log_temperature").param_groups[0]["params"][0]
+        theirs = _optimizer(model, "log_temperature").param_groups[0]["params"][0]
         yield arrays["log_temperature" + suffix].view(1), _of(model, "log_temperature", theirs, moment)
 
 
@@ -132,12 +132,12 @@ def _linear(layers: Any) -> list[list[nn.Linear]]:
 
 def _of(model: stable_baselines3.SAC, name: str, parameter: Tensor, moment: str | None) -> Tensor:
     """A parameter's numbers, or a moment of it; torch keeps weights as (out, in)."""
-    return parameter if moment is None else _optimiser(model, name).state[parameter][moment]
+    return parameter if moment is None else _optimizer(model, name).state[parameter][moment]
 
 
-def _optimiser(model: stable_baselines3.SAC, name: str) -> torch.optim.Optimizer:
+def _optimizer(model: stable_baselines3.SAC, name: str) -> torch.optim.Optimizer:
     """Adam of one of ``TRAINED``.  Raises ValueError for a temperature that is fixed."""
     found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "log_temperature": model.ent_coef_optimizer}
-    if (optimiser := found[name]) is None:
+    if (optimizer := found[name]) is None:
         raise ValueError("the temperature is fixed: only experts that tune it can go on here")
-    return optimiser
+    return optimizer

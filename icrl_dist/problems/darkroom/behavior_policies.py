@@ -32,7 +32,7 @@ def towards(here: Float[np.ndarray, "B 2"], target: Float[np.ndarray, "B 2"]) ->
 
 
 class Walks:
-    """One episode of a behaviour policy in each of B rows.
+    """One episode of a behavior policy in each of B rows.
 
     ``random``: uniform over the actions.  ``persistent``: the last action again, or a random
     one.  ``goals``: to a random cell, some rest there, then to another, so that contexts also

@@ -16,13 +16,13 @@ from jaxtyping import Float32, Float64, Int
 
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior
 
-Rule = Literal["paper", "every step", "stretches", "committed", "zeta"]
-STRETCH = 5
+Rule = Literal["paper", "every step", "windows", "committed", "zeta"]
+WINDOW = 5
 ZETA = 11
 RULES: dict[Rule, str] = {
     "paper": "exact, Algorithm 1",
     "every step": "exact, every step",
-    "stretches": f"exact, stretches of {STRETCH}",
+    "windows": f"exact, windows of {WINDOW}",
     "committed": "exact, committed",
     "zeta": f"exact, zeta of {ZETA}",
 }
@@ -33,8 +33,8 @@ class ExactAgent:
     """The agent that Theorem E.3 promises: actions from the exact posterior, no network.
 
     ``paper``: Algorithm 1, a hypothesis a step, the posterior updated at an episode's end.
-    ``every step``: the same, updated at every transition.  ``stretches``: updated at every
-    transition, but a hypothesis is kept for ``STRETCH`` steps, or to the episode's end.
+    ``every step``: the same, updated at every transition.  ``windows``: updated at every
+    transition, but a hypothesis is kept for ``WINDOW`` steps, or to the episode's end.
     ``committed``: a hypothesis is kept, from episode to episode, until a transition refutes it.
     ``zeta``: the posterior, updated at every transition, given that the last ``ZETA`` actions of the
     episode were right (eq. 6): what ``rollout.CommittedPolicy`` does.  Of these as many count as
@@ -77,7 +77,7 @@ class ExactAgent:
         seen = log_likelihood(self._h, cell, action.astype(np.int64), reward, arrived)
         self._loglik += seen
         self._step = 0 if done else self._step + 1
-        if self._rule in ("stretches", "committed"):
+        if self._rule in ("windows", "committed"):
             self._guess = _normalised(self._guess * self._labels[self._family, cell, action])
         if self._rule == "committed":
             kept = np.where(np.isneginf(seen), 0.0, self._guess)
@@ -86,7 +86,7 @@ class ExactAgent:
             right = self._labels[self._family, cell, action]
             self._zeta = [] if done else [*self._zeta, right][-ZETA:]
             self._guess = self._given_zeta()
-        elif done or self._rule == "every step" or (self._rule == "stretches" and self._step % STRETCH == 0):
+        elif done or self._rule == "every step" or (self._rule == "windows" and self._step % WINDOW == 0):
             self._guess = self._posterior()
 
     def append(

@@ -33,8 +33,8 @@ def scripted_context(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Tr
     """Episodes D^{i,k} that the scripted policy leads in each variation, query states and labels.
 
     Of its trials every other one is told the true goal; the rest are told places in the box that goals
-    lie in, a new one at some step.  Settings: ``queries`` a trajectory; ``stretches``, ``stretch`` and
-    ``misled`` as for ``train_expert``.  Raises RuntimeError for a variation whose simulation keeps breaking down.
+    lie in, a new one at some step.  Settings: ``queries`` a trajectory; ``windows``, ``window`` and
+    ``decoy_fraction`` as for ``train_expert``.  Raises RuntimeError for a variation whose simulation keeps breaking down.
     """
     env = registry.batch(job.variations)
     recorder, count = Recorder(env, job.trials, job.trials), len(job.variations)
@@ -47,7 +47,7 @@ def scripted_context(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Tr
             recorder.step(_actions(env.truth, leads, step))  # type: ignore[attr-defined]
         tell(f"{count * (trial + 1)} of {count * job.trials} episodes of the scripted policy")
     columns = labelled(recorder.columns(), None)
-    if int(str(job.setting("stretches"))):
+    if int(str(job.setting("windows"))):
         led = lead(env, None, [own_seed(variation, job.seed) for variation in job.variations], range(count))
     else:
         led = {name: column[:, :0] for name, column in columns.items() if name != "adversary"}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from icrl_dist.bench import bite, disturbance
+from icrl_dist.bench import disturbance, drop
 from icrl_dist.bench.disturbance import Setting, Sizes
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps, load, override, parse
@@ -17,17 +17,17 @@ from icrl_dist.problems.dmc import domains
 from tests.bench.test_bench_disturbance import Balances
 
 KIND = "dmc-cartpole-balance"
-RUN = f'problem = "{KIND}"\n[control]\ntrain_tasks = 4\nstrength = "bite:0.3"\n'
+RUN = f'problem = "{KIND}"\n[control]\ntrain_tasks = 4\nstrength = "drop:0.3"\n'
 
 
 def row(strength, problem=KIND, forces=("paper",), share=0.3, metres=0.0):
-    return {"problem": problem, "forces": list(forces), "metres": metres, "bite": share, "strength": strength}
+    return {"problem": problem, "forces": list(forces), "metres": metres, "drop": share, "strength": strength}
 
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
     """The user's own table, in a folder of the test."""
-    file = tmp_path / "cache" / "bites.json"
+    file = tmp_path / "cache" / "drops.json"
     monkeypatch.setattr(calibrated_strength, "own_file", lambda: file)
     monkeypatch.setattr(calibrated_strength, "packaged", list)
 
@@ -41,7 +41,7 @@ def own(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("slope", [0.001, 0.04, 0.7, 90.0])
 def test_a_straight_line_is_solved_to_the_tolerance_from_above(slope):
-    found = bite.solve(lambda strength: slope * strength, 0.25, most=2.0**12)
+    found = drop.solve(lambda strength: slope * strength, 0.25, most=2.0**12)
     exact = 0.25 / slope
     assert found.reached and exact <= found.strength <= exact / (1 - 0.021) and found.lost == slope * found.strength
     assert list(found.tried) == sorted(found.tried) and (found.strength, found.lost) in found.tried
@@ -52,28 +52,28 @@ def test_of_a_loss_that_rises_and_falls_the_smallest_strength_is_found_as_a_slow
         """Passes 0.25 three times."""
         return 0.5 * math.exp(-((math.log(s) - math.log(3.0)) ** 2)) + 0.01 * s
 
-    fine = np.geomspace(bite.FIRST, bite.MOST, 20_001)
+    fine = np.geomspace(drop.FIRST, drop.MOST, 20_001)
     slow = next(s for s in fine if bump(s) >= 0.25)
-    found = bite.solve(bump, 0.25)
+    found = drop.solve(bump, 0.25)
     assert slow * 0.999 <= found.strength <= slow * 1.022
     assert any(bump(s) < 0.25 for s in fine if s > found.strength), "or this test would be of a monotone loss"
 
 
 def test_a_bite_that_nothing_reaches_is_said_at_the_largest_strength():
-    found = bite.solve(lambda strength: 0.2, 0.25, first=1.0, most=6.0)
+    found = drop.solve(lambda strength: 0.2, 0.25, first=1.0, most=6.0)
     assert not found.reached and found.strength == 6.0 and [s for s, _ in found.tried] == [1, 2, 4, 6]
 
 
 def test_a_run_has_the_strength_that_was_measured_and_keeps_it_whatever_the_table_says_later(own):
     own(row(7.5), row(9.0, forces=("qarl",)), row(1.0, share=0.25), row(2.0, problem="dmc-cheetah-run"))
     run = parse(RUN, "file")
-    assert run.control.strength == "bite:0.3" and calibrated_strength.strength(run.control, run.problem) == 7.5
+    assert run.control.strength == "drop:0.3" and calibrated_strength.strength(run.control, run.problem) == 7.5
     pushes = {v.adversary["strength"] for v in splits.variations(run, 0, splits.split(run).train[0])[1:]}
     assert pushes == {7.5} and splits.test_adversary(run, 0, 2.0, "unseen")["strength"] == 15.0
     own(row(8.0), row(9.0, forces=("qarl",)))
     again = parse(dumps(run), "run.toml")
-    assert again == run and 'strength = "bite:0.3"' in dumps(run) and "=7.5" in dumps(run)
-    assert override(run, ["control.forces=qarl"], "--set").control.solved.endswith("qarl/bite:0.3=9.0")
+    assert again == run and 'strength = "drop:0.3"' in dumps(run) and "=7.5" in dumps(run)
+    assert override(run, ["control.forces=qarl"], "--set").control.solved.endswith("qarl/drop:0.3=9.0")
     plain = override(run, ["control.strength=2"], "--set")
     assert (plain.control.strength, plain.control.solved) == (2.0, "")
     assert parse(RUN, "file").control.solved.endswith("=8.0")
@@ -81,7 +81,7 @@ def test_a_run_has_the_strength_that_was_measured_and_keeps_it_whatever_the_tabl
 
 def test_metres_are_what_a_bite_in_meta_world_is_of(own):
     own(row(0.6, problem="metaworld-pick-place", forces=(), metres=0.01))
-    text = 'problem = "metaworld-pick-place"\n[control]\nstrength = "bite:0.3"\ndisturbance = {}\n'
+    text = 'problem = "metaworld-pick-place"\n[control]\nstrength = "drop:0.3"\ndisturbance = {}\n'
     assert calibrated_strength.strength(parse(text.format("0.01"), "file").control, "metaworld-pick-place") == 0.6
     assert calibrated_strength.strength(parse(text.format("0.02"), "file").control, "metaworld-pick-place") == pytest.approx(
         0.3
@@ -90,55 +90,55 @@ def test_metres_are_what_a_bite_in_meta_world_is_of(own):
         parse(text.format("0.0"), "file")
 
 
-@pytest.mark.parametrize("given", ["bit:0.25", "bite:0", "bite:1", "bite:25%", "bite:-0.1", "bite:nan", "strong", "2"])
+@pytest.mark.parametrize("given", ["bit:0.25", "drop:0", "drop:1", "drop:25%", "drop:-0.1", "drop:nan", "strong", "2"])
 def test_what_is_neither_a_number_nor_a_bite_is_refused_with_the_form(given):
-    with pytest.raises(ConfigError, match=rf"file: control\.strength = '{given}': write a number, or bite:SHARE"):
-        parse(RUN.replace("bite:0.3", given), "file")
+    with pytest.raises(ConfigError, match=rf"file: control\.strength = '{given}': write a number, or drop:SHARE"):
+        parse(RUN.replace("drop:0.3", given), "file")
 
 
 def test_a_bite_that_nobody_solved_is_refused_with_the_command_that_solves_it(own, capsys):
     file = own(row(7.5, share=0.5))
-    assert main.main(["train", f"{KIND}-laptop", "--control.strength", "bite:0.25", "--out", str(file.parent / "r")]) == 2
+    assert main.main(["train", f"{KIND}-laptop", "--control.strength", "drop:0.25", "--out", str(file.parent / "r")]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"`icrl-dist bench disturbance --problem {KIND} --bite 0.25`" in said
-    assert "solved: bite:0.5" in said
+    assert said.count("\n") == 1 and f"`icrl-dist bench disturbance --problem {KIND} --drop 0.25`" in said
+    assert "solved: drop:0.5" in said
     with pytest.raises(ConfigError, match=r"not solved for dmc-hopper-hop .*solved: none"):
-        override(load("dmc-hopper-hop"), ["control.strength=bite:0.5"], "--set")
+        override(load("dmc-hopper-hop"), ["control.strength=drop:0.5"], "--set")
     with pytest.raises(ConfigError, match=r"adversary\.p_max"):
-        parse('[control]\nstrength = "bite:0.25"', "file")
+        parse('[control]\nstrength = "drop:0.25"', "file")
     file.write_text("[{}]")
-    with pytest.raises(ConfigError, match=r"not a table of bites.*delete it"):
+    with pytest.raises(ConfigError, match=r"not a table of calibrated strengths.*delete it"):
         parse(RUN, "file")
 
 
 def test_the_packaged_table_has_what_it_was_solved_from():
     for one in calibrated_strength.packaged():
         assert one["problem"] in (*domains.PROBLEMS, "metaworld-pick-place") and one["reached"]
-        assert one["lost_mean"] >= one["bite"] == calibrated_strength.share(f"bite:{one['bite']:g}")
+        assert one["lost_mean"] >= one["drop"] == calibrated_strength.share(f"drop:{one['drop']:g}")
         below = [share for strength, share in one["tried"] if strength < one["strength"]]
-        assert below and max(below) < one["bite"], "the smallest that was tried"
-        assert f"--problem {one['problem']} --bite" in one["command"] and one["versions"] and one["date"]
-        assert one["undisturbed"] >= bite.COMPETENT * (5000 if one["metres"] else 200)
+        assert below and max(below) < one["drop"], "the smallest that was tried"
+        assert f"--problem {one['problem']} --drop" in one["command"] and one["versions"] and one["date"]
+        assert one["undisturbed"] >= drop.COMPETENT * (5000 if one["metres"] else 200)
 
 
 def test_solving_keeps_the_strength_for_runs_that_ask_for_it(own, monkeypatch, capsys):
     settings = [Setting("qarl", domains.task(KIND, forces="qarl", horizon=20), 2)]
     monkeypatch.setattr(disturbance, "settings", lambda kind: settings)
-    monkeypatch.setattr(bite, "settings", lambda kind: settings)
-    monkeypatch.setattr(bite, "_tasks", lambda kind, one, sizes: (one.task,))
-    monkeypatch.setattr(bite, "_expert", lambda kind, config, report: Balances)
-    monkeypatch.setattr(bite, "solve", functools.partial(bite.solve, first=0.5, most=8.0, tolerance=0.4))
-    monkeypatch.setattr(bite, "SIZES", Sizes(adversaries=1, episodes=1))
-    assert main.main(["bench", "disturbance", "--problem", KIND, "--bite", "0.01", "--json"]) == 0
+    monkeypatch.setattr(drop, "settings", lambda kind: settings)
+    monkeypatch.setattr(drop, "_tasks", lambda kind, one, sizes: (one.task,))
+    monkeypatch.setattr(drop, "_expert", lambda kind, config, report: Balances)
+    monkeypatch.setattr(drop, "solve", functools.partial(drop.solve, first=0.5, most=8.0, tolerance=0.4))
+    monkeypatch.setattr(drop, "SIZES", Sizes(adversaries=1, episodes=1))
+    assert main.main(["bench", "disturbance", "--problem", KIND, "--drop", "0.01", "--json"]) == 0
     out = capsys.readouterr().out
     (solved,) = json.loads(out.splitlines()[-1])["problems"]
     assert solved["lost_mean"] >= 0.01 and solved["reached"] and len(solved["tried"]) > 1
     kept = calibrated_strength.own()
     assert kept == [solved]
     slow = disturbance.pushes(settings[0], 1, solved["strength"])
-    measured = disturbance.measure([bite.Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
+    measured = disturbance.measure([drop.Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
     assert disturbance.lost(measured.returns)["lost_mean"] == pytest.approx(solved["lost_mean"])
-    bite._keep(solved)
+    drop._keep(solved)
     assert calibrated_strength.own() == kept, "in its own place"
 
 
@@ -148,12 +148,12 @@ def test_an_incompetent_expert_is_not_asked_what_bites_it(own, monkeypatch):
             return np.full((len(observation), 1), np.float32(1))
 
     settings = Setting("qarl", domains.task(KIND, forces="qarl", horizon=20), 2)
-    monkeypatch.setattr(bite, "_tasks", lambda kind, one, sizes: (one.task,))
-    monkeypatch.setattr(bite, "settings", lambda kind: [settings])
-    monkeypatch.setattr(bite, "_expert", lambda kind, config, report: Idle)
+    monkeypatch.setattr(drop, "_tasks", lambda kind, one, sizes: (one.task,))
+    monkeypatch.setattr(drop, "settings", lambda kind: [settings])
+    monkeypatch.setattr(drop, "_expert", lambda kind, config, report: Idle)
     with pytest.raises(ConfigError, match=r"earn .* undisturbed, not 19: train longer"):
-        monkeypatch.setattr(bite, "COMPETENT", 0.95)
-        bite.run(0.25, KIND, sizes=Sizes(adversaries=1, episodes=1))
+        monkeypatch.setattr(drop, "COMPETENT", 0.95)
+        drop.run(0.25, KIND, sizes=Sizes(adversaries=1, episodes=1))
     assert not calibrated_strength.own_file().exists()
     with pytest.raises(ConfigError, match="did you mean 'dmc-hopper-hop'"):
-        bite.run(0.25, "dmc-hoper-hop")
+        drop.run(0.25, "dmc-hoper-hop")

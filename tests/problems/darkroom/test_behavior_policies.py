@@ -1,4 +1,4 @@
-"""The behaviour policies of pretraining's contexts, against what their words say."""
+"""The behavior policies of pretraining's contexts, against what their words say."""
 
 import numpy as np
 import pytest

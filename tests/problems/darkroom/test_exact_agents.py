@@ -11,14 +11,14 @@ import pytest
 
 from icrl_dist.problems.darkroom import exact_agents, solver
 from icrl_dist.problems.darkroom import room as darkroom
-from icrl_dist.problems.darkroom.exact_agents import RULES, STRETCH, ExactAgent, OptimalAgent, Rule
+from icrl_dist.problems.darkroom.exact_agents import RULES, WINDOW, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.problems.darkroom.solver import Hypotheses
 from icrl_dist.rollout.deployment import sample
 from icrl_dist.types import NULL, Adversary, Task, Variation
 from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, normalised, outcomes
 
-SIZE, HORIZON, EPISODES = 3, STRETCH + 2, 3
+SIZE, HORIZON, EPISODES = 3, WINDOW + 2, 3
 OTHERS = (Adversary.of("uniform", p=0.5), Adversary.of("dirichlet", p=0.2, alpha=ALPHA[::-1]))
 Room = Callable[[int, int], tuple[Task, ...]]
 Transition = tuple[tuple[int, int], int, float, tuple[int, int]]
@@ -55,8 +55,8 @@ def slow_law(rule: Rule, family: Family, labels: np.ndarray, history: list[Trans
         """Whether the hypothesis that acted at step t is drawn anew for the next."""
         if rule == "committed":
             return likelihood(family[m], history[t]) == 0.0
-        if rule == "stretches":
-            return (t + 1) % HORIZON in (0, STRETCH)
+        if rule == "windows":
+            return (t + 1) % HORIZON in (0, WINDOW)
         return True
 
     @functools.cache
@@ -163,7 +163,7 @@ def test_an_agent_that_keeps_a_hypothesis_refuses_actions_that_none_would_take(r
     for rule in RULES:
         agent = ExactAgent([h], [labels], np.array([0]), rule)
         away = (np.array([[0.0, 1.0]], np.float32), np.array([3]), np.zeros(1, np.float32), np.zeros((1, 2), np.float32), False)
-        if rule in ("stretches", "committed"):
+        if rule in ("windows", "committed"):
             with pytest.raises(ValueError, match="an action that it never takes"):
                 agent.observe(*away)
         else:

@@ -150,11 +150,11 @@ def test_a_context_that_no_goal_explains_is_refused():
         exact(h, (states[:2], np.array([0, 1]), states[1:], never))
 
 
-def build(stretch, heads=2):
+def build(window, heads=2):
     """A model whose every parameter matters."""
     torch.manual_seed(0)
     spec = Spec(low=(0.0, 0.0), high=(4.0, 4.0), actions=5, horizon=7)
-    model = PretrainedTransformer(spec, ModelConfig(3, heads, 16, stretch=stretch)).eval()
+    model = PretrainedTransformer(spec, ModelConfig(3, heads, 16, window=window)).eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.4)

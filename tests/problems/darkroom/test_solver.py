@@ -87,8 +87,8 @@ def episode(variation: Variation, seed: int) -> Trajectory:
     return Trajectory(
         identity=Identity("pretrain", 0, 0, 0, seed),
         variation=variation,
-        weights=-1,
-        digest="",
+        policy_version=-1,
+        weights_digest="",
         worker="test",
         observations=np.array(states, np.float32),
         actions=np.array(actions, np.int16),

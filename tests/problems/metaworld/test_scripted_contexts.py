@@ -95,8 +95,8 @@ def test_actions_are_the_leaders_with_its_noise_and_labels_the_true_goals(run, m
 
 def test_the_same_job_gives_the_same_bytes_and_stretches_when_they_are_asked_for(run, monkeypatch):
     monkeypatch.setattr(delivery, "LED", 1)
-    model = dataclasses.replace(run.model, stretch=4)
-    run = dataclasses.replace(run, model=model, pretrain=dataclasses.replace(run.pretrain, stretches=3, contexts=4))
+    model = dataclasses.replace(run.model, window=4)
+    run = dataclasses.replace(run, model=model, pretrain=dataclasses.replace(run.pretrain, windows=3, contexts=4))
     job = dataclasses.replace(asked(run), tasks=1, variations=asked(run).variations[:2])
     sent, again = (list(jobs.do(job, None, "w")) for _ in range(2))
     assert [wire.trajectory_digest(t) for t in sent] == [wire.trajectory_digest(t) for t in again]

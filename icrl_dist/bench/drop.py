@@ -1,4 +1,4 @@
-"""The strength at which undisturbed experts lose a given share of their return, solved and kept (``bite:0.25``).
+"""The strength at which undisturbed experts lose a given share of their return, solved and kept (``drop:0.25``).
 
 In DeepMind Control the tasks are those of the smallest training set, the central 2x2 of the grid, each with
 an undisturbed SAC expert of its own; in Meta-World the first training tasks with the scripted policy of
@@ -32,9 +32,9 @@ from icrl_dist.types import Task, Variation
 KNOWN = ("dmc-cartpole-balance", pick_place.KIND)
 """Problems whose experts are known to be competent with their laptop numbers."""
 COMPETENT = 0.25
-"""Mean reward a step, of at most 1, that experts must earn undisturbed: what bites a worse one says nothing."""
+"""Mean reward a step, of at most 1, that experts must earn undisturbed: a drop of a worse one says nothing."""
 FIRST, MOST = 2.0**-3, 2.0**14
-"""The strengths between which a bite is looked for, each twice the one before; then within 2% by bisection."""
+"""The strengths between which the drop is searched, each twice the one before; then within 2% by bisection."""
 SIZES = Sizes(episodes=3)
 
 Loss = Callable[[float], float]
@@ -54,18 +54,18 @@ class Solved:
     """Every strength and what it took, smallest first."""
 
 
-def solve(loss: Loss, bite: float, first: float = FIRST, most: float = MOST, tolerance: float = 0.02) -> Solved:
-    """The smallest strength at which ``loss`` is at least ``bite``, to ``tolerance`` of itself from above.
+def solve(loss: Loss, drop: float, first: float = FIRST, most: float = MOST, tolerance: float = 0.02) -> Solved:
+    """The smallest strength at which ``loss`` is at least ``drop``, to ``tolerance`` of itself from above.
 
     The loss need not be monotone: strengths are tried upwards, each twice the one before, and the first
-    that takes ``bite`` ends the ladder; bisection then keeps an upper end that does.  What rises and
+    that takes ``drop`` ends the ladder; bisection then keeps an upper end that does.  What rises and
     falls again between two rungs is not seen.
     """
     tried: dict[float, float] = {}
 
     def ask(strength: float) -> bool:
         tried[strength] = loss(strength)
-        return tried[strength] >= bite
+        return tried[strength] >= drop
 
     low, high = 0.0, first
     while not ask(high):
@@ -79,18 +79,18 @@ def solve(loss: Loss, bite: float, first: float = FIRST, most: float = MOST, tol
 
 
 def run(
-    bite: float,
+    drop: float,
     problem: str | None = None,
     steps: int | None = None,
     report: Report = lambda said: None,
     sizes: Sizes | None = None,
 ) -> dict[str, Any]:
-    """Solve ``bite`` for a problem, or for those with experts known to be competent, and keep it in the user's own table.
+    """Solve ``drop`` for a problem, or for those with experts known to be competent, and keep it in the user's own table.
 
     ``steps`` of SAC for a problem's experts, instead of those of ``bench disturbance``.  Raises ConfigError
     for an unknown problem, and for experts that are not competent.
     """
-    calibrated_strength.share(f"bite:{bite:g}")
+    calibrated_strength.share(f"drop:{drop:g}")
     known = (*domains.PROBLEMS, pick_place.KIND)
     if problem is not None and problem not in known:
         raise ConfigError(
@@ -100,26 +100,26 @@ def run(
     torch.set_num_threads(1)
     try:
         for kind in KNOWN if problem is None else (problem,):
-            rows += _solved(kind, bite, steps, report, sizes or SIZES)
+            rows += _solved(kind, drop, steps, report, sizes or SIZES)
     finally:
         torch.set_num_threads(threads)
     return {
-        "bite": bite,
+        "drop": drop,
         "problems": rows,
         "file": str(calibrated_strength.own_file()),
         "ok": all(row["reached"] for row in rows),
     }
 
 
-def _solved(kind: str, bite: float, steps: int | None, report: Report, sizes: Sizes) -> list[dict[str, Any]]:
+def _solved(kind: str, drop: float, steps: int | None, report: Report, sizes: Sizes) -> list[dict[str, Any]]:
     """One problem under each of its disturbances."""
     config = disturbance.numbers(kind)
     config = config if steps is None else dataclasses.replace(config, steps=steps)
     make = _expert(kind, config, report)
     rows: list[dict[str, Any]] = []
     for one in settings(kind):
-        row = _row(kind, one, make, bite, config, report, sizes)
-        row["command"] = f"icrl-dist bench disturbance --problem {kind} --bite {bite:g}" + (
+        row = _row(kind, one, make, drop, config, report, sizes)
+        row["command"] = f"icrl-dist bench disturbance --problem {kind} --drop {drop:g}" + (
             f" --steps {steps}" if steps else ""
         )
         if row["reached"]:
@@ -129,7 +129,7 @@ def _solved(kind: str, bite: float, steps: int | None, report: Report, sizes: Si
     return rows
 
 
-def _row(kind: str, one: Setting, make: Make, bite: float, config: SACConfig, report: Report, sizes: Sizes) -> dict[str, Any]:
+def _row(kind: str, one: Setting, make: Make, drop: float, config: SACConfig, report: Report, sizes: Sizes) -> dict[str, Any]:
     chosen = _tasks(kind, one, sizes)
     found: dict[float, dict[str, float | None]] = {}
     episodes = 1 if kind == pick_place.KIND else sizes.episodes
@@ -143,11 +143,11 @@ def _row(kind: str, one: Setting, make: Make, bite: float, config: SACConfig, re
         if share is None or earned is None or earned < _needed(kind, one):
             remedy = "its scripted policy has failed" if kind == pick_place.KIND else "train longer with --steps"
             needed = f"earn {earned:.1f} undisturbed, not {_needed(kind, one):g}"
-            raise ConfigError(f"bench disturbance --bite {bite:g}: the experts of {kind} {needed}: {remedy}")
+            raise ConfigError(f"bench disturbance --drop {drop:g}: the experts of {kind} {needed}: {remedy}")
         report(f"{kind} {one.forces}: strength {strength:g} takes {share:.1%}")
         return share
 
-    answer = solve(loss, bite)
+    answer = solve(loss, drop)
     preset = ["paper", "qarl"] if len(settings(kind)) == 1 else [one.forces]
     scripted = kind == pick_place.KIND
     names = ("undisturbed", "undisturbed_error", "lost_mean", "lost_worst", "lost_error", "broken")
@@ -155,7 +155,7 @@ def _row(kind: str, one: Setting, make: Make, bite: float, config: SACConfig, re
         "problem": kind,
         "forces": [] if scripted else preset,
         "metres": pick_place.DISTURBANCE if scripted else 0.0,
-        "bite": bite,
+        "drop": drop,
         "strength": answer.strength,
         "reached": answer.reached,
         **{name: found[answer.strength][name] for name in names},
@@ -194,7 +194,7 @@ def _expert(kind: str, config: SACConfig, report: Report) -> Make:
 
 def _keep(row: dict[str, Any]) -> None:
     """In the user's own table, in the place of what it held for the same."""
-    key = ("problem", "forces", "metres", "bite")
+    key = ("problem", "forces", "metres", "drop")
     others = [old for old in calibrated_strength.own() if any(old[name] != row[name] for name in key)]
     file = calibrated_strength.own_file()
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -205,7 +205,7 @@ def describe_row(row: dict[str, Any]) -> str:
     """A problem in one line of the table."""
     of = f"{row['metres'] * 100:g} cm" if row["metres"] else "/".join(row["forces"])
     error = "" if row["lost_error"] is None else f" +-{row['lost_error']:.1%}"
-    said = "" if row["reached"] else f"  not {row['bite']:.0%}, even at the largest strength tried: not kept"
+    said = "" if row["reached"] else f"  not {row['drop']:.0%}, even at the largest strength tried: not kept"
     return (
         f"{row['problem']:<22}{of:<12}{row['strength']:>10.4g}{row['lost_mean']:>9.1%}{error:<9}{row['lost_worst']:>8.1%}"
         f"{row['undisturbed']:>12.1f}  {row['expert']}{said}"
@@ -215,5 +215,5 @@ def describe_row(row: dict[str, Any]) -> str:
 def describe(result: dict[str, Any]) -> str:
     """The result as a table."""
     head = f"{'problem':<22}{'forces':<12}{'strength':>10}{'lost':>9}{'':<9}{'worst':>8}{'undisturbed':>12}  expert"
-    of = f"smallest strength at which undisturbed experts lose {result['bite']:.0%} of their return; kept in {result['file']}"
+    of = f"smallest strength at which undisturbed experts lose {result['drop']:.0%} of their return; kept in {result['file']}"
     return "\n".join([of, head, *map(describe_row, result["problems"])])

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from icrl_dist.config.run import PracticeConfig
+from icrl_dist.config.run import DAggerConfig
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch.train import TrainInterrupted
 from icrl_dist.types import Identity
@@ -19,8 +19,8 @@ def run(small_run):
     return dataclasses.replace(
         small_run,
         method="icag",
-        pretrain=dataclasses.replace(small_run.pretrain, behaviours=("random", "persistent", "goals", "sweep")),
-        practice=PracticeConfig(rounds=2, trials=3, steps=6),
+        pretrain=dataclasses.replace(small_run.pretrain, behaviors=("random", "persistent", "goals", "sweep")),
+        dagger=DAggerConfig(rounds=2, trials=3, steps=6),
         optim=dataclasses.replace(small_run.optim, muon=5.0, transitions=60),
     )
 
@@ -41,7 +41,7 @@ def test_a_round_of_practice_stopped_midway_goes_on_to_the_same_bytes(run, tmp_p
     with pytest.raises(TrainInterrupted):
         run_inline(run, tmp_path / "stopped", stop)
     partial = checkpoints.read_manifest(tmp_path / "stopped" / "checkpoints" / checkpoints.PARTIAL)
-    assert partial["produces"] == 2 and 0 < partial["step"] < 6
+    assert partial["next_version"] == 2 and 0 < partial["step"] < 6
     monkeypatch.setattr(service.Service, "run", real)
     assert same(run_inline(run, tmp_path / "stopped", resume=True), whole)
 
@@ -49,5 +49,5 @@ def test_a_round_of_practice_stopped_midway_goes_on_to_the_same_bytes(run, tmp_p
 def test_a_history_is_explained_and_made_again(run, tmp_path):
     run_inline(run, tmp_path / "run")
     answer = explain.explain(tmp_path / "run", Identity("adapt", 1, 3, 2, 1), rerun=True)
-    assert answer["rerun_equal"] and answer["weights"] == 1
+    assert answer["rerun_equal"] and answer["policy_version"] == 1
     assert answer["label_origin"] == "optimal" and answer["learned_by"] == ["T^2"]
