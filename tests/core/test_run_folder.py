@@ -1,6 +1,8 @@
 """Run folders: the user's files are never removed, and a run that is replaced comes back unless its successor stands."""
 
 import contextlib
+import fcntl
+import json
 import os
 import tempfile
 from pathlib import Path
@@ -10,6 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from icrl_dist import launch, run_folder
+from icrl_dist.chaos import campaign
+from icrl_dist.chaos.training import Training
 from icrl_dist.config import ConfigError
 from icrl_dist.files import hold
 
@@ -202,10 +206,12 @@ def test_after_the_first_checkpoint_or_a_good_end_the_new_run_stays(tmp_path, mo
         folder, _ = began(tmp_path / str(checkpoint), module_run)
         with pytest.raises(ConfigError) if checkpoint else contextlib.nullcontext():  # noqa: SIM117
             with launch.prepare(module_run, folder, resume=False, overwrite=True):
+                write(folder, ["learner.log"])
                 if checkpoint:
                     write(folder, ["checkpoints/version-0000.npz"])
                     raise ConfigError("later")
-        assert (folder / "checkpoints").exists() == checkpoint and [path.name for path in folder.parent.iterdir()] == ["run"]
+        assert (folder / "learner.log").exists() and [path.name for path in folder.parent.iterdir()] == ["run"]
+        assert (folder / "checkpoints").exists() == checkpoint
 
 
 def test_neither_is_removed_if_the_new_folder_got_a_file_of_the_users(tmp_path, module_run):
@@ -254,11 +260,68 @@ def test_after_a_kill_during_the_removal_what_is_left_is_no_run_that_comes_back(
     assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
 
 
-def test_the_lock_that_counts_is_the_one_in_the_folder_now(tmp_path):
-    """Whoever waits for a folder that is replaced meanwhile does not end with the lock of the one that is gone."""
+def test_a_campaign_of_faults_clears_only_its_own_files(tmp_path, module_run):
+    folder = write(tmp_path / "undisturbed", [*OURS, "notes.md"])
+    training = Training("smoke", module_run, (), folder, 1, 1.0)
+    training.log.touch()
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match=r"notes\.md"):
+        campaign._clear(training)
+    assert files(tmp_path) == before
+    (folder / "notes.md").unlink()
+    campaign._clear(training)
+    assert not any(tmp_path.iterdir())
+
+
+def forked(folder, version):
+    """The folder's run as a fork that began with another's versions up to this one."""
+    write(folder, [f"checkpoints/version-{n:04d}.npz" for n in range(version + 1)])
+    (folder / "fork.json").write_text(json.dumps({"version": version}))
+
+
+def test_the_versions_that_a_fork_begins_with_are_no_first_checkpoint(tmp_path, module_run, monkeypatch):
+    folder, before = began(tmp_path, module_run)
+    monkeypatch.setattr(launch, "fork", lambda theirs, version, run, folder: forked(folder, version))
+    given = {"resume": False, "overwrite": True, "source": (tmp_path / "parent", 1)}
+    with pytest.raises(KeyboardInterrupt), launch.prepare(module_run, folder, **given) as begun:
+        begun.heed(lambda event: None)({"event": "progress", "version": 1})
+        raise KeyboardInterrupt
+    assert begun.restored and files(folder) == before
+    launch.prepare(module_run, folder, **given)._lock.close()  # killed
+    with pytest.raises(ConfigError, match="was killed"):
+        launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(run_folder.aside_of(folder)) == before
+    write(folder, ["checkpoints/version-0002.npz"])
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert not run_folder.aside_of(folder).exists()
+
+
+def test_a_removal_that_is_cut_short_leaves_no_run(tmp_path, monkeypatch):
+    folder = write(tmp_path / "run", OURS)
+    unlink, cut = Path.unlink, []
+
+    def once(path, missing_ok=False):
+        if cut:
+            raise OSError("cut short")
+        cut.append(path)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", once)
+    with pytest.raises(OSError, match="cut short"):
+        run_folder.remove(folder)
+    assert cut == [folder / "run.toml"] and not cut[0].exists()
+
+
+def test_the_lock_that_counts_is_the_one_in_the_folder_now(tmp_path, monkeypatch):
+    """A folder may be replaced between the opening of its lock and the locking."""
     folder = write(tmp_path / "run", ["run.toml"])
-    first = hold(folder)
-    (folder / ".lock").unlink()
-    with hold(folder) as second:
-        assert os.path.samestat(os.fstat(second.fileno()), (folder / ".lock").stat())
-        first.close()
+    flock, replaced = fcntl.flock, []
+
+    def late(file, how):
+        if not replaced:
+            replaced.append((folder / ".lock").rename(tmp_path / "gone"))
+        flock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with hold(folder) as file:
+        assert replaced and os.path.samestat(os.fstat(file.fileno()), (folder / ".lock").stat())

@@ -9,7 +9,7 @@ import torch
 from actors import fleet
 from icrl_dist import cli, heldout, launch, run_folder
 from icrl_dist.config import ConfigError, dumps, load, override
-from icrl_dist.files import held, hold, load_checkpoint, version_file
+from icrl_dist.files import Checkpoint, held, hold, load_checkpoint, save_checkpoint, version_file
 from tests.core.test_run_folder import files
 from tests.learner.test_service import no_tensorboard
 
@@ -199,6 +199,9 @@ def test_a_report_of_other_settings_is_never_replaced(run):
     shutil.copyfile(version_file(run, 2), run / "agent.npz")
     after = evaluate(run / "agent.npz")
     assert len(after) == len(known) + 2, "a file's report, without T^0, beside its folder's"
+    made = load_checkpoint(version_file(run, 2))
+    save_checkpoint(run / "agent.npz", Checkpoint(made.arrays, {**made.manifest, "weights_digest": "0" * 64}))
+    assert len(evaluate(run / "agent.npz")) == len(after) + 2, "another agent in a file of the same name"
     run_override = override(load(str(run / "run.toml")), [f"evaluate.p={[n / 100 for n in range(50)]}"], "--set")
     assert len(heldout.report_name(run_override, run)) < 200
     assert run_folder.foreign(run) == []
