@@ -95,7 +95,7 @@ def main() -> int:
     for name, keys in differing.items():
         print(f"{name:<22} {'equal' if not keys else 'DIFFERS: ' + ', '.join(keys)}")
         for key in keys:
-            print(f"    {key}: {recorded[name][key]}\n      now: {found[name][key]}")
+            print(f"    {key}: {str(recorded[name][key])[:200]}\n      now: {str(found[name][key])[:200]}")
     return 1 if any(differing.values()) else 0
 
 

@@ -79,14 +79,9 @@ def train(arguments: Train, console: Console) -> int:
                         heldout.keep_calibrated(folder, display)
                         results = heldout.online(run, folder, display)
         except launch.TrainInterrupted:
-            resume = f"`{_resuming(arguments.given)}` goes on from the checkpoint"
-            told = (
-                f"{folder} is as it was before"
-                if begun.restored
-                else resume
-                if folder.exists()
-                else "nothing had been done yet"
-            )
+            told = f"`{_resuming(arguments.given)}` goes on from the checkpoint"
+            if begun.restored or not folder.exists():
+                told = f"{folder} is as it was before" if begun.restored else "nothing had been done yet"
             console.print(f"interrupted; {told}", highlight=False, markup=False, soft_wrap=True)
             return INTERRUPTED
         result |= {"folder": str(folder), "seconds": round(time.monotonic() - began, 1)}

@@ -1,6 +1,8 @@
 """Run folders: the user's files are never removed, and a run that is replaced comes back unless its successor stands."""
 
 import contextlib
+import fcntl
+import json
 import os
 import tempfile
 from pathlib import Path
@@ -9,8 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from icrl_dist.chaos import campaign
+from icrl_dist.chaos.training import Training
 from icrl_dist.config.run import ConfigError
-from icrl_dist.launch import run_folder, train
+from icrl_dist.launch import run_folder
+from icrl_dist.launch import train as launch
 from icrl_dist.storage.files import hold
 
 OURS = (
@@ -58,7 +63,7 @@ def test_a_folder_with_any_file_of_the_users_is_refused_by_its_name_and_keeps_ev
         folder = write(Path(made) / "run", {"run.toml", "env.json", *ours, *theirs})
         before = files(Path(made))
         with pytest.raises(ConfigError) as refused:
-            train.prepare(module_run, folder, resume=False, overwrite=True)
+            launch.prepare(module_run, folder, resume=False, overwrite=True)
         assert any(name.split("/")[0] in str(refused.value) for name in theirs) and "--out" in str(refused.value)
         with pytest.raises(ConfigError):
             run_folder.remove(folder)
@@ -91,7 +96,7 @@ def test_links_are_not_followed(tmp_path, module_run, place):
     (folder / place).symlink_to(outside / "online.json" if "." in place else outside)
     before = files(tmp_path)
     with pytest.raises(ConfigError, match=place):
-        train.prepare(module_run, folder, resume=False, overwrite=True)
+        launch.prepare(module_run, folder, resume=False, overwrite=True)
     (tmp_path / "link").symlink_to(outside)
     with pytest.raises(ConfigError, match="is a link"):
         run_folder.remove(tmp_path / "link")
@@ -102,7 +107,7 @@ def test_links_are_not_followed(tmp_path, module_run, place):
 def test_a_run_file_of_the_users_is_no_run(tmp_path, module_run):
     folder = write(tmp_path / "run", ["run.toml"])
     with pytest.raises(ConfigError, match="holds no run"):
-        train.prepare(module_run, folder, resume=False, overwrite=True)
+        launch.prepare(module_run, folder, resume=False, overwrite=True)
     assert files(folder) == {"run.toml": b"run.toml"}
 
 
@@ -129,7 +134,7 @@ def test_places_that_are_no_runs_own_are_refused(tmp_path, module_run, monkeypat
     for out, why in refused.items():
         for options in ({"overwrite": True, "resume": False}, {"overwrite": False, "resume": False}):
             with pytest.raises(ConfigError) as error:
-                train.prepare(module_run, Path(out), **options)
+                launch.prepare(module_run, Path(out), **options)
             assert f"--out {out}: " in str(error.value) and why in str(error.value)
     assert files(tmp_path) == before
 
@@ -140,14 +145,14 @@ def test_a_fork_stays_out_of_its_parents_folder(tmp_path, module_run, spelling):
     (tmp_path / "runs" / "other").symlink_to(tmp_path / "runs")
     before = files(tmp_path)
     with pytest.raises(ConfigError, match="the run of --from; use another --out"):
-        train.prepare(module_run, tmp_path / "runs" / spelling, resume=False, overwrite=True, source=(parent, 0))
+        launch.prepare(module_run, tmp_path / "runs" / spelling, resume=False, overwrite=True, source=(parent, 0))
     assert files(tmp_path) == before
 
 
 def began(tmp_path, run):
     """A run with a checkpoint, its folder and what is in it."""
     folder = tmp_path / "run"
-    train.prepare(run, folder, resume=False, overwrite=False)
+    launch.prepare(run, folder, resume=False, overwrite=False)
     write(folder, ["checkpoints/version-0000.npz", "dataset/segment-000000.frames", ".lock"])
     return folder, files(folder)
 
@@ -155,7 +160,7 @@ def began(tmp_path, run):
 def test_resume_and_overwrite_contradict_each_other(tmp_path, module_run):
     folder, before = began(tmp_path, module_run)
     with pytest.raises(ConfigError, match="leave one out"):
-        train.prepare(module_run, folder, resume=True, overwrite=True)
+        launch.prepare(module_run, folder, resume=True, overwrite=True)
     assert files(folder) == before
 
 
@@ -164,33 +169,33 @@ def test_a_folder_in_which_a_run_is_on_is_left_alone(tmp_path, module_run, optio
     folder, before = began(tmp_path, module_run)
     stamp = (folder / "env.json").stat().st_mtime_ns
     with hold(folder), pytest.raises(ConfigError, match=r"run: a run is on in this folder; end it, or use another --out"):
-        train.prepare(module_run, folder, **options)
+        launch.prepare(module_run, folder, **options)
     assert files(folder) == before and (folder / "env.json").stat().st_mtime_ns == stamp
-    with train.prepare(module_run, folder, **options):
+    with launch.prepare(module_run, folder, **options):
         pass
 
 
 def test_the_earlier_run_goes_with_the_first_checkpoint_and_no_sooner(tmp_path, module_run):
     folder, before = began(tmp_path, module_run)
     heard = []
-    with train.prepare(module_run, folder, resume=False, overwrite=True) as begun:
+    with launch.prepare(module_run, folder, resume=False, overwrite=True) as begun:
         report, aside = begun.heed(heard.append), run_folder.aside_of(folder)
         report({"event": "progress", "version": -1})
         assert files(aside) == before
         report({"event": "progress", "version": 0})
         assert files(aside) == before, "an event is no checkpoint"
         with pytest.raises(ConfigError, match="a run is on"):
-            train.prepare(module_run, folder, resume=False, overwrite=True)
+            launch.prepare(module_run, folder, resume=False, overwrite=True)
         write(folder, ["checkpoints/version-0000.npz"])
         report({"event": "progress", "version": 0})
         assert not aside.exists() and len(heard) == 3
     assert folder.is_dir() and not begun.restored
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, train.TrainInterrupted, ConfigError])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, launch.TrainInterrupted, ConfigError])
 def test_the_earlier_run_comes_back_if_the_new_one_ends_before_its_first_checkpoint(tmp_path, module_run, error):
     folder, before = began(tmp_path, module_run)
-    begun = train.prepare(module_run, folder, resume=False, overwrite=True)
+    begun = launch.prepare(module_run, folder, resume=False, overwrite=True)
     with pytest.raises(error), begun:
         write(folder, ["dataset/segment-000000.frames", "learner.log", "crashes/w0-1.json"])
         raise error
@@ -201,17 +206,19 @@ def test_after_the_first_checkpoint_or_a_good_end_the_new_run_stays(tmp_path, mo
     for checkpoint in (True, False):
         folder, _ = began(tmp_path / str(checkpoint), module_run)
         with pytest.raises(ConfigError) if checkpoint else contextlib.nullcontext():  # noqa: SIM117
-            with train.prepare(module_run, folder, resume=False, overwrite=True):
+            with launch.prepare(module_run, folder, resume=False, overwrite=True):
+                write(folder, ["learner.log"])
                 if checkpoint:
                     write(folder, ["checkpoints/version-0000.npz"])
                     raise ConfigError("later")
-        assert (folder / "checkpoints").exists() == checkpoint and [path.name for path in folder.parent.iterdir()] == ["run"]
+        assert (folder / "learner.log").exists() and [path.name for path in folder.parent.iterdir()] == ["run"]
+        assert (folder / "checkpoints").exists() == checkpoint
 
 
 def test_neither_is_removed_if_the_new_folder_got_a_file_of_the_users(tmp_path, module_run):
     folder, before = began(tmp_path, module_run)
     heard = []
-    with pytest.raises(ConfigError), train.prepare(module_run, folder, resume=False, overwrite=True) as begun:
+    with pytest.raises(ConfigError), launch.prepare(module_run, folder, resume=False, overwrite=True) as begun:
         begun.heed(heard.append)
         write(folder, ["notes.md"])
         raise ConfigError("it failed")
@@ -222,7 +229,7 @@ def test_neither_is_removed_if_the_new_folder_got_a_file_of_the_users(tmp_path, 
 def killed(tmp_path, run):
     """What a command leaves that was killed while it replaced a run."""
     folder, before = began(tmp_path, run)
-    train.prepare(run, folder, resume=False, overwrite=True)._lock.close()
+    launch.prepare(run, folder, resume=False, overwrite=True)._lock.close()
     return folder, run_folder.aside_of(folder), before
 
 
@@ -231,18 +238,18 @@ def test_after_a_kill_both_runs_are_named_with_the_remedy_and_kept(tmp_path, mod
     folder, aside, old = killed(tmp_path, module_run)
     before = files(tmp_path)
     with pytest.raises(ConfigError) as refused:
-        train.prepare(module_run, folder, *options)
+        launch.prepare(module_run, folder, *options)
     assert f"delete {folder} to have that one back, or {aside} to keep the new one" in str(refused.value)
     assert files(tmp_path) == before
     run_folder.remove(folder)  # the remedy
-    train.prepare(module_run, folder, resume=True, overwrite=False)
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
     assert files(folder) == old and not aside.exists()
 
 
 def test_after_a_kill_between_checkpoint_and_removal_the_new_run_stays(tmp_path, module_run):
     folder, aside, _ = killed(tmp_path, module_run)
     write(folder, ["checkpoints/version-0000.npz"])
-    train.prepare(module_run, folder, resume=True, overwrite=False)
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
     assert not aside.exists() and (folder / "checkpoints").exists()
 
 
@@ -250,15 +257,72 @@ def test_after_a_kill_during_the_removal_what_is_left_is_no_run_that_comes_back(
     folder, aside, _ = killed(tmp_path, module_run)
     (aside / "run.toml").unlink()
     run_folder.remove(folder)
-    train.prepare(module_run, folder, resume=False, overwrite=False)
+    launch.prepare(module_run, folder, resume=False, overwrite=False)
     assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
 
 
-def test_the_lock_that_counts_is_the_one_in_the_folder_now(tmp_path):
-    """Whoever waits for a folder that is replaced meanwhile does not end with the lock of the one that is gone."""
+def test_a_campaign_of_faults_clears_only_its_own_files(tmp_path, module_run):
+    folder = write(tmp_path / "undisturbed", [*OURS, "notes.md"])
+    training = Training("smoke", module_run, (), folder, 1, 1.0)
+    training.log.touch()
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match=r"notes\.md"):
+        campaign._clear(training)
+    assert files(tmp_path) == before
+    (folder / "notes.md").unlink()
+    campaign._clear(training)
+    assert not any(tmp_path.iterdir())
+
+
+def forked(folder, version):
+    """The folder's run as a fork that began with another's versions up to this one."""
+    write(folder, [f"checkpoints/version-{n:04d}.npz" for n in range(version + 1)])
+    (folder / "fork.json").write_text(json.dumps({"version": version}))
+
+
+def test_the_versions_that_a_fork_begins_with_are_no_first_checkpoint(tmp_path, module_run, monkeypatch):
+    folder, before = began(tmp_path, module_run)
+    monkeypatch.setattr(launch, "fork", lambda theirs, version, run, folder: forked(folder, version))
+    given = {"resume": False, "overwrite": True, "source": (tmp_path / "parent", 1)}
+    with pytest.raises(KeyboardInterrupt), launch.prepare(module_run, folder, **given) as begun:
+        begun.heed(lambda event: None)({"event": "progress", "version": 1})
+        raise KeyboardInterrupt
+    assert begun.restored and files(folder) == before
+    launch.prepare(module_run, folder, **given)._lock.close()  # killed
+    with pytest.raises(ConfigError, match="was killed"):
+        launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(run_folder.aside_of(folder)) == before
+    write(folder, ["checkpoints/version-0002.npz"])
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert not run_folder.aside_of(folder).exists()
+
+
+def test_a_removal_that_is_cut_short_leaves_no_run(tmp_path, monkeypatch):
+    folder = write(tmp_path / "run", OURS)
+    unlink, cut = Path.unlink, []
+
+    def once(path, missing_ok=False):
+        if cut:
+            raise OSError("cut short")
+        cut.append(path)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", once)
+    with pytest.raises(OSError, match="cut short"):
+        run_folder.remove(folder)
+    assert cut == [folder / "run.toml"] and not cut[0].exists()
+
+
+def test_the_lock_that_counts_is_the_one_in_the_folder_now(tmp_path, monkeypatch):
+    """A folder may be replaced between the opening of its lock and the locking."""
     folder = write(tmp_path / "run", ["run.toml"])
-    first = hold(folder)
-    (folder / ".lock").unlink()
-    with hold(folder) as second:
-        assert os.path.samestat(os.fstat(second.fileno()), (folder / ".lock").stat())
-        first.close()
+    flock, replaced = fcntl.flock, []
+
+    def late(file, how):
+        if not replaced:
+            replaced.append((folder / ".lock").rename(tmp_path / "gone"))
+        flock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with hold(folder) as file:
+        assert replaced and os.path.samestat(os.fstat(file.fileno()), (folder / ".lock").stat())

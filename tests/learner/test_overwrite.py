@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from actors import fleet
-from icrl_dist.cli import main
+from icrl_dist.cli import main as cli
 from icrl_dist.config.run import ConfigError, dumps, load, override
 from icrl_dist.launch import run_folder
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout
-from icrl_dist.storage.files import held, hold, load_checkpoint, version_file
+from icrl_dist.storage.files import Checkpoint, held, hold, load_checkpoint, save_checkpoint, version_file
 from tests.launch.test_run_folder import files
 from tests.learner.test_service import no_tensorboard
 
@@ -20,7 +20,7 @@ __all__ = ["no_tensorboard"]
 
 
 def train(*words):
-    return main.main(["train", *map(str, words)])
+    return cli.main(["train", *map(str, words)])
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +180,7 @@ def test_a_finished_run_that_is_mended_keeps_its_seconds_and_says_what_was_mende
 
 def test_a_report_of_other_settings_is_never_replaced(run):
     def evaluate(what, *more):
-        assert main.main(["evaluate", str(what), "--episodes", "2", "--seeds", "1", *more]) == 0
+        assert cli.main(["evaluate", str(what), "--episodes", "2", "--seeds", "1", *more]) == 0
         return files(run / "report")
 
     before = files(run / "report")
@@ -202,6 +202,9 @@ def test_a_report_of_other_settings_is_never_replaced(run):
     shutil.copyfile(version_file(run, 2), run / "agent.npz")
     after = evaluate(run / "agent.npz")
     assert len(after) == len(known) + 2, "a file's report, without T^0, beside its folder's"
+    made = load_checkpoint(version_file(run, 2))
+    save_checkpoint(run / "agent.npz", Checkpoint(made.arrays, {**made.manifest, "weights_digest": "0" * 64}))
+    assert len(evaluate(run / "agent.npz")) == len(after) + 2, "another agent in a file of the same name"
     run_override = override(load(str(run / "run.toml")), [f"evaluate.p={[n / 100 for n in range(50)]}"], "--set")
     assert len(heldout.report_name(run_override, run)) < 200
     assert run_folder.foreign(run) == []
@@ -211,9 +214,9 @@ def test_an_export_replaces_only_an_export(run, capsys):
     (run.parent / "notes.txt").write_text("mine")
     before = files(run.parent)
     for out in (run.parent / "notes.txt", version_file(run, 2)):
-        assert main.main(["export", str(run), "--out", str(out)]) == 2
+        assert cli.main(["export", str(run), "--out", str(out)]) == 2
         assert f"--out {out}: exists, and is no agent that was exported" in capsys.readouterr().err
     assert files(run.parent) == before
     for _ in range(2):
-        assert main.main(["export", str(run)]) == 0
+        assert cli.main(["export", str(run)]) == 0
     assert load_checkpoint(run / "agent.npz").part("model")
