@@ -6,22 +6,23 @@ import contextlib
 import threading
 import time
 
-from icrl_dist.config.run import ModelConfig
-from icrl_dist.models.dpt import PretrainedTransformer, load_weights
+from torch import nn
+
+from icrl_dist.models.weights import load_weights
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link, Refused, Unanswered
-from icrl_dist.types import Spec, Weights
+from icrl_dist.types import Weights
 
 _KEPT = 4
 """Versions that a worker remembers: its job may name one that the learner is past."""
 
 
-class LivePolicy:
-    """Follows the learner's broadcasts; ``at`` waits for one version (Algorithm 3, line 12)."""
+class WeightCache:
+    """Keeps the learner's newest broadcasts; ``at`` waits for one policy version (Algorithm 3, line 12)."""
 
-    def __init__(self, link: Link, keys: Keys, spec: Spec, config: ModelConfig, limit: int, timeout_s: float = 60.0) -> None:
+    def __init__(self, link: Link, keys: Keys, model: nn.Module, limit: int, timeout_s: float = 60.0) -> None:
         self._link, self._keys, self._limit, self._timeout_s = link, keys, limit, timeout_s
-        self._model = PretrainedTransformer(spec, config).eval()
+        self._model = model.eval()
         self._loaded: Weights | None = None
         self._kept: dict[int, Weights] = {}
         self._arrived = threading.Condition()
@@ -39,7 +40,7 @@ class LivePolicy:
             self._arrived.notify_all()
         return weights
 
-    def at(self, version: int) -> tuple[PretrainedTransformer, str]:
+    def at(self, version: int) -> tuple[nn.Module, str]:
         """The model of this version and its digest.
 
         Waits for the broadcast and asks the learner for it meanwhile.  Raises Unanswered if the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import threading
@@ -11,21 +12,24 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from torch import nn
+
 import icrl_dist
-from actors.beliefs import Beliefs
+from actors.beliefs import BeliefPublisher
 from actors.publisher import Showing
 from actors.watchdog import Watchdog
-from actors.weight_cache import LivePolicy
+from actors.weight_cache import WeightCache
 from icrl_dist import version as code
-from icrl_dist.collect import jobs
+from icrl_dist.collect import kinds
 from icrl_dist.config.run import parse
-from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.problems import splits
+from icrl_dist.interfaces import Problem
+from icrl_dist.methods import registry as methods
+from icrl_dist.problems import registry as problems
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Link, LinkError, Refused, Unanswered
 from icrl_dist.telemetry import crash_reports
-from icrl_dist.types import Identity, Job, Trajectory
+from icrl_dist.types import Identity, Job, Payload, Trajectory
 
 _log = logging.getLogger(__name__)
 
@@ -62,9 +66,10 @@ class Worker:
         self._link.announce(self._keys.alive(self.name))
         _, hello = self._ask("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
         run = parse(hello["run"], "the learner's run")
-        policy = LivePolicy(self._link, self._keys, splits.spec(run), run.model, run.stream.max_message_bytes)
+        problem, method = problems.of(run), methods.of(run)
+        weights = WeightCache(self._link, self._keys, method.build(problem.spec, run), run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
-        beliefs = Beliefs(self._link, self._keys.monitor(f"belief/{self.name}"), self.name, run)
+        beliefs = BeliefPublisher(self._link, self._keys.monitor(f"belief/{self.name}"), self.name, problem)
         watchdog = Watchdog(self._folder, self.name)
         with contextlib.closing(watchdog), contextlib.closing(sender), self._heartbeat(sender):
             while not self._stop.is_set():
@@ -74,15 +79,16 @@ class Worker:
                 if kind == "wait":
                     self._stop.wait(float(fields["seconds"]))
                 else:
-                    job = wire.decode_job(fields["job"])
-                    self._do(job, float(fields["deadline_s"]), policy, beliefs, sender, watchdog, run.stream.lease_s)
+                    job = wire.decode_job(fields["job"], functools.partial(_payload, problem))
+                    waiting = _Waiting(weights, watchdog)
+                    work = functools.partial(kinds.do, job, problem, method, waiting, self.name, self._tell, beliefs)
+                    self._do(job, work, float(fields["deadline_s"]), sender, watchdog, run.stream.lease_s)
 
     def _do(
         self,
         job: Job,
+        work: Callable[[], Iterator[Trajectory]],
         deadline_s: float,
-        policy: LivePolicy,
-        beliefs: Beliefs,
         sender: CreditSender,
         watchdog: Watchdog,
         drain_s: float,
@@ -91,8 +97,8 @@ class Worker:
         self._job, self._weights = job.label, job.policy_version
         made: set[Identity] = set()
         try:
-            work = jobs.do(job, _Waiting(policy, watchdog), self.name, self._tell, beliefs)
-            while (trajectory := _next(work, watchdog, deadline_s)) is not None:
+            trajectories = work()
+            while (trajectory := _next(trajectories, watchdog, deadline_s)) is not None:
                 made.add(trajectory.identity)
                 self._episodes += 1
                 self._steps += len(trajectory.actions)
@@ -176,15 +182,19 @@ class Worker:
             thread.join(5.0)
 
 
+def _payload(problem: Problem, kind: str, data: Any) -> Payload:
+    return kinds.read_payload(kind, problem, data)
+
+
 class _Waiting:
     """The policy as jobs see it: waiting for the weights is no environment's fault."""
 
-    def __init__(self, policy: LivePolicy, watchdog: Watchdog) -> None:
-        self._policy, self._watchdog = policy, watchdog
+    def __init__(self, weights: WeightCache, watchdog: Watchdog) -> None:
+        self._weights, self._watchdog = weights, watchdog
 
-    def at(self, version: int) -> tuple[PretrainedTransformer, str]:
+    def at(self, version: int) -> tuple[nn.Module, str]:
         with self._watchdog.paused():
-            return self._policy.at(version)
+            return self._weights.at(version)
 
 
 def _next(work: Iterator[Trajectory], watchdog: Watchdog, deadline_s: float) -> Trajectory | None:

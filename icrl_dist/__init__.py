@@ -10,18 +10,22 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from icrl_dist.agent.in_context_agent import InContextAgent, load_agent
+    from icrl_dist.agent.in_context_agent import InContextAgent
+    from icrl_dist.agent.loading import load_agent
+    from icrl_dist.interfaces import Method, Problem
     from icrl_dist.problems.darkroom import solver as oracle
     from icrl_dist.problems.registry import make
     from icrl_dist.types import NULL, Adversary, Task, Variation
 
 __version__ = "0.1.0"
 
-__all__ = ["NULL", "Adversary", "InContextAgent", "Task", "Variation", "load_agent", "make", "oracle"]
+__all__ = ["NULL", "Adversary", "InContextAgent", "Method", "Problem", "Task", "Variation", "load_agent", "make", "oracle"]
 
 _HOME = {
     "InContextAgent": "icrl_dist.agent.in_context_agent",
-    "load_agent": "icrl_dist.agent.in_context_agent",
+    "load_agent": "icrl_dist.agent.loading",
+    "Method": "icrl_dist.interfaces",
+    "Problem": "icrl_dist.interfaces",
     "make": "icrl_dist.problems.registry",
     "NULL": "icrl_dist.types",
     "Adversary": "icrl_dist.types",

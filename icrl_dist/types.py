@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int16, Shaped
@@ -101,6 +101,14 @@ class Variation:
 
     task: Task
     adversary: Adversary = NULL
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Split:
+    """The tasks of a problem: ``train`` to learn from, ``test`` never learned from."""
+
+    train: tuple[Task, ...]
+    test: tuple[Task, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -241,6 +249,17 @@ class Weights:
     digest: str
 
 
+@dataclasses.dataclass(frozen=True)
+class Payload:
+    """What one kind of job needs beyond its variations; each kind has a subclass, decoded strictly."""
+
+    kind: ClassVar[str] = ""
+    """Name of the kind."""
+    arrives_at_once: ClassVar[bool] = False
+    """Whether a job's first trajectory comes after hours of training, or from a cache immediately: then the
+    gap between two trajectories does not tell how long the next one takes."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Job:
     """A fixed batch of work: all K variations of a few tasks, for a number of trials.
@@ -262,15 +281,12 @@ class Job:
     policy_version: int
     """Weights version that must act; -1 for none."""
     seed: int
-    settings: Params = ()
-    """Further numbers that the function needs, from the run's config."""
+    payload: Payload = Payload()
+    """Further numbers that the kind needs, from the run's config."""
     tasks: int = 1
     """How many consecutive tasks."""
     first: int = 0
     """Number of the first variation within its task, for a job that holds only some of one task's."""
-
-    def setting(self, name: str) -> Value:
-        return _Named(self.kind, self.settings)[name]
 
     def rows(self) -> list[tuple[int, int]]:
         """Number of the task, and of the variation within it, of each of ``variations``."""

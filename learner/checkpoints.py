@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
-from icrl_dist.agent.in_context_agent import spec_from
+from icrl_dist.agent.loading import spec_from
 from icrl_dist.config.run import ConfigError, Run, dumps
-from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
-from icrl_dist.problems import splits
+from icrl_dist.models.weights import load_weights, weights_of
+from icrl_dist.problems import registry
 from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.stream.wire import weights_digest
 from icrl_dist.training.fit import Optimizer
@@ -25,7 +26,6 @@ PARTIAL = "partial.npz"
 
 def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]:
     """What a checkpoint says of itself: enough to deploy it, and to know where it comes from."""
-    room = run.darkroom
     return {
         "method": run.method,
         "version": version,
@@ -33,30 +33,25 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
         "spec": dataclasses.asdict(spec),
         "problem": run.problem,
         "seed": run.seed,
-        "split_seed": room.split_seed,
         "horizon": spec.horizon,
         "window": run.model.window,
-        **_tasks(run),
+        **registry.of(run).manifest(),
         "threads": threads,
         "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},
     }
 
 
-def _tasks(run: Run) -> dict[str, Any]:
-    """Which tasks it was trained on, and which it was not."""
-    split = splits.split(run)
-    if run.problem == "darkroom":
-        return {"size": run.darkroom.size, "test_goals": [[int(c) for c in task.vector("goal")] for task in split.test]}
-    plain = [[dict(task.params) for task in part] for part in (split.train, split.test)]
-    return {"train_tasks": plain[0], "test_tasks": plain[1]}
+def weights(version: int, model: nn.Module) -> Weights:
+    """The model's parameters as policy version ``version``, with their digest."""
+    arrays = weights_of(model)
+    return Weights(version, arrays, weights_digest(arrays))
 
 
-def save(path: Path, model: PretrainedTransformer, opt: Optimizer, about: Mapping[str, Any]) -> None:
-    """Weights, the optimizer's moments, and the manifest, atomically."""
-    weights = weights_of(model)
-    arrays = {f"model/{name}": value for name, value in weights.items()}
+def save(path: Path, weights: Weights, opt: Optimizer, about: Mapping[str, Any]) -> None:
+    """Write weights, the optimizer's moments and the manifest atomically."""
+    arrays = {f"model/{name}": value for name, value in weights.arrays.items()}
     arrays |= {f"optimizer/{name}": value.cpu().numpy() for name, value in opt.state().items()}
-    save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights_digest(weights)}))
+    save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights.digest}))
 
 
 def read_manifest(path: Path) -> Mapping[str, Any]:
@@ -64,7 +59,7 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
     return load_checkpoint(path).manifest
 
 
-def restore(path: Path, spec: Spec, model: PretrainedTransformer, opt: Optimizer) -> Mapping[str, Any]:
+def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping[str, Any]:
     """Load what ``save`` wrote into model and optimizer; returns the manifest.
 
     Raises ConfigError for a checkpoint of another spec, another model size or another optimizer.

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from icrl_dist.config.run import Run
-from icrl_dist.methods.recipes import METHODS, Phase
+from icrl_dist.interfaces import Method, Phase
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.types import Identity, Job
 
 
-class Plan:
-    """A method's phases against a dataset."""
+class PhasePlan:
+    """A method's phases and what the dataset holds of each."""
 
-    def __init__(self, run: Run, lineage: Lineage, store: Store, given_up: dict[str, str]) -> None:
-        self.method = METHODS[run.method]
+    def __init__(self, run: Run, lineage: Lineage, store: Store, method: Method, given_up: dict[str, str]) -> None:
+        self.method = method
         self.phases = self.method.phases(run)
         self.given_up = given_up
         """Variations that are quarantined, ``adapt/0/3/1``, and why."""
         self._staleness, self._lineage, self._store = run.stream.staleness, lineage, store
         self._whole: set[Phase] = set()
+        self._asked: dict[Phase, tuple[Job, ...]] = {}
 
     def ask(self, phase: Phase) -> tuple[Job, ...]:
-        """The phase's jobs, with the numbers that it was first asked for with."""
-        return self.method.ask(self._lineage.run_of(phase.next_version), phase)
+        """The phase's jobs, computed once, with the numbers of the run that first collected it."""
+        if phase not in self._asked:
+            self._asked[phase] = self.method.ask(self._lineage.run_of(phase.next_version), phase)
+        return self._asked[phase]
 
     def next(self, version: int) -> Phase | None:
         """The first phase that is not fitted, or whose data is not whole, given the newest version."""

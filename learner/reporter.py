@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import Run
-from icrl_dist.methods.recipes import Phase, about
+from icrl_dist.interfaces import Phase
+from icrl_dist.problems import registry
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link, LinkError
+from icrl_dist.telemetry.about import about
 from icrl_dist.telemetry.alerts import Alerts
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.types import Job, Trajectory
@@ -73,7 +75,7 @@ class Herald:
     def stored(self, trajectory: Trajectory) -> None:
         """A trajectory was stored."""
         identity = trajectory.identity
-        if identity.stage == "adapt" or self._run.problem != "darkroom":  # a random walk in the dark may well find nothing
+        if identity.stage == "adapt" or registry.of(self._run).earns_in_contexts:
             place = identity.task, identity.variation, identity.trial
             with self._lock:
                 self._alerts.returned(place, trajectory.policy_version, trajectory.episode_return)

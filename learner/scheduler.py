@@ -21,10 +21,6 @@ DEATHS = 3
 
 _DOUBLINGS = 10
 
-_AT_ONCE = ("train_expert",)
-"""Kinds of jobs whose first trajectory comes after hours of training, or from a cache at once: no gap tells how long the
-next takes."""
-
 
 @dataclass(frozen=True)
 class Lease:
@@ -279,7 +275,7 @@ class Board:
         return self._open(slot)
 
     def _allowed(self, slot: _Slot) -> float:
-        longest = None if slot.job.kind in _AT_ONCE else self._longest.get(slot.job.kind)
+        longest = None if slot.job.payload.arrives_at_once else self._longest.get(slot.job.kind)
         base = self._lease_s if longest is None else min(self._lease_s, max(self._floor_s, self._factor * longest))
         return base * 2.0 ** min(_DOUBLINGS, slot.expired + slot.blame)
 

@@ -10,34 +10,29 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
+from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
-from icrl_dist.methods.recipes import Phase
-from icrl_dist.models.dpt import PretrainedTransformer, weights_of
-from icrl_dist.problems import splits
-from icrl_dist.results.evaluate import label_quality
+from icrl_dist.interfaces import Phase
+from icrl_dist.methods import registry as methods
+from icrl_dist.problems import registry
 from icrl_dist.storage import files
 from icrl_dist.storage.dataset import Damaged, Store
 from icrl_dist.storage.fork import Lineage
-from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Link
 from icrl_dist.telemetry.metrics import Metrics
-from icrl_dist.training import batches, fit
+from icrl_dist.training import fit
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
 from learner.broadcast import Broadcast
 from learner.ingest import Inbox
-from learner.phases import Plan
+from learner.phases import PhasePlan
 from learner.reporter import Herald
 from learner.scheduler import Board
 from learner.worker_api import Desk
 
 Report = Callable[[dict[str, Any]], None]
-
-_FIT_DRAWS = 104
-"""Spawn key of a fit's draws, apart from every trajectory's (those begin with a stage)."""
 
 
 class RunFailed(RuntimeError):  # noqa: N818
@@ -65,11 +60,14 @@ class Service:
     def _begin(self, closing: contextlib.ExitStack) -> None:
         run, folder, link, report = self._run, self._folder, self._link, self._report
         self._keys = Keys(folder.name)
-        self._spec = splits.spec(run)
+        self._spec = registry.of(run).spec
+        lineage = Lineage.of(folder, run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
-        self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
+        self._device = _device(run.learner.device)
+        self._method = methods.of(run)
+        self.model = self._method.build(self._spec, run).to(self._device)
         self._opt = fit.Optimizer(self.model, run.optim)
         self.version = files.newest_version(folder)
         self._partial = 0
@@ -87,7 +85,7 @@ class Service:
         self.store = Store(folder / "dataset")
         closing.callback(self.store.close)
         self._tell_repairs()
-        self._plan = Plan(run, Lineage.of(folder, run), self.store, {})
+        self._plan = PhasePlan(run, lineage, self.store, self._method, {})
         self._plan.give_up(checkpoints.given_up(folder, self.version))
         self._opened: set[Phase] = set()
         self._broadcast = Broadcast(link, self._keys, self._older)
@@ -111,7 +109,7 @@ class Service:
     @property
     def device(self) -> str:
         """Where fits run, and with what: ``cuda, NVIDIA H100``, ``cpu, 2 threads``."""
-        kind = self.model.low.device
+        kind = self._device
         return f"cuda, {torch.cuda.get_device_name(kind)}" if kind.type == "cuda" else f"cpu, {self._threads} threads"
 
     # What other threads call.
@@ -242,22 +240,22 @@ class Service:
                 f"quarantined; first: {next(iter(blamed.values()))}"
             )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
-        quality = label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
+        quality = self._method.label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
         if quality:
             self._herald.labelled(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
-        pools = self._plan.method.learn(self._run, phase, self.store)
+        draw = self._method.data(self._run, phase, self.store) if phase.steps else None
         optim, torch_threads = self._run.optim, torch.get_num_threads()
         torch.set_num_threads(self._threads)
         began = time.monotonic()
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
 
-        def batch(step: int) -> batches.Batch:
-            key = (_FIT_DRAWS, phase.next_version, step)
-            rng = np.random.default_rng(np.random.SeedSequence(self._run.seed, spawn_key=key))
+        def loss_of(step: int) -> torch.Tensor:
+            assert draw is not None
+            rng = generator(self._run.seed, RandomKey.FIT, phase.next_version, step)
             torch.manual_seed(int(rng.integers(2**31)))
-            return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.windows)
+            return self._method.loss(self.model, draw(rng))
 
         def progress(step: int, loss: float) -> None:
             self._partial = step  # damage may end this fit: it is taken up from here
@@ -265,12 +263,12 @@ class Service:
             if step % 50 == 0 or step == phase.steps:
                 self._metrics.write(step, f"fit/{phase.next_version}", loss=loss)
             if self._stop.is_set() or step % 1000 == 0:
-                self._save(partial, next_version=phase.next_version, step=step)
+                self._save(partial, self._weights(), next_version=phase.next_version, step=step)
             self._check()
 
         first = self._partial
         try:
-            loss = fit.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, batch, progress, first)
+            loss = fit.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, loss_of, progress, first)
         finally:
             torch.set_num_threads(torch_threads)
         self._partial = 0
@@ -281,24 +279,25 @@ class Service:
             "dataset_digest": self.store.digest(self.version),
             "quarantined": self._plan.given_up,
         }
-        self._save(files.version_file(self._folder, self.version), loss=loss, **where)
+        weights = self._weights()
+        self._save(files.version_file(self._folder, self.version), weights, loss=loss, **where)
         partial.unlink(missing_ok=True)
-        self._publish()
+        self._broadcast.publish(weights)
         self._herald.fitted(loss, time.monotonic() - began)
 
-    def _save(self, path: Path, **where: object) -> None:
-        about = checkpoints.manifest(self._run, self._spec, self.version, self._threads)
-        checkpoints.save(path, self.model, self._opt, {**about, **where})
+    def _weights(self) -> Weights:
+        """The model's parameters, hashed once."""
+        return checkpoints.weights(self.version, self.model)
 
-    def _publish(self) -> None:
-        arrays = weights_of(self.model)
-        self._broadcast.publish(Weights(self.version, arrays, wire.weights_digest(arrays)))
+    def _save(self, path: Path, weights: Weights, **where: object) -> None:
+        about = checkpoints.manifest(self._run, self._spec, self.version, self._threads)
+        checkpoints.save(path, weights, self._opt, {**about, **where})
 
     def _take_up(self) -> None:
-        """Go on from the newest version, and from the fit that was under way, if there are any."""
+        """Continue from the newest version, and from the fit that was interrupted, if there are any."""
         if self.version >= 0:
             checkpoints.restore(files.version_file(self._folder, self.version), self._spec, self.model, self._opt)
-            self._publish()
+            self._broadcast.publish(self._weights())
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
         if partial.exists() and checkpoints.read_manifest(partial)["next_version"] == self.version + 1:
             self._partial = checkpoints.restore(partial, self._spec, self.model, self._opt)["step"]

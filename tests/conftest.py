@@ -26,20 +26,20 @@ assert not imported, f"{imported} were imported before the import hook: their sh
 tests.typecheck.install("icrl_dist")
 torch.set_num_threads(1)
 
-from icrl_dist.config.run import (
+from icrl_dist.config.run import Run
+from icrl_dist.config.sections import (
     AdversaryConfig,
     ContextConfig,
-    DarkRoomConfig,
     EvaluateConfig,
     ICAAConfig,
     LearnerConfig,
     ModelConfig,
     OptimConfig,
     PretrainConfig,
-    Run,
     StreamConfig,
 )
 from icrl_dist.problems.darkroom import room as darkroom
+from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.stream.memory_link import MemoryHub, MemoryLink
 from icrl_dist.types import Task
 

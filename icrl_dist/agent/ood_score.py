@@ -1,4 +1,7 @@
-"""How unlike pretraining a context is: what a deployed T_theta is told of its own predictions."""
+"""Out-of-distribution score (``agent.surprise``): how far a context is from pretraining.
+
+Read from how well a linear readout of the model's states predicts what its actions bring.
+"""
 
 from __future__ import annotations
 
@@ -7,30 +10,28 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from icrl_dist.config.run import Run
-from icrl_dist.methods.recipes import METHODS
-from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.models.outcome_readout import WINDOWS, Decisions, OutcomeModel
-from icrl_dist.problems import registry, splits
-from icrl_dist.rollout import deployment
+from icrl_dist.problems import registry as problems
+from icrl_dist.rollout.episode import episode
 from icrl_dist.types import Spec, Variation
 
 EPISODES = 5
-"""Online episodes in each training variation that outcomes are learned from."""
-
-_CHANCE = 105  # spawn key of these episodes' draws, apart from every other's
-_FRESH = 1 << 20  # a round that no run reaches: its adversaries were never trained on
+"""Online episodes in each training variation that the readout is fitted to."""
+_FRESH = 1 << 20
+"""A round that no run reaches, so its adversaries were never trained on."""
 
 
 class Surprise:
-    """The running surprise of B environments: hand ``observe`` to their policy as its ``watch``."""
+    """The running score of B environments; ``observe`` is the ``watch`` of their policy."""
 
     def __init__(self, model: OutcomeModel, spec: Spec, batch: int) -> None:
         self._model, self._spec = model, spec
         self._losses = np.zeros((batch, 0), np.float32)
 
     def observe(self, *decision: np.ndarray) -> None:
-        """One decision of each environment and what came of it: the columns of ``Decisions``."""
+        """Take in one decision of each environment and its outcome: the columns of ``Decisions``."""
         state, before, action, reward, after = decision
         loss = self._model.loss(self._spec, (state, before, action, reward, after))
         self._losses = np.concatenate([self._losses[:, 1 - WINDOWS[-1] :], loss[:, None]], axis=1)
@@ -40,45 +41,44 @@ class Surprise:
         return self._model.surprise(self._losses)
 
 
-def calibrate(run: Run, model: PretrainedTransformer, progress: Callable[[int], None] = lambda episodes: None) -> OutcomeModel:
-    """Deploys T_theta in its training tasks, under adversaries it never met, and fits and calibrates what it expects.
+def calibrate(trained: TrainedModel, progress: Callable[[int], None] = lambda episodes: None) -> OutcomeModel:
+    """Deploy the model in its training tasks, under adversaries it never met; fit and calibrate the outcome readout.
 
-    Fitted to every other task, calibrated on the rest; ``progress`` hears of each of the
+    Fitted to every other task, calibrated on the rest; ``progress`` is called after each of the
     ``2 * EPISODES`` episodes.  The same weights give the same answer.
     """
     done = 0
 
-    def step(rows: Sequence[tuple[int, Variation]]) -> Iterator[Decisions]:
+    def decisions(rows: Sequence[tuple[int, Variation]]) -> Iterator[Decisions]:
         nonlocal done
-        for seen in _decisions(run, model, rows):
+        for seen in _decisions(trained, rows):
             done += 1
             progress(done)
             yield from seen
 
-    rows = list(_rows(run))
+    rows = list(_rows(trained))
     halves = ([row for row in rows if row[0] % 2 == half] for half in (0, 1))
-    fitted, heldout = (step(half or rows) for half in halves)
-    return OutcomeModel.fit(model.spec, fitted, heldout)
+    fitted, heldout = (decisions(half or rows) for half in halves)
+    return OutcomeModel.fit(trained.spec, fitted, heldout)
 
 
-def _rows(run: Run) -> Iterator[tuple[int, Variation]]:
+def _rows(of: TrainedModel) -> Iterator[tuple[int, Variation]]:
     """Two of the method's variations of every training task, phi_0 as often as it trains on it."""
-    for index, task in enumerate(splits.split(run).train):
-        chosen = METHODS[run.method].variations(run, index, splits.deployed(task), _FRESH)
+    problem = problems.of(of.run)
+    for index, task in enumerate(problem.split.train):
+        chosen = of.method.training_variations(of.run, index, problem.at_test_start(task), _FRESH)
         for turn in (0, len(chosen) // 2):
             yield index, chosen[(index // 2 + turn) % len(chosen)]
 
 
-def _decisions(run: Run, model: PretrainedTransformer, rows: Sequence[tuple[int, Variation]]) -> Iterator[list[Decisions]]:
+def _decisions(of: TrainedModel, rows: Sequence[tuple[int, Variation]]) -> Iterator[list[Decisions]]:
     """The decisions of every episode, deployed as a user would."""
     seen: list[Decisions] = []
-    env = registry.batch([variation for _, variation in rows])
+    env = problems.batch([variation for _, variation in rows])
     watch = lambda *decision: seen.append(decision)  # noqa: E731
-    policy = deployment.in_context(model, len(rows), run.context, watch=watch)
-    keys = [(_CHANCE, index, row) for row, (index, _) in enumerate(rows)]
+    policy = of.method.policy(of.model, len(rows), of.run.context, None, watch)
     for number in range(EPISODES):
-        deployment.episode(
-            env, policy, [np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(*key, number))) for key in keys]
-        )
+        keys = [(index, row, number) for row, (index, _) in enumerate(rows)]
+        episode(env, policy, [generator(of.run.seed, RandomKey.OOD_CALIBRATION, *key) for key in keys])
         yield seen
         seen.clear()

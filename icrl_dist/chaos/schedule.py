@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icrl_dist.config.run import ConfigError, Run
-from icrl_dist.methods.recipes import METHODS
+from icrl_dist.methods import registry as methods
 
 FAULTS = {
     "kill-worker": "SIGKILL of a worker",
@@ -58,7 +58,7 @@ def draw(run: Run, seed: int, fault: str, attempt: int = 0) -> Strike:
     Raises ConfigError for a fault that this run gives no chance to.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(list(FAULTS).index(fault), attempt)))
-    method = METHODS[run.method]
+    method = methods.of(run)
     phases = method.phases(run)
     first = 1 if fault == "flip-byte" else 0
     if first >= len(phases):

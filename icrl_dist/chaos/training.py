@@ -18,7 +18,7 @@ import psutil
 
 from icrl_dist.chaos.schedule import Strike
 from icrl_dist.config.run import Run
-from icrl_dist.methods.recipes import METHODS
+from icrl_dist.methods import registry as methods
 from icrl_dist.stream import monitor_messages, security, wire
 from icrl_dist.stream.link import Keys, LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
@@ -181,7 +181,7 @@ class _Ear:
     """Counts what the monitor plane tells, until a strike is due."""
 
     def __init__(self, run: Run, strike: Strike) -> None:
-        self._order = {f"{phase.stage}/{phase.round}": n for n, phase in enumerate(METHODS[run.method].phases(run))}
+        self._order = {f"{phase.stage}/{phase.round}": n for n, phase in enumerate(methods.of(run).phases(run))}
         self._strike = strike
         self._heard: Counter[str] = Counter()
         self.where = ""

@@ -115,10 +115,11 @@ def _resuming(given: Sequence[str]) -> str:
 
 def evaluate(arguments: Evaluate, console: Console) -> int:
     """``icrl-dist evaluate``: per-episode returns beside the oracle's."""
-    from icrl_dist.agent.in_context_agent import checkpoint_file
-    from icrl_dist.config.run import default_deployment, parse
+    from icrl_dist.agent.loading import checkpoint_file
+    from icrl_dist.config.run import parse
     from icrl_dist.console.terminal import Display
     from icrl_dist.results import heldout
+    from icrl_dist.rollout.deployment import default_deployment
     from icrl_dist.storage.files import load_checkpoint
 
     what, folder = _evaluated(arguments)
@@ -152,7 +153,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
 
 def _evaluated(arguments: Evaluate) -> tuple[Path, Path]:
     """What is to be evaluated, and the folder of its report."""
-    from icrl_dist.agent.in_context_agent import shipped
+    from icrl_dist.agent.loading import shipped
 
     what, name = arguments.what, arguments.pretrained
     if what is not None and name is None:
@@ -164,7 +165,7 @@ def _evaluated(arguments: Evaluate) -> tuple[Path, Path]:
 
 def export(arguments: Export, console: Console) -> int:
     """``icrl-dist export``: an agent without what only training needs."""
-    from icrl_dist.agent.in_context_agent import checkpoint_file, is_slim, slim
+    from icrl_dist.agent.loading import checkpoint_file, is_slim, slim
     from icrl_dist.console.terminal import Display
     from icrl_dist.results import heldout
     from icrl_dist.storage.files import save_checkpoint
@@ -318,7 +319,7 @@ def chaos(arguments: Chaos, console: Console) -> int:
 
 def play(arguments: Play, console: Console) -> int:
     """``icrl-dist play``: until Ctrl-C."""
-    from icrl_dist.agent.in_context_agent import shipped
+    from icrl_dist.agent.loading import shipped
     from icrl_dist.monitor import player
 
     what = arguments.what if arguments.pretrained is None else shipped(arguments.pretrained)

@@ -101,8 +101,6 @@ def _info(event: dict[str, Any]) -> str:
 
 def returns_table(results: Sequence[Result], title: str) -> Table:
     """Mean return by online episode, a row an agent and p, the last column beside the optimum."""
-    from icrl_dist.results.evaluate import EXPERT, ORACLE, SCRIPTED
-
     episodes = results[0].returns.shape[2]
     shown = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes]
     last = min(5, episodes)
@@ -112,8 +110,8 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
     for e in shown:
         table.add_column(f"ep {e}", justify="right")
     table.add_column(f"last {last}", justify="right")
-    present = [name for name in (ORACLE, SCRIPTED, EXPERT) if any(r.agent == name for r in results)]
-    best = next(iter(present), ORACLE if results[0].optimum is not None else "")
+    present = [r.agent for r in results if r.ceiling]
+    best = present[0] if present else "oracle" if results[0].optimum is not None else ""
     if best:
         table.add_column(f"of {best}", justify="right")
     ceilings = {r.p: r.last(last) for r in results if r.agent == best}

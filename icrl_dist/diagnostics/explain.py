@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from icrl_dist.agent.in_context_agent import checkpoint_file, model_of
-from icrl_dist.collect import jobs
+from torch import nn
+
+from icrl_dist.agent.loading import checkpoint_file, trained
+from icrl_dist.collect import kinds
 from icrl_dist.config.run import ConfigError, Run, load
-from icrl_dist.methods.recipes import METHODS
-from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.methods import registry as methods
+from icrl_dist.problems import registry as problems
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.files import load_checkpoint, newest_version
 from icrl_dist.storage.fork import Lineage
@@ -127,19 +129,19 @@ class _Checkpoints:
 
     folder: Path
 
-    def at(self, version: int) -> tuple[PretrainedTransformer, str]:
+    def at(self, version: int) -> tuple[nn.Module, str]:
         checkpoint = load_checkpoint(checkpoint_file(self.folder, version))
-        return model_of(checkpoint)[0], str(checkpoint.manifest["weights_digest"])
+        return trained(checkpoint).model, str(checkpoint.manifest["weights_digest"])
 
 
 def _again(folder: Path, run: Run, row: Row) -> str:
     """The digest of the trajectory, from its job done once more in this process."""
-    method = METHODS[run.method]
+    method, problem = methods.of(run), problems.of(run)
     for phase in method.phases(run):
         for job in method.ask(run, phase) if (phase.stage, phase.round) == row.identity[:2] else ():
             if (row.identity.task, row.identity.variation) in job.rows():
                 repeated = dataclasses.replace(job, policy_version=row.policy_version)
-                for trajectory in jobs.do(repeated, _Checkpoints(folder), "explain"):
+                for trajectory in kinds.do(repeated, problem, method, _Checkpoints(folder), "explain"):
                     if trajectory.identity == row.identity:
                         return wire.trajectory_digest(trajectory)
     raise ConfigError(f"{row.identity}: the run's present numbers ask for no such trajectory")

@@ -7,17 +7,17 @@ import hashlib
 import logging
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import msgpack
 import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist import version
-from icrl_dist.config.sac import SACConfig, horizon
+from icrl_dist.config.sac import SACConfig
 from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
 from icrl_dist.stream import wire
-from icrl_dist.types import Job, Params, Task, Variation
+from icrl_dist.types import Variation
 
 _log = logging.getLogger(__name__)
 
@@ -57,46 +57,35 @@ class History:
         return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
 
 
-def settings(config: SACConfig) -> Params:
-    """The section as settings of a job."""
-    return tuple((f"sac.{item.name}", getattr(config, item.name)) for item in dataclasses.fields(config))
-
-
-def sac_of(job: Job) -> SACConfig:
-    """The inverse of ``settings``."""
-    given: dict[str, Any] = {item.name: job.setting(f"sac.{item.name}") for item in dataclasses.fields(SACConfig)}
-    return SACConfig(**given)
-
-
 def own_seed(variation: Variation, seed: int) -> int:
     """The seed of a variation's expert in a run with this one: nothing of it depends on its company."""
     return int.from_bytes(hashlib.sha256(msgpack.packb([wire.from_variation(variation), seed])).digest()[:16])
 
 
-def episodes(task: Task, config: SACConfig) -> int:
-    """Episodes of an expert's whole training."""
-    return max(1, config.steps // horizon(task.kind, int(str(dict(task.params).get("horizon", 0)))))
+def episodes(horizon: int, config: SACConfig) -> int:
+    """Episodes of an expert's whole training, ``horizon`` steps each."""
+    return max(1, config.steps // horizon)
 
 
-def remembered(task: Task, config: SACConfig, trials: int = 1) -> int:
-    """Episodes of a history that so many are asked for of: ``KEPT``, or all if that is not enough."""
-    return episodes(task, config) if trials > KEPT else min(KEPT, episodes(task, config))
+def remembered(horizon: int, config: SACConfig, trials: int = 1) -> int:
+    """Episodes that a history keeps if ``trials`` of them are needed: ``KEPT``, or all if that is too few."""
+    return episodes(horizon, config) if trials > KEPT else min(KEPT, episodes(horizon, config))
 
 
-def key(variation: Variation, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> str:
+def key(variation: Variation, horizon: int, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> str:
     """What a variation's history is kept under: all that decides it, physics and code included."""
     versions = [[name, metadata.version(name)] for name in _VERSIONS]
-    numbers = [[name, value] for name, value in settings(dataclasses.replace(config, cache=""))]
+    numbers = [[f"sac.{item.name}", getattr(config, item.name)] for item in dataclasses.fields(config) if item.name != "cache"]
     whole = [wire.from_variation(variation), numbers, seed, by, versions, version.digest_of(_CODE)]
-    whole += [remembered(variation.task, config, trials), LED]
+    whole += [remembered(horizon, config, trials), LED]
     return hashlib.sha256(msgpack.packb(whole)).hexdigest()
 
 
-def kept(variation: Variation, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> History | None:
+def kept(variation: Variation, horizon: int, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> History | None:
     """The history in the cache; None if it is not there, or damaged."""
     if not config.cache:
         return None
-    path = file(config, key(variation, config, seed, by, trials))
+    path = file(config, key(variation, horizon, config, seed, by, trials))
     try:
         return History(**load_checkpoint(path).arrays) if path.exists() else None
     except (StoreError, TypeError) as error:
@@ -104,9 +93,9 @@ def kept(variation: Variation, config: SACConfig, seed: int, by: Trainer, trials
         return None
 
 
-def any_kept(variation: Variation, config: SACConfig, seed: int) -> History | None:
+def any_kept(variation: Variation, horizon: int, config: SACConfig, seed: int) -> History | None:
     """The same, whoever trained the expert, and whatever is kept of that."""
-    found = (kept(variation, config, seed, by, trials) for by in get_args(Trainer) for trials in (1, KEPT + 1))
+    found = (kept(variation, horizon, config, seed, by, trials) for by in get_args(Trainer) for trials in (1, KEPT + 1))
     return next((history for history in found if history is not None), None)
 
 
@@ -115,8 +104,10 @@ def file(config: SACConfig, name: str) -> Path:
     return Path(config.cache).expanduser() / f"{name}.npz"
 
 
-def keep(history: History, variation: Variation, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> None:
+def keep(
+    history: History, variation: Variation, horizon: int, config: SACConfig, seed: int, by: Trainer, trials: int = 1
+) -> None:
     """For every later run that asks for the same."""
     if config.cache:
-        path = file(config, key(variation, config, seed, by, trials))
+        path = file(config, key(variation, horizon, config, seed, by, trials))
         save_checkpoint(path, Checkpoint(history.arrays(), {"of": str(variation), "by": by}))

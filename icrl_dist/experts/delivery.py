@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from icrl_dist.experts.cache import LED, History, own_seed
+from icrl_dist.experts.payloads import ExpertLabelling
 from icrl_dist.experts.sac import draws
-from icrl_dist.problems import registry
-from icrl_dist.problems.registry import Batch
+from icrl_dist.interfaces import Batch, Problem
 from icrl_dist.rollout.recorder import Recorder
 from icrl_dist.types import Identity, Job, Trajectory
 
@@ -26,12 +26,14 @@ Act = Callable[[np.ndarray], np.ndarray]
 """Mean actions (N, E, A) of N experts in E states of each (N, E, S)."""
 
 
-def delivered(job: Job, found: Sequence[History], worker: str, act: Act | None) -> Iterator[Trajectory]:
+def delivered(
+    job: Job, problem: Problem, labelling: ExpertLabelling, found: Sequence[History], worker: str, act: Act | None
+) -> Iterator[Trajectory]:
     """``job.trials`` episodes of each variation's history, evenly spaced, with query states and labels.
 
     ``act`` is what leads and labels, or None for Meta-World's scripted policy.
     """
-    decoys = _decoys(job, act)
+    decoys = _decoys(job, problem, labelling, act)
     for row, (task, variation) in enumerate(job.rows()):
         history = found[row]
         led = _Led.of(history, {name: column[row] for name, column in decoys.items()})
@@ -49,7 +51,7 @@ def delivered(job: Job, found: Sequence[History], worker: str, act: Act | None) 
                 rewards=history.rewards[episode],
                 adversary=history.adversary[episode],
                 origin="expert",
-                **_known(job, history, led, identity.rng(job.seed, _KNOWN)),
+                **_known(labelling, history, led, identity.rng(job.seed, _KNOWN)),
             )
 
 
@@ -73,11 +75,11 @@ class _Led:
         return cls(**both, wrong=np.arange(len(both["actions"])) >= len(own["actions"]))
 
 
-def _known(job: Job, history: History, led: _Led, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _known(labelling: ExpertLabelling, history: History, led: _Led, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Query states of the history and windows of what experts led, with their labels: a trajectory's last arrays."""
-    queries, windows, length = (int(str(job.setting(name))) for name in ("queries", "windows", "window"))
+    queries, windows, length = labelling.queries, labelling.windows, labelling.window
     place = np.unravel_index(rng.integers(history.rewards.size, size=queries), history.rewards.shape)
-    wrong = rng.random(windows) < float(str(job.setting("decoy_fraction")))
+    wrong = rng.random(windows) < labelling.decoy_fraction
     right_ones, wrong_ones = np.flatnonzero(~led.wrong), np.flatnonzero(led.wrong)
     episodes, at = [], []
     for decoys in wrong.tolist():
@@ -93,7 +95,7 @@ def _known(job: Job, history: History, led: _Led, rng: np.random.Generator) -> d
     }
 
 
-def labelled(columns: dict[str, np.ndarray], act: Act | None) -> dict[str, np.ndarray]:
+def labelled(columns: dict[str, np.ndarray], problem: Problem, act: Act | None) -> dict[str, np.ndarray]:
     """Episodes with the right action at each of their states in place of the true states."""
     truths = columns.pop("truths", None)
     if truths is None:
@@ -101,39 +103,39 @@ def labelled(columns: dict[str, np.ndarray], act: Act | None) -> dict[str, np.nd
         seen = columns["observations"][:, :, :-1]
         labels = act(seen.reshape(len(seen), -1, seen.shape[-1]))
     else:
-        labels = scripted(truths)
+        labels = scripted(problem, truths)
     return {**columns, "labels": labels.reshape(columns["actions"].shape)}
 
 
-def lead(env: Batch, act: Act | None, seeds: Sequence[int], by: Sequence[int]) -> dict[str, np.ndarray]:
+def lead(env: Batch, problem: Problem, act: Act | None, seeds: Sequence[int], by: Sequence[int]) -> dict[str, np.ndarray]:
     """``LED`` episodes in which row r follows expert ``by[r]``; Meta-World's is the scripted policy told that row's goal."""
     recorder, order = Recorder(env, LED, LED), np.array(by)
     for episode in range(LED):
         seen = recorder.reset([np.random.default_rng(draws.key(seed, draws.LED, episode)) for seed in seeds])
         for _ in range(env.spec.horizon):
-            seen = recorder.step(_led_by(order, seen, getattr(env, "truth", None), act)).observation
-    columns = labelled(recorder.columns(), act)
+            seen = recorder.step(_led_by(order, seen, getattr(env, "truth", None), problem, act)).observation
+    columns = labelled(recorder.columns(), problem, act)
     del columns["adversary"]  # zeta holds nothing of it
     return columns
 
 
-def _decoys(job: Job, act: Act | None) -> dict[str, np.ndarray]:
+def _decoys(job: Job, problem: Problem, labelling: ExpertLabelling, act: Act | None) -> dict[str, np.ndarray]:
     """``LED`` episodes of each variation that the next task's expert leads; none if nobody asks for them or there is no other.
 
     Begun as those of the variation's own expert are.
     """
-    if job.tasks == 1 or not int(str(job.setting("windows"))) or not float(str(job.setting("decoy_fraction"))):
+    if job.tasks == 1 or not labelling.windows or not labelling.decoy_fraction:
         return {}
     seeds = [own_seed(variation, job.seed) for variation in job.variations]
     by = np.roll(np.arange(len(seeds)), -(len(seeds) // job.tasks))
-    return lead(registry.batch(job.variations), act, seeds, by.tolist())
+    return lead(problem.batch(job.variations), problem, act, seeds, by.tolist())
 
 
 def _led_by(
-    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, act: Act | None
+    by: np.ndarray, seen: Float32[np.ndarray, "B S"], truth: np.ndarray | None, problem: Problem, act: Act | None
 ) -> Float32[np.ndarray, "B A"]:
     if truth is not None:
-        return scripted(np.concatenate([truth[:, :-3], truth[by, -3:]], axis=1))
+        return scripted(problem, np.concatenate([truth[:, :-3], truth[by, -3:]], axis=1))
     assert act is not None, "a game without a scripted policy"
     asked = np.empty_like(seen)
     asked[by] = seen
@@ -141,8 +143,8 @@ def _led_by(
     return led
 
 
-def scripted(truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
-    """Meta-World's scripted policy at these true states."""
-    from icrl_dist.problems.metaworld.environment import expert
-
-    return expert(truths.reshape(-1, truths.shape[-1]).astype(np.float64))
+def scripted(problem: Problem, truths: np.ndarray) -> Float32[np.ndarray, "N A"]:
+    """The problem's scripted policy at these true states.  Raises ValueError for a problem without one."""
+    if problem.scripted is None:
+        raise ValueError(f"{problem.name} has no scripted policy")
+    return problem.scripted(truths.reshape(-1, truths.shape[-1]).astype(np.float64))

@@ -13,15 +13,16 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.cache import History, Trainer, episodes, file, keep, kept, key, own_seed, remembered, sac_of
+from icrl_dist.experts.cache import History, Trainer, episodes, file, keep, kept, key, own_seed, remembered
 from icrl_dist.experts.delivery import Act, delivered, labelled, lead, scripted
-from icrl_dist.problems import registry
+from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.interfaces import Batch, Problem, Progress, no_progress
 from icrl_dist.rollout.recorder import Recorder
 from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
 from icrl_dist.types import Job, Trajectory, Variation
@@ -35,20 +36,7 @@ CHECKPOINT_S = 60.0
 """A training that is under way is written down so often; after a kill it goes on from there."""
 
 
-class Tell(Protocol):
-    """Hears how long work goes on; what is a ``note`` is worth a line of its own.
-
-    ``reached`` is how far it is: who does it once more after a kill, and gets further, is not to blame.
-    """
-
-    def __call__(self, text: str, note: bool = False, reached: int = 0) -> None: ...
-
-
-def unheard(text: str, note: bool = False, reached: int = 0) -> None:
-    """Nobody listens."""
-
-
-def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajectory]:
+def train_expert(job: Job, problem: Problem, worker: str, progress: Progress = no_progress) -> Iterator[Trajectory]:
     """Histories D^{i,k} of SAC experts of each variation, query states and labels (Algorithm 2, lines 8 to 12).
 
     All of a job's experts train together, in lockstep; they, and so the histories, are known when
@@ -56,22 +44,25 @@ def train_expert(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajec
     a trajectory, of ``window`` states, a share ``decoy_fraction`` of them led by another task's expert.  Raises
     RuntimeError for a variation whose simulation keeps breaking down.
     """
-    config = sac_of(job)
-    found = _histories(job, config, tell)
-    yield from delivered(job, found, worker, _by_actors(found, config))
+    payload = job.payload
+    assert isinstance(payload, ExpertHistories)
+    found = _histories(job, problem, payload.sac, progress)
+    yield from delivered(job, problem, payload.labelling, found, worker, _by_actors(found, payload.sac))
 
 
-def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
+def _histories(job: Job, problem: Problem, config: SACConfig, progress: Progress) -> list[History]:
     """Of each of the job's variations: from the cache, and of a training of those that are not there."""
-    by = trained_by(len(job.variations))
-    there = {variation: kept(variation, config, job.seed, _trainer(by), job.trials) for variation in job.variations}
+    by, horizon = trained_by(len(job.variations)), problem.spec_of(job.variations[0].task).horizon
+    there = {variation: kept(variation, horizon, config, job.seed, _trainer(by), job.trials) for variation in job.variations}
     found = {variation: history for variation, history in there.items() if history is not None}
     missing = [variation for variation in there if variation not in found]
     if found:
-        tell(f"{job.label}: {len(found)} experts from the cache, {len(found) * config.steps:,} steps of SAC saved", note=True)
+        progress(
+            f"{job.label}: {len(found)} experts from the cache, {len(found) * config.steps:,} steps of SAC saved", note=True
+        )
     if missing:
-        for variation, history in zip(missing, _train(job, missing, by, config, tell), strict=True):
-            keep(history, variation, config, job.seed, _trainer(by), job.trials)
+        for variation, history in zip(missing, _train(job, problem, missing, by, config, progress), strict=True):
+            keep(history, variation, horizon, config, job.seed, _trainer(by), job.trials)
             found[variation] = history
     return [found[variation] for variation in job.variations]
 
@@ -89,30 +80,32 @@ def _trainer(by: By) -> Trainer:
     return "lockstep, cuda" if by == "lockstep" and pick("auto").type == "cuda" else by
 
 
-def _train(job: Job, variations: Sequence[Variation], by: By, config: SACConfig, tell: Tell) -> list[History]:
+def _train(
+    job: Job, problem: Problem, variations: Sequence[Variation], by: By, config: SACConfig, progress: Progress
+) -> list[History]:
     from icrl_dist.experts.sac.batched import train
 
-    names = [key(variation, config, job.seed, _trainer(by), job.trials) for variation in variations]
+    horizon = problem.spec_of(variations[0].task).horizon
+    names = [key(variation, horizon, config, job.seed, _trainer(by), job.trials) for variation in variations]
     part = file(config, "part-" + hashlib.sha256("".join(names).encode()).hexdigest()) if config.cache else None
-    env, seeds = registry.batch(variations), [own_seed(variation, job.seed) for variation in variations]
-    task = variations[0].task
-    recorder = Recorder(env, episodes(task, config), remembered(task, config, job.trials))
+    env, seeds = problem.batch(variations), [own_seed(variation, job.seed) for variation in variations]
+    recorder = Recorder(env, episodes(horizon, config), remembered(horizon, config, job.trials))
     state = _resumed(part, recorder) if part is not None and part.exists() else None
     written = time.monotonic()
 
-    def progress(experts: SACBatch, returns: np.ndarray) -> None:
+    def report(experts: SACBatch, returns: np.ndarray) -> None:
         nonlocal written
         mean = f"mean return {returns.mean():.0f}"
-        tell(f"{len(names)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
+        progress(f"{len(names)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
         if part is not None and time.monotonic() - written >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}
             save_checkpoint(part, Checkpoint(arrays, {}))
             written = time.monotonic()
 
-    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, progress, state=state, by=by)
-    columns, led = labelled(recorder.columns(), experts.act), lead(env, experts.act, seeds, range(env.batch))
-    made = assembled(job, variations, columns, led, experts.arrays["actor"].cpu().numpy(), tell)
+    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, by=by)
+    columns, led = labelled(recorder.columns(), problem, experts.act), lead(env, problem, experts.act, seeds, range(env.batch))
+    made = assembled(job, variations, columns, led, experts.arrays["actor"].cpu().numpy(), progress)
     if part is not None:
         part.unlink(missing_ok=True)
     return made
@@ -124,7 +117,7 @@ def assembled(
     columns: dict[str, np.ndarray],
     led: dict[str, np.ndarray],
     actors: np.ndarray,
-    tell: Tell,
+    progress: Progress,
 ) -> list[History]:
     """The history of each of these of the job's variations, without the episodes that broke down.
 
@@ -135,7 +128,7 @@ def assembled(
         whole = {prefix: of["whole"][row] for prefix, of in parts.items()}
         lost = sum(int((~one).sum()) for one in whole.values())
         if lost:
-            tell(f"{job.label}: {lost} episodes of {variation} broke down, and are left out", note=True)
+            progress(f"{job.label}: {lost} episodes of {variation} broke down, and are left out", note=True)
         if not all(one.any() for one in whole.values() if len(one)):
             raise RuntimeError(f"{variation}: its simulation breaks down in every episode; leave it out, or push it less")
         taken = {
@@ -191,15 +184,15 @@ class ExpertPolicy:
 
 
 class ScriptedPolicy:
-    """Meta-World's scripted policy, which is told the true states of the environment that it meets."""
+    """A problem's scripted policy, which reads the true states of one batch of environments."""
 
-    def meet(self, env: Any) -> None:
-        """Before the first ``act``."""
-        self._env = env
+    def __init__(self, problem: Problem, env: Batch) -> None:
+        self._problem, self._env = problem, env
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
-        """What it does in the true state, whatever is shown."""
-        return scripted(self._env.truth)
+        """Its actions in the true states, whatever is observed."""
+        truth: np.ndarray = self._env.truth  # type: ignore[attr-defined]  # of problems with a scripted policy
+        return scripted(self._problem, truth)
 
     def observe(self, *transition: object) -> None:
         """Nothing to learn."""

@@ -6,16 +6,14 @@ one token.  Observations are scaled to [-1, 1] by the spec, so nothing here know
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from icrl_dist.config.run import ModelConfig
+from icrl_dist.config.sections import ModelConfig
 from icrl_dist.models import heads
 from icrl_dist.models.gpt import GPT, Cache, Decoder, copied
 from icrl_dist.types import Spec
@@ -176,13 +174,3 @@ class Deployed:
         """
         queries = F.linear(self._model.features(states), *self._embed)
         return F.linear(self._decoder.peek(row, queries, self._model.tokens(arrived)[0]), *self._head)
-
-
-def weights_of(model: nn.Module) -> dict[str, np.ndarray]:
-    """The parameters as numpy arrays by name: copies, little-endian."""
-    return {name: value.detach().cpu().numpy().copy() for name, value in model.state_dict().items()}
-
-
-def load_weights(model: nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises RuntimeError naming the parameters unless names and shapes are the model's own."""
-    model.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in arrays.items()})

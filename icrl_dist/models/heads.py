@@ -15,6 +15,7 @@ from scipy.special import ndtri
 from torch import Tensor
 from torch.nn import functional as F
 
+from icrl_dist.models.sampling import sample
 from icrl_dist.types import Spec
 
 FLOOR = 0.05
@@ -98,9 +99,3 @@ class Gaussian:
 def head(spec: Spec) -> Head:
     """The head of this spec's actions."""
     return Categorical(spec.actions) if spec.discrete else Gaussian(spec.actions)
-
-
-def sample(probabilities: Float[np.ndarray, "B A"], u: Float[np.ndarray, " B"]) -> Int64[np.ndarray, " B"]:
-    """The action of each row that its uniform number u in [0, 1) picks."""
-    edges = probabilities.astype(np.float64).cumsum(axis=1)
-    return (u[:, None] * edges[:, -1:] >= edges[:, :-1]).sum(axis=1)

@@ -10,23 +10,14 @@ A drawing is one of
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from icrl_dist.monitor import validation
 from icrl_dist.monitor.validation import Odd
-from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_values
-from icrl_dist.problems.dmc import domains
-from icrl_dist.problems.metaworld import pick_place
+from icrl_dist.problems import registry
 from icrl_dist.stream import validation as strict
-from icrl_dist.types import Adversary, Task, Variation
-
-_LARGEST_ROOM, _LONGEST = 32, 1000
-"""Of larger rooms and longer episodes the optimum is not computed."""
-_HAND, _OBJECT = slice(0, 2), slice(4, 6)
-"""Where Meta-World's observation has x and y of hand and object."""
 
 
 def of(message: dict[str, Any]) -> dict[str, Any]:
@@ -42,61 +33,17 @@ def of(message: dict[str, Any]) -> dict[str, Any]:
     if not (np.isfinite(states).all() and np.isfinite(adversary).all()):
         raise Odd("schema")
     parameters = validation.named(message.get("task"))
-    if kind == "darkroom":
-        return _room(states, adversary, parameters)
-    if kind == pick_place.KIND:
-        return _paths(states, parameters)
-    if kind in domains.PROBLEMS and states.shape[1] == len(domains.PROBLEMS[kind].scale):
-        from icrl_dist.problems.dmc import picture
-
-        frames, force = picture.sticks(kind, states), _rounded(np.minimum(adversary, 1.0))
-        frame_s = validation.integer(message.get("every"), 1, 512) * picture.step_s(kind)
-        return {"kind": "sticks", "frames": frames, "frame_s": frame_s, "force": force}
-    raise Odd("schema")
-
-
-def _room(states: np.ndarray, adversary: np.ndarray, parameters: dict[str, Any]) -> dict[str, Any]:
-    size = validation.integer(parameters.get("size"), 2, 256)
-    goal = [validation.integer(c, 0, size - 1) for c in validation.listed(parameters.get("goal"), 2)]
-    if states.shape[1] != 2 or len(goal) != 2:
+    every = validation.integer(message.get("every"), 1, 512)
+    draw = registry.problem(kind).drawing if kind in registry.names() else None
+    if draw is None:
         raise Odd("schema")
-    path = np.rint(states).astype(np.int64).clip(0, size - 1)
-    return {"kind": "room", "size": size, "goal": goal, "path": path.tolist(), "overridden": (adversary >= 0).tolist()}
-
-
-def _paths(states: np.ndarray, parameters: dict[str, Any]) -> dict[str, Any]:
-    goal = validation.numbers(parameters.get("goal"), 3)
-    if states.shape[1] < 7 or len(goal) != 3:
-        raise Odd("schema")
-    drawn = {"hand": _HAND, "object": _OBJECT}
-    paths = [{"name": name, "points": [_rounded(p) for p in states[:, place]]} for name, place in drawn.items()]
-    return {"kind": "paths", "paths": paths, "goal": _rounded(np.array(goal[:2]))}
-
-
-def _rounded(values: np.ndarray) -> list[float]:
-    return [round(float(value), 3) for value in values]
+    try:
+        return draw(states, adversary, parameters, every)
+    except ValueError:
+        raise Odd("schema") from None
 
 
 def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> float | None:
-    """The optimal undiscounted return of a Dark Room variation, over its start cells; None where nobody knows it
-    or what was told makes no finite number."""
-    size, horizon = task.get("size"), task.get("horizon")
-    if problem != "darkroom" or not isinstance(size, int) or not isinstance(horizon, int):
-        return None
-    if not (2 <= size <= _LARGEST_ROOM and 1 <= horizon <= _LONGEST):
-        return None
-    try:
-        others = {name: _value(value) for name, value in adversary.items() if name != "kind"}
-        room = Task.of("darkroom", **{name: _value(value) for name, value in task.items()})
-        law = Adversary.of(str(adversary.get("kind")), **others)
-        with np.errstate(all="ignore"):
-            values = optimal_values(Hypotheses.of([Variation(room, law)]))[0]
-        start = task.get("start", "random")
-        best = float(values.mean() if start == "random" else values[int(start[0]) * size + int(start[1])])
-        return best if math.isfinite(best) else None
-    except (ValueError, KeyError, TypeError, IndexError, ArithmeticError):
-        return None  # it comes from a message, and is no room
-
-
-def _value(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+    """The optimal undiscounted return of a variation, over its start cells; None where it cannot be computed."""
+    found = registry.problem(problem).message_optimum if problem in registry.names() else None
+    return None if found is None else found(task, adversary)

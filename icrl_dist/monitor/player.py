@@ -11,10 +11,10 @@ from typing import Any
 
 from rich.console import Console
 
-from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import ConfigError, Deployment, parse
-from icrl_dist.monitor.play import PlayGame
 from icrl_dist.monitor.serve import EventStream, application, serving
+from icrl_dist.problems import registry as problems
 
 FRAME_S, BELIEF_S, HURRY_S = 0.05, 0.15, 0.25
 """At least so long from one picture to the next, from one belief, and from one picture where steps follow as fast as can be."""
@@ -27,7 +27,7 @@ class Player:
     The game is touched by the thread in ``run`` alone; ``command`` may be called from any.
     """
 
-    def __init__(self, game: PlayGame, stream: EventStream) -> None:
+    def __init__(self, game: Any, stream: EventStream) -> None:
         self._game, self._stream = game, stream
         self._orders: queue.SimpleQueue[tuple[dict[str, Any], Future[None]]] = queue.SimpleQueue()
 
@@ -101,9 +101,12 @@ def play(
     """
     agent = load_agent(what, seed, deploy)
     run = parse(str(agent.manifest.get("run", "")), str(what))
-    if run.problem != "darkroom":
-        raise ConfigError(f"play {what}: its agent knows {run.problem}; only a Dark Room can be played")
-    stream, game = EventStream(), PlayGame(agent, run, seed)
+    make_game = problems.of(run).game
+    if make_game is None:
+        raise ConfigError(
+            f"play {what}: its agent was trained in {run.problem}, which cannot be played; use an agent of darkroom"
+        )
+    stream, game = EventStream(), make_game(agent, run, seed)
     game.pause(paused)
     player = Player(game, stream)
     with serving(application("play.html", stream, player.command), stream, *where) as url:

@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import ConfigError, load
-from icrl_dist.methods.recipes import METHODS, about
+from icrl_dist.methods import registry as methods
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys
+from icrl_dist.telemetry.about import about
 
 _BEAT_S = 1.0
 _EPISODES_S = 1.0
@@ -75,7 +76,7 @@ class Recording:
         return heapq.merge(self._from_metrics(), self._from_dataset(), key=lambda message: message[0])
 
     def _from_metrics(self) -> Iterator[Message]:
-        method = METHODS[self._run.method]
+        method = methods.of(self._run)
         phases = method.phases(self._run)
         asked = {phase.next_version: method.ask(self._run, phase) for phase in phases}
         expected = {version: sum(job.trials * len(job.variations) for job in jobs) for version, jobs in asked.items()}

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from icrl_dist.types import Variation
 
 if TYPE_CHECKING:
-    from icrl_dist.problems.registry import Batch
+    from icrl_dist.interfaces import Batch
 
 Observation = np.ndarray[Any, np.dtype[np.float32]]
 Action = np.int64 | np.ndarray[Any, np.dtype[np.float32]]

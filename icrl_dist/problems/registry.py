@@ -1,39 +1,46 @@
-"""Variation environments: ``make`` for one as a gymnasium.Env, ``batch`` for many at once."""
+"""Problems by name, and variation environments: ``make`` one as a gymnasium.Env, ``batch`` many at once."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float, Float32, Int
-
-from icrl_dist.config.toml import nearest
-from icrl_dist.problems.darkroom import room
-from icrl_dist.problems.dmc import domains
+from icrl_dist.config import plugins
+from icrl_dist.config.random_keys import RandomKey, generator
+from icrl_dist.config.run import ConfigError, Run
+from icrl_dist.interfaces import Batch, Problem
 from icrl_dist.problems.gym_adapter import VariationEnv
-from icrl_dist.problems.metaworld import pick_place
-from icrl_dist.types import Spec, Step, Task, Variation
+from icrl_dist.types import NULL, Adversary, Spec, Task, Variation
 
 
-class Batch(Protocol):
-    """B variation environments stepped together; each row draws from its own generator."""
-
-    spec: Spec
-    batch: int
-
-    def reset(self, rngs: Sequence[np.random.Generator]) -> Float[np.ndarray, "B S"]: ...
-
-    def step(self, actions: Int[np.ndarray, " B"] | Float32[np.ndarray, "B A"]) -> Step: ...
+def names() -> tuple[str, ...]:
+    """The names of all problems, sorted: the kinds of their tasks."""
+    return plugins.names("problems")
 
 
-KINDS = ("darkroom", pick_place.KIND, *domains.PROBLEMS)
-"""Every problem there is: the kinds of tasks."""
+@functools.lru_cache(maxsize=64)
+def problem(name: str, config: Any = None) -> Problem:
+    """The problem of this name, with this section of a run file or the default one.
+
+    Raises ConfigError, with the nearest name, if there is none.
+    """
+    owner = plugins.find("problems", name)
+    made: Problem = owner(name, owner.Config() if config is None else config)
+    return made
 
 
-def _known(kind: str) -> None:
-    if kind not in KINDS:
-        raise ValueError(f"task {kind!r}: no such problem{nearest(kind, KINDS)}; known: {', '.join(KINDS)}")
+def of(run: Run) -> Problem:
+    """The problem of a run; its split is computed once."""
+    return problem(run.problem, run.section(plugins.find("problems", run.problem).section))
+
+
+def of_task(task: Task) -> Problem:
+    """The problem that a task belongs to.  Raises ValueError, with the nearest name, for an unknown one."""
+    try:
+        return problem(task.kind)
+    except ConfigError as error:
+        raise ValueError(f"task {task.kind!r}: no such {error}") from None
 
 
 def batch(variations: Sequence[Variation]) -> Batch:
@@ -41,30 +48,34 @@ def batch(variations: Sequence[Variation]) -> Batch:
     kinds = sorted({v.task.kind for v in variations})
     if len(kinds) != 1:
         raise ValueError(f"a batch holds variations of one problem, not {kinds}")
-    _known(kinds[0])
-    if kinds[0] == "darkroom":
-        return room.DarkRoom(variations)
-    # MuJoCo takes a moment to import: only for those who simulate.
-    if kinds[0] == pick_place.KIND:
-        from icrl_dist.problems.metaworld import environment
-
-        return environment.PickPlace(variations)
-    from icrl_dist.problems.dmc import simulation
-
-    return simulation.Variations(variations)
+    return of_task(variations[0].task).batch(variations)
 
 
 def spec(task: Task) -> Spec:
     """Shape of the task's observations and actions."""
-    _known(task.kind)
-    of = {"darkroom": room.spec, pick_place.KIND: pick_place.spec}.get(task.kind, domains.spec)
-    return of(task)
+    return of_task(task).spec_of(task)
 
 
 def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
     """One variation environment (tau, phi) as a ``gymnasium.Env``; ``render_mode`` ``rgb_array`` for images.
 
-    The adversary is part of the environment: the agent sees neither it nor its action,
+    The adversary is part of the environment: the agent observes neither it nor its action,
     except in ``info["adversary"]`` (see ``Step.adversary``).
     """
     return VariationEnv(variation, batch([variation]), render_mode)
+
+
+def training_variations(run: Run, index: int, task: Task, round: int = 0) -> tuple[Variation, ...]:
+    """The K training variations of task number ``index``, phi_0 first (Algorithm 2, line 7).
+
+    Every round of ICAA samples its adversaries anew (Algorithm 3, line 11).
+    """
+    rng = generator(run.seed, RandomKey.TRAINING_ADVERSARIES, index, round)
+    return tuple(Variation(task, one) for one in of(run).training_adversaries(rng, run.adversary))
+
+
+def test_adversary(run: Run, index: int, p: float, prior: str) -> Adversary:
+    """The disturbance of test task ``index`` at strength ``p``: never one that was trained on."""
+    if p == 0:
+        return NULL
+    return of(run).test_adversary(generator(run.seed, RandomKey.TEST_ADVERSARIES, index), p, prior)

@@ -1,34 +1,21 @@
-"""Deploying agents on held-out tasks, beside the oracle that knows task and adversary."""
+"""Agents deployed on tasks that were never trained on, beside the problem's references."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
-from icrl_dist.config.run import DarkRoomConfig, Deployment, Run
-from icrl_dist.experts import cache, train
-from icrl_dist.experts.train import ScriptedPolicy
-from icrl_dist.methods.recipes import Dataset, Phase, self_labelled
-from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.problems import registry, splits
-from icrl_dist.problems.darkroom import room as darkroom
-from icrl_dist.problems.darkroom.exact_agents import RULES, ExactAgent, OptimalAgent, Rule
-from icrl_dist.problems.darkroom.room import ACTIONS
-from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, optimal_returns, soft_labels
+from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.run import Deployment, Run
+from icrl_dist.interfaces import MakePolicy, Policy, Reference
+from icrl_dist.problems import registry
 from icrl_dist.results.statistics import mean_and_error
-from icrl_dist.rollout import deployment
-from icrl_dist.rollout.deployment import Actor, Policy, RandomActor, RandomPolicy, deploy_offline, deploy_online, episode
-from icrl_dist.types import Adversary, Identity, Task, Variation
-
-MakePolicy = Callable[[Sequence[Variation]], Policy | Actor]
-ORACLE = "oracle"
-EXPERT, SCRIPTED = "SAC expert", "scripted expert"
-"""Of a continuous game: the experts of the undisturbed tasks, and Meta-World's policy that is told the goal."""
+from icrl_dist.rollout.episode import DataPolicy, deploy_offline, deploy_online, episode
+from icrl_dist.types import Identity, Task, Variation
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +27,8 @@ class Result:
     returns: Float[np.ndarray, "tasks seeds episodes"]
     optimum: Float[np.ndarray, " tasks"] | None
     """Expected return of the optimal policy in each task's variation, by value iteration; None in a continuous game."""
+    ceiling: bool = False
+    """The agent knows the task, so other returns are also shown as a share of its returns."""
     broken: int = 0
     """Episodes that ended early because the simulation broke down: they count with what they had earned by then."""
 
@@ -72,161 +61,83 @@ class Result:
         }
 
 
-def variations(run: Run, p: float, goals: Sequence[Task] | None = None) -> tuple[Variation, ...]:
-    """Every evaluated task (or these) under its test adversary of strength p, started in the origin."""
-    chosen = splits.evaluated(run) if goals is None else goals
+def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple[Variation, ...]:
+    """Every evaluated task (or these) under its test adversary of strength p, with the start of test episodes."""
+    problem = registry.of(run)
+    chosen = problem.evaluated if tasks is None else tasks
     return tuple(
-        Variation(splits.deployed(t), splits.test_adversary(run, i, p, run.evaluate.prior)) for i, t in enumerate(chosen)
+        Variation(problem.at_test_start(task), registry.test_adversary(run, index, p, run.evaluate.prior))
+        for index, task in enumerate(chosen)
     )
 
 
-def in_context(run: Run, model: PretrainedTransformer, deploy: Deployment | None = None) -> MakePolicy:
-    """T_theta, deployed by this rule or the better one that it was trained for."""
-    return lambda rows: deployment.in_context(model, len(rows), run.context, deploy)
-
-
-def random(rows: Sequence[Variation]) -> Policy:
-    """The uniform policy."""
-    return RandomPolicy(ACTIONS)
-
-
-def random_vectors(rows: Sequence[Variation]) -> Actor:
-    """Uniform over vectors."""
-    return RandomActor()
-
-
-def scripted(rows: Sequence[Variation]) -> Actor:
-    """Meta-World's scripted policy."""
-    return ScriptedPolicy()
-
-
-def expert(run: Run, chosen: Sequence[Task]) -> MakePolicy | None:
-    """The SAC experts of these tasks, undisturbed, if they were trained on this machine."""
-    asked = {task: cache.any_kept(Variation(task), run.sac, run.seed) for task in chosen}
-    found = {task: history for task, history in asked.items() if history is not None}
-    if len(found) < len(asked):
-        return None
-    return lambda rows: train.ExpertPolicy([found[row.task] for row in rows], run.sac)
-
-
-def optimal(run: Run) -> MakePolicy:
-    """The oracle, which follows pi*_{tau,phi} of every row."""
-
-    def make(rows: Sequence[Variation]) -> Policy:
-        hypotheses = Hypotheses.of(rows)
-        return OptimalAgent(soft_labels(hypotheses, run.darkroom.gamma, slack=0.0), hypotheses.size)
-
-    return make
-
-
-@functools.lru_cache(maxsize=64)
-def _any_goal(room: DarkRoomConfig, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
-    goals = [darkroom.task(divmod(cell, room.size), room.size, room.horizon) for cell in range(room.size**2)]
-    hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
-    return hypotheses, soft_labels(hypotheses, room.gamma, room.label_slack)
-
-
-def exact(run: Run, rule: Rule) -> Callable[[Sequence[Variation]], ExactAgent]:
-    """The exact agent that knows every row's adversary and holds each cell for the goal, all equally."""
-
-    def make(rows: Sequence[Variation]) -> ExactAgent:
-        adversaries = list(dict.fromkeys(v.adversary for v in rows))
-        families, labels = zip(*(_any_goal(run.darkroom, a) for a in adversaries), strict=True)
-        return ExactAgent(families, labels, np.array([adversaries.index(v.adversary) for v in rows]), rule)
-
-    return make
+def in_context(trained: TrainedModel, deploy: Deployment | None = None) -> MakePolicy:
+    """The model, deployed by this rule or the one that it was trained for."""
+    of = trained
+    return lambda rows, env: of.method.policy(of.model, len(rows), of.run.context, deploy)
 
 
 def online(
     run: Run,
-    agents: Mapping[str, MakePolicy],
+    agents: Mapping[str, MakePolicy | Reference],
     progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
-    goals: Sequence[Task] | None = None,
+    tasks: Sequence[Task] | None = None,
 ) -> list[Result]:
-    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, same chance for all.
+    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, with the same draws for all.
 
-    On the held-out tasks, or those given.
+    On the evaluated tasks, or those given.
     """
-    results = []
+    problem, results = registry.of(run), []
     for level, p in enumerate(run.evaluate.p):
-        chosen = variations(run, p, goals)
-        optimum = optimal_returns(Hypotheses.of(chosen)) if run.problem == "darkroom" else None
+        chosen = variations(run, p, tasks)
+        optimum = None if problem.exact is None else problem.exact.optimum(chosen)
         rows, ids = _rows(run, chosen, level)
-        for name, make in agents.items():
-            env = registry.batch(rows)
+        for name, agent in agents.items():
+            env = problem.batch(rows)
             trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
             returns, broken = [], 0
-            policy = make(rows)
-            if isinstance(policy, ScriptedPolicy):
-                policy.meet(env)
-            for ran in deploy_online(env, policy, trials):
+            made, ceiling = (agent.make, agent.ceiling) if isinstance(agent, Reference) else (agent, False)
+            for ran in deploy_online(env, made(rows, env), trials):
                 returns.append(ran.returns)
                 broken += 0 if ran.diverged is None else int(ran.diverged.sum())
                 progress(name, p, len(returns))
             shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
-            results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum, broken))
+            results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum, ceiling, broken))
     return results
 
 
-def offline(run: Run, agents: Mapping[str, PretrainedTransformer], deploy: Deployment | None = None) -> list[Result]:
+def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
     """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
 
-    Of every model and every exact agent.
+    Of every model and every reference that takes in data of others.  Only for a problem with exact answers.
     """
-    results = []
+    problem, results = registry.of(run), []
+    assert problem.exact is not None
+    references = problem.references(run)
+    sources = {"random": references["random"], "expert": next(one for one in references.values() if one.ceiling)}
     for level, p in enumerate(run.evaluate.p):
         chosen = variations(run, p)
-        optimum = optimal_returns(Hypotheses.of(chosen))
+        optimum = problem.exact.optimum(chosen)
         rows, ids = _rows(run, chosen, level)
-        env = registry.batch(rows)
-        for source, behavior in (("random", random), ("expert", optimal(run))):
-            data = episode(env, behavior(rows), [i.rng(run.seed) for i in ids])
+        env = problem.batch(rows)
+        for source, behavior in sources.items():
+            data = episode(env, behavior.make(rows, env), [i.rng(run.seed) for i in ids])
             shape = (len(chosen), run.evaluate.seeds, 1)
             results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
-            ran = {}
-            for name, model in agents.items():
-                policy = deployment.in_context(model, len(rows), run.context, deploy)
-                ran[name] = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
-            for rule, name in RULES.items():
-                agent = exact(run, rule)(rows)
-                agent.append(data.observations[:, :-1], data.actions, data.observations[:, 1:], data.rewards)
-                ran[name] = episode(env, agent, [i._replace(trial=1).rng(run.seed) for i in ids])
-            results += [Result(f"{name}, {source} data", p, r.returns.reshape(shape), optimum) for name, r in ran.items()]
+            policies: dict[str, Policy] = {name: in_context(one, deploy)(rows, env) for name, one in models.items()}
+            policies |= {name: one.make(rows, env) for name, one in references.items()}
+            for name, policy in policies.items():
+                if _takes_data(policy):
+                    ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
+                    results.append(Result(f"{name}, {source} data", p, ran.returns.reshape(shape), optimum))
     return results
+
+
+def _takes_data(policy: Policy) -> TypeGuard[DataPolicy]:
+    return hasattr(policy, "append")
 
 
 def _rows(run: Run, chosen: Sequence[Variation], level: int) -> tuple[list[Variation], list[Identity]]:
     """Every variation ``evaluate.seeds`` times, and the identity of each row's first episode."""
     pairs = [(i, seed) for i in range(len(chosen)) for seed in range(run.evaluate.seeds)]
     return [chosen[i] for i, _ in pairs], [Identity("evaluate", level, i, seed, 0) for i, seed in pairs]
-
-
-def label_quality(run: Run, phase: Phase, data: Dataset) -> dict[str, float]:
-    """How good a round's own labels are, against the exact answer (Theorem E.5, measured).
-
-    ``agreement``: share of labels that the optimal policy would also take; ``labelling``: share
-    of the variations that gave labels; the mean return of
-    the trials that became contexts and of those that gave labels; the optimum beside them.
-    Empty for a phase whose labels are not the model's own.
-    """
-    if phase.stage != "adapt" or run.method != "icaa" or run.problem != "darkroom":
-        return {}
-    agreement, early, late, best = [], [], [], []
-    for trials in map(data.trials, data.variations(phase.stage, phase.round)):
-        hypotheses = Hypotheses.of([trials[0].variation])
-        truth = soft_labels(hypotheses, run.darkroom.gamma, run.darkroom.label_slack)[0]
-        own = self_labelled(run, trials)
-        if own is not None:
-            good = truth[cell_numbers(own.queries, hypotheses.size), own.labels.argmax(axis=1)] > 0
-            agreement.append(good.mean())
-        cut = run.icaa.context_trials + 1
-        early.append(np.mean([t.episode_return for t in trials[:cut]]))
-        late.append(np.mean([t.episode_return for t in trials[cut:]]))
-        best.append(optimal_returns(hypotheses)[0])
-    return {
-        "agreement": float(np.mean(agreement)) if agreement else 0.0,
-        "labelling": len(agreement) / len(early),
-        "context_return": float(np.mean(early)),
-        "label_return": float(np.mean(late)),
-        "optimum": float(np.mean(best)),
-    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Sequence
@@ -13,29 +14,28 @@ from jaxtyping import Float
 from rich.console import Console
 
 from icrl_dist.agent import ood_score
-from icrl_dist.agent.in_context_agent import calibrated, checkpoint_file, model_of, outcomes_of
+from icrl_dist.agent.loading import calibrated, checkpoint_file, outcomes_of, trained
 from icrl_dist.agent.ood_score import Surprise
-from icrl_dist.config.run import Deployment, Run, default_deployment
+from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.run import ConfigError, Deployment, Run
 from icrl_dist.console.terminal import Display, experts_table, gap_table, kl_table, returns_table
-from icrl_dist.experts import cache
-from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.problems import splits
-from icrl_dist.problems.darkroom import divergence
-from icrl_dist.problems.darkroom.exact_agents import RULES
+from icrl_dist.interfaces import Batch, MakePolicy, Method, Policy, Reference
+from icrl_dist.methods import registry as methods
+from icrl_dist.problems import registry
 from icrl_dist.results import evaluate, plots
-from icrl_dist.rollout import deployment
+from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.files import Checkpoint, atomic_write, load_checkpoint, save_checkpoint
 from icrl_dist.types import Variation
 
 
-def models(what: Path) -> dict[str, PretrainedTransformer]:
+def models(what: Path) -> dict[str, TrainedModel]:
     """The newest model and, in a run folder, the T^0 that it grew from."""
     newest = load_checkpoint(checkpoint_file(what))
     version = newest.manifest["version"]
-    found = {f"T^{version} ({newest.manifest['method']})": model_of(newest)[0]}
+    found = {f"T^{version} ({newest.manifest['method']})": trained(newest)}
     if what.is_dir() and version > 0:
-        found["T^0"] = model_of(load_checkpoint(checkpoint_file(what, 0)))[0]
+        found["T^0"] = trained(load_checkpoint(checkpoint_file(what, 0)))
     return found
 
 
@@ -53,7 +53,7 @@ def keep_calibrated(folder: Path, display: Display) -> None:
     """Calibrate a run's newest checkpoint, which is written anew only if it was not calibrated before."""
     made = calibrate(folder, display)
     file = checkpoint_file(folder)
-    if not load_checkpoint(file).part("outcomes"):
+    if made.part("outcomes") and not load_checkpoint(file).part("outcomes"):
         save_checkpoint(file, made)
 
 
@@ -69,7 +69,7 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     if len(levels) > 60:
         levels = hashlib.sha256(levels.encode()).hexdigest()[:16]
     agent = f"T{manifest['version']}-{str(manifest.get('weights_digest', ''))[:8]}"
-    by = deploy or default_deployment(run.model)
+    by = deploy or methods.of(run).deployment(run)
     named = "" if what.is_dir() else f"{what.stem[:60]}-"
     return f"{suite}-{named}{agent}-{by}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
 
@@ -85,48 +85,24 @@ def online(
     Algorithm 1, the newest is deployed by it too.  And the newest's surprise at the end, by p,
     if it was calibrated.
     """
-    found = models(what)
-    agents: dict[str, evaluate.MakePolicy] = {name: evaluate.in_context(run, model, deploy) for name, model in found.items()}
+    found, problem = models(what), registry.of(run)
+    made = {name: evaluate.in_context(model, deploy) for name, model in found.items()}
     newest, model = next(iter(found.items()))
-    watches: list[Surprise] = []
+    scores: list[Surprise] = []
     if outcomes := outcomes_of(load_checkpoint(checkpoint_file(what))):
 
-        def watched(rows: Sequence[Variation]) -> deployment.Policy:
-            watches.append(Surprise(outcomes, model.spec, len(rows)))
-            return deployment.in_context(model, len(rows), run.context, deploy, watches[-1].observe)
+        def scored(rows: Sequence[Variation], env: Batch) -> Policy:
+            scores.append(Surprise(outcomes, model.spec, len(rows)))
+            return model.method.policy(model.model, len(rows), run.context, deploy, scores[-1].observe)
 
-        agents[newest] = watched
-    if (deploy or default_deployment(run.model)) != "paper":
-        agents[f"{newest}, Algorithm 1"] = evaluate.in_context(run, model, "paper")
-    others = _others(run)
-    agents |= others
-    if run.problem.startswith("dmc-") and evaluate.EXPERT not in others:
-        display.report({"event": "note", "text": _no_expert(run, what)})
+        made[newest] = scored
+    if (deploy or model.method.deployment(run)) != "paper":
+        made[f"{newest}, Algorithm 1"] = evaluate.in_context(model, "paper")
+    agents: dict[str, MakePolicy | Reference] = {**made, **problem.references(run)}
+    if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
+        display.report({"event": "note", "text": missing})
     results = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
-    return results, {f"{p:g}": _spread(one.now()) for p, one in zip(run.evaluate.p, watches, strict=False)}
-
-
-def _others(run: Run) -> dict[str, evaluate.MakePolicy]:
-    """Who the models stand beside."""
-    if run.problem == "darkroom":
-        agents: dict[str, evaluate.MakePolicy] = {"random": evaluate.random}
-        agents |= {name: evaluate.exact(run, rule) for rule, name in RULES.items()}
-        return agents | {evaluate.ORACLE: evaluate.optimal(run)}
-    agents = {"random": evaluate.random_vectors}
-    if run.problem.startswith("metaworld"):
-        return agents | {evaluate.SCRIPTED: evaluate.scripted}
-    trained = evaluate.expert(run, splits.evaluated(run))
-    return agents if trained is None else agents | {evaluate.EXPERT: trained}
-
-
-def _no_expert(run: Run, what: Path) -> str:
-    """Why no expert stands beside the models, and what would put it there."""
-    if not run.sac.cache:
-        return "no SAC expert stands beside the models: with sac.cache = '' none is kept"
-    missing = [task for task in splits.evaluated(run) if cache.any_kept(Variation(task), run.sac, run.seed) is None]
-    train = f"icrl-dist train experts-{what / 'run.toml' if what.is_dir() else 'RUN'} --out OTHER"
-    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this machine"
-    return f"no SAC expert stands beside the models: {where}; `{train}` trains them"
+    return results, {f"{p:g}": _spread(one.now()) for p, one in zip(run.evaluate.p, scores, strict=False)}
 
 
 def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
@@ -134,7 +110,14 @@ def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
 
 
 def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
-    """Offline returns of the folder's models, given random and expert data."""
+    """Offline returns of the folder's models, given random and expert data.
+
+    Raises ConfigError for a problem without exact answers.
+    """
+    if registry.of(run).exact is None:
+        raise ConfigError(
+            f"--suite offline: {run.problem} has no exact answers to collect expert data with; use --suite online"
+        )
     return evaluate.offline(run, models(what), deploy)
 
 
@@ -144,7 +127,7 @@ def show_online(
     """Print the table, keep the rows as ``report``.json and the figure as ``report``.png; returns the rows with its path."""
     rows = [result.row() for result in results]
     adapted = _adaptation(results)
-    title = f"{run.method.upper()} on {_tasks(run, len(results[0].returns))}, {run.evaluate.seeds} seeds"
+    title = f"{run.method.upper()} on {registry.of(run).title(len(results[0].returns))}, {run.evaluate.seeds} seeds"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(rows, indent=1).encode()))
     figure = plots.adaptation(rows, report.with_name(f"{report.name}.png"), title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
@@ -161,7 +144,7 @@ def show_online(
 
 def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:
     """How soon the newest model acts well, by p, beside the oracle: see ``Result.first_over`` and ``Result.episode_of``."""
-    oracle = {result.p: result for result in results if result.agent == evaluate.ORACLE}
+    oracle = {result.p: result for result in results if result.ceiling and result.optimum is not None}
     if not oracle:
         return {}
     newest = [result for result in results if result.agent == results[0].agent]
@@ -185,43 +168,44 @@ def show_experts(folder: Path, console: Console) -> dict[str, Any]:
     return {"experts": rows}
 
 
-def _tasks(run: Run, count: int) -> str:
-    if run.problem == "darkroom":
-        return f"{count} held-out goals of a {run.darkroom.size}x{run.darkroom.size} Dark Room"
-    return f"{count} {'training' if run.problem.startswith('dmc-') else 'held-out'} tasks of {run.problem}"
-
-
 def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
-    """The newest model beside the exact posterior: ``truth``'s measures on training and on held-out goals."""
-    model = model_of(load_checkpoint(checkpoint_file(what)))[0]
+    """The newest model beside the exact posterior, on training and on held-out tasks.
+
+    Raises ConfigError for a problem or a method that has no such comparison.
+    """
+    model = trained(load_checkpoint(checkpoint_file(what)))
+    suite = registry.of(run).posterior
+    if suite is None or type(model.method).distributions is Method.distributions:
+        raise ConfigError(f"--suite posterior: {run.problem} with method {run.method} has none; use --suite online")
+    decide = functools.partial(model.method.distributions, model.model)
+    act = evaluate.in_context(model, "paper")
     report: dict[str, Any] = {}
-    total = len(divergence.KINDS) * len(divergence.levels(run))
+    total = len(suite.kinds) * len(suite.levels(run))
     for name, heldout in (("kl_nats", False), ("kl_heldout", True)):
         event = {"event": "progress", "stage": "evaluate", "phase": f"contexts, {_goals(heldout)}", "steps": total}
         found = []
-        for pair in divergence.divergences(run, model, heldout):
+        for pair in suite.divergences(run, decide, act, heldout):
             found.append(pair)
             display.report(event | {"step": len(found)})
-        for law, ones in zip(divergence.LAWS, zip(*found, strict=True), strict=True):
-            summary = divergence.summary(ones)
-            report |= {f"{name}{law}{part}": value for part, value in summary.items()}
-            report[f"{name}{law}_curves"] = divergence.curves(ones)
-    split = splits.split(run)
+        for prior, ones in zip(suite.priors, zip(*found, strict=True), strict=True):
+            report |= {f"{name}{prior}{part}": value for part, value in suite.summary(ones).items()}
+            report[f"{name}{prior}_curves"] = suite.curves(ones)
+    split = registry.of(run).split
     for name, heldout in (("paper_gap", True), ("paper_gap_train", False)):
-        goals = split.test if heldout else split.train[: len(split.test)]
+        tasks = split.test if heldout else split.train[: len(split.test)]
         progress = _count(display, f"online, {_goals(heldout)}", run, 2)
-        report[name] = divergence.gaps(run, evaluate.in_context(run, model), goals, progress)
+        report[name] = posterior_suite.gaps(run, evaluate.in_context(model), tasks, progress)
     return report
 
 
 def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Console) -> dict[str, Any]:
     """Print the tables, keep everything as ``report``.json and the figure as ``report``.png; returns all but the curves."""
-    size = run.darkroom.size
-    title = f"{run.method.upper()} beside the exact posterior in a {size}x{size} Dark Room"
+    problem = registry.of(run)
+    title = f"{run.method.upper()} beside the exact posterior: {problem.title(len(problem.evaluated))}"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
     figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
-    for law, meaning in divergence.LAWS.items():
-        console.print(kl_table(found, law, f"KL(exact || model) in nats, where {meaning}"))
+    for prior, meaning in problem.posterior.priors.items():
+        console.print(kl_table(found, prior, f"KL(exact || model) in nats, where {meaning}"))
     adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
     console.print(gap_table(found, f"Online return by Algorithm 1 beside the exact agent's: {adversary}"))
     console.print(f"figure {figure}", highlight=False, markup=False)

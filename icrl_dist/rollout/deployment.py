@@ -1,76 +1,22 @@
-"""Algorithm 1: deploying a policy offline and online, in a whole batch of environments."""
+"""T_theta deployed in a batch of environments: by Algorithm 1, or committed (zeta of eq. 6)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int16, Int64
+from jaxtyping import Float, Float32, Int64
 
-from icrl_dist.config.run import ConfigError, ContextConfig, Deployment, default_deployment
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
+from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, Windows
-from icrl_dist.models.heads import sample
-from icrl_dist.problems.registry import Batch
-
-Actions = Int64[np.ndarray, " B"] | Float32[np.ndarray, "B A"]
-"""Of B environments: numbers, or vectors in [-1, 1]."""
-
-Watch = Callable[..., object]
-"""Told of every decision of T_theta and of what came of it (``models.outcomes.Decisions``)."""
 
 
-class Observer(Protocol):
-    """Whatever it learns of B environments, it learns from ``observe``."""
-
-    def observe(
-        self,
-        observation: Float32[np.ndarray, "B S"],
-        action: Actions,
-        reward: Float32[np.ndarray, " B"],
-        next_observation: Float32[np.ndarray, "B S"],
-        done: bool,
-    ) -> None: ...
-
-
-class Policy(Observer, Protocol):
-    """Acts in B environments at once, by its law over discrete actions."""
-
-    def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]: ...
-
-
-@runtime_checkable
-class Actor(Observer, Protocol):
-    """Acts in B environments at once, by actions of any kind."""
-
-    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
-        """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
-        ...
-
-
-class RandomActor:
-    """Uniform over vectors in [-1, 1]."""
-
-    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Float32[np.ndarray, "B U"]:
-        return (2 * u - 1).astype(np.float32)
-
-    def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
-
-
-class RandomPolicy:
-    """Uniform over the actions: the behavior policy of the pretraining contexts."""
-
-    def __init__(self, actions: int) -> None:
-        self._uniform = np.full(actions, 1.0 / actions)
-
-    def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
-        return np.broadcast_to(self._uniform, (len(observation), len(self._uniform)))
-
-    def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
+def default_deployment(model: ModelConfig) -> Deployment:
+    """``committed`` for a model that is trained on action windows."""
+    return "committed" if model.window > 1 else "paper"
 
 
 class InContextPolicy:
@@ -96,10 +42,10 @@ class InContextPolicy:
         return self.model.reads.act(self._decide(observation), u)
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
-        """The law over discrete actions."""
+        """The distribution over discrete actions."""
         return self._decide(observation).softmax(-1).cpu().numpy()
 
-    def law(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]:
+    def distribution(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]:
         """T_theta(. | s, D) at any states s, D being the context of environment ``row`` as the next decision sees it.
 
         Every state stands alone: what the agent did last (zeta) is not told.  Nothing changes: later
@@ -111,7 +57,7 @@ class InContextPolicy:
         return outputs.softmax(-1).cpu().numpy()
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
-        """D of ``law``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
+        """D of ``distribution``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
         taken_up = zip(*([c[row].cpu().numpy() for c in episode] for episode in self._episodes), strict=True)
         columns = [np.concatenate(column) for column in taken_up] or self._stacked([], row)
         return tuple(np.concatenate(both) for both in zip(columns, self._stacked(self._running(), row), strict=True))
@@ -251,65 +197,3 @@ def in_context(
             "deploy it by 'paper', or train with model.window, pretrain.windows and optim.windows"
         )
     return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context, watch)
-
-
-@dataclass(frozen=True, eq=False)
-class Episodes:
-    """One episode in each of B environments."""
-
-    actions: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H A"]
-    observations: Float32[np.ndarray, "B H+1 S"]
-    rewards: Float32[np.ndarray, "B H"]
-    adversary: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H F"]
-    diverged: Bool[np.ndarray, " B"] | None = None
-    """Rows that nothing may be learned from; None for a game that cannot break down."""
-
-    @property
-    def returns(self) -> Float[np.ndarray, " B"]:
-        """Undiscounted return of each episode."""
-        return self.rewards.sum(axis=1, dtype=np.float64)
-
-
-def _act(policy: Policy | Actor, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
-    if isinstance(policy, Actor):
-        return policy.act(observation, u)
-    return sample(policy.probabilities(observation), u[:, 0])
-
-
-def episode(env: Batch, policy: Policy | Actor, rngs: Sequence[np.random.Generator]) -> Episodes:
-    """One episode; row b's chance, the agent's included, comes from ``rngs[b]`` alone."""
-    observation = env.reset(rngs)
-    shape = (env.spec.horizon, 1 if env.spec.discrete else env.spec.actions)
-    noise = np.stack([rng.random(shape) for rng in rngs], axis=1)
-    observations, actions, rewards, adversary = [observation], [], [], []
-    for h in range(env.spec.horizon):
-        action = _act(policy, observation, noise[h])
-        step = env.step(action)
-        policy.observe(observation, action, step.reward, step.observation, step.done)
-        observation = step.observation
-        observations.append(observation)
-        actions.append(action.astype(np.int16) if env.spec.discrete else action)
-        rewards.append(step.reward)
-        adversary.append(step.adversary)
-    return Episodes(
-        observations=np.stack(observations, axis=1),
-        actions=np.stack(actions, axis=1),
-        rewards=np.stack(rewards, axis=1),
-        adversary=np.stack(adversary, axis=1),
-        diverged=step.diverged,
-    )
-
-
-def deploy_online(env: Batch, policy: Policy | Actor, trials: Iterable[Sequence[np.random.Generator]]) -> Iterator[Episodes]:
-    """Lines 9 to 17: one episode a trial, the context growing from nothing."""
-    for rngs in trials:
-        yield episode(env, policy, rngs)
-
-
-def deploy_offline(
-    env: Batch, policy: InContextPolicy, dataset: Sequence[Episodes], rngs: Sequence[np.random.Generator]
-) -> Episodes:
-    """Lines 3 to 7: one episode given D_off, which was collected before by other policies."""
-    for data in dataset:
-        policy.append(data.observations[:, :-1], data.actions.astype(np.int64), data.observations[:, 1:], data.rewards)
-    return episode(env, policy, rngs)

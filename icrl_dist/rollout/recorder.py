@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from icrl_dist.problems.registry import Batch
+from icrl_dist.interfaces import Batch
 from icrl_dist.types import Step
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load, parse
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.files import StoreError, atomic_write, load_checkpoint, newest_version, version_file
@@ -66,9 +68,7 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
     not fit together, StoreError if the data is not what the checkpoint names.
     """
     parent = load(str(theirs / "run.toml"))
-    for name in ("method", "darkroom", "model"):
-        if getattr(run, name) != getattr(parent, name):
-            raise ConfigError(f"--from {theirs}@{version}: a fork has its parent's {name}; begin a run of its own for another")
+    _same(parent, run, f"--from {theirs}@{version}")
     manifest: Mapping[str, Any] = load_checkpoint(version_file(theirs, version)).manifest
     if "dataset_digest" not in manifest:
         raise ConfigError(f"--from {theirs}@{version}: its checkpoint names no data: it is of an older version of icrl-dist")
@@ -97,6 +97,27 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
         "ancestors": [{"version": newest, "run": dumps(ancestor)} for newest, ancestor in ancestors],
     }
     atomic_write(folder / _FILE, lambda file: file.write(json.dumps(record, indent=1).encode()))
+
+
+def _same(parent: Run, run: Run, what: str) -> None:
+    """Raises ConfigError, naming every number that differs, if the runs have another problem, split, method or model."""
+    owner = plugins.find("problems", run.problem)
+    differing = [
+        (name, getattr(parent, name), getattr(run, name))
+        for name in ("method", "problem")
+        if getattr(parent, name) != getattr(run, name)
+    ]
+    sections = {"model": ()} if differing else {"model": (), owner.section: owner.free_in_forks}
+    for section, free in sections.items():
+        before, after = parent.section(section), run.section(section)
+        differing += [
+            (f"{section}.{item.name}", getattr(before, item.name), getattr(after, item.name))
+            for item in dataclasses.fields(before)
+            if item.name not in free and getattr(before, item.name) != getattr(after, item.name)
+        ]
+    if differing:
+        named = ", ".join(f"{name} = {after!r} (parent: {before!r})" for name, before, after in differing)
+        raise ConfigError(f"{what}: {named}: a fork has its parent's problem, split, method and model; begin a new run instead")
 
 
 def _link(source: Path, target: Path) -> None:

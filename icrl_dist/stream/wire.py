@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any
 
 import msgpack
 import numpy as np
 
+from icrl_dist.stream import schema
 from icrl_dist.stream.validation import (
     DEPTH,
     REASONS,
@@ -40,6 +41,7 @@ from icrl_dist.types import (
     Identity,
     Job,
     Params,
+    Payload,
     Task,
     Trajectory,
     Value,
@@ -153,18 +155,28 @@ def encode_job(job: Job) -> bytes:
             "trials": job.trials,
             "policy_version": job.policy_version,
             "seed": job.seed,
-            "settings": _from_params(job.settings),
+            "payload": schema.as_data(job.payload),
             "tasks": job.tasks,
             "first": job.first,
         },
     )
 
 
-def decode_job(data: bytes, limit: int = SMALL) -> Job:
-    """The job in ``data``, equal to the one encoded: integers stay integers, lists come back as tuples."""
+ReadPayload = Callable[[str, Any], Payload]
+"""``read(kind, data)``: the payload of a job of this kind from plain data; raises ValueError for an impossible one."""
+
+
+def decode_job(data: bytes, read_payload: ReadPayload, limit: int = SMALL) -> Job:
+    """The job in ``data``, equal to the one encoded; ``read_payload`` decodes what its kind needs."""
     fields = _fields(data, limit, "job", _JOB)
+    kind = text(fields["job"], "job")
+    check_plain(fields["payload"], "payload", DEPTH)
+    try:
+        payload = read_payload(kind, fields["payload"])
+    except ValueError as error:
+        raise WireError("schema", str(error)) from None
     return Job(
-        kind=text(fields["job"], "job"),
+        kind=kind,
         stage=_stage(fields["stage"]),
         round=integer(fields["round"], "round", 0),
         task=integer(fields["task"], "task", 0),
@@ -172,7 +184,7 @@ def decode_job(data: bytes, limit: int = SMALL) -> Job:
         trials=integer(fields["trials"], "trials", 0),
         policy_version=integer(fields["policy_version"], "policy_version", -1),
         seed=integer(fields["seed"], "seed", 0),
-        settings=_to_params(fields["settings"], "settings"),
+        payload=payload,
         tasks=integer(fields["tasks"], "tasks", 1),
         first=integer(fields["first"], "first", 0),
     )

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from icrl_dist.config.toml import ConfigError
+from icrl_dist.config.sections import AlertsConfig
 
 _PAIRS = 20
 """Trials that two versions must have in common before their returns are compared."""
@@ -17,33 +17,6 @@ _AGAIN_S = 30.0
 """An alert whose words change is told of again after so long at the earliest: logs are read by people."""
 _WINDOW_S = 10.0
 """The time over which ingest is compared with demand, seconds."""
-
-
-@dataclass(frozen=True)
-class AlertsConfig:
-    """When to wake somebody; in the live view, in ``metrics.jsonl`` and on the monitor plane.  0: never."""
-
-    collapse: float = 0.5
-    """The newest version returns less than this share of what the one before returned in the same
-    trials of the same variations."""
-    zero_episodes: int = 40
-    """A variation whose last so many episodes all returned 0."""
-    silent_s: float = 5.0
-    """A worker that has not been heard of for so long, seconds."""
-    ingest: float = 0.5
-    """Trajectories are stored at less than this share of the rate at which workers could make them: for the
-    rest of the last ten seconds they have waited for the learner to store what they sent."""
-    labels: float = 0.05
-    """The share of a round's own labels that are optimal falls by this much from round to round (ICAA in Dark Room)."""
-
-    def __post_init__(self) -> None:
-        """Raises ConfigError, naming the number, for one that cannot be."""
-        for name in ("zero_episodes", "silent_s"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"alerts.{name} = {getattr(self, name)!r}: must not be negative; 0 is never")
-        for name in ("collapse", "ingest", "labels"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"alerts.{name} = {getattr(self, name)!r}: a share lies in [0, 1]; 0 is never")
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ class Pool:
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class TrainingBatch:
     """B contexts of up to T transitions, zero-padded at the end, and N queries and R windows of each.
 
     Padding needs no mask: context tokens see only earlier ones, and ``prefix`` never
@@ -177,7 +177,7 @@ def draw(
     queries: int,
     transitions: int = 0,
     windows: int = 0,
-) -> Batch:
+) -> TrainingBatch:
     """A training batch: random variations, random contexts of them, random prefixes, queries and windows.
 
     A batch comes from one pool, drawn by share, and its contexts have the same drawn number of
@@ -202,7 +202,7 @@ def draw(
         return out
 
     asked, labels, prefix = (np.stack([row[column] for row in rows]) for column in (4, 5, 6))
-    made = Batch(padded(0), padded(1), padded(2), padded(3), asked, labels, prefix)
+    made = TrainingBatch(padded(0), padded(1), padded(2), padded(3), asked, labels, prefix)
     if windows:
         drawn = [_windows(rng, examples, length, windows) for examples, length in zip(chosen, lengths, strict=True)]
         columns = (np.stack(column) for column in zip(*(of for of, _ in drawn), strict=True))

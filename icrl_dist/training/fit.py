@@ -1,4 +1,4 @@
-"""Supervised pretraining: the loss of eq. (1), one step, and a fit."""
+"""Supervised pretraining: the optimizer, one step, and a fit."""
 
 from __future__ import annotations
 
@@ -6,38 +6,16 @@ import math
 from collections.abc import Callable, Mapping
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from icrl_dist.config.run import OptimConfig
-from icrl_dist.models.dpt import PretrainedTransformer, Transitions, Windows
+from icrl_dist.config.sections import OptimConfig
 from icrl_dist.training import optimizers
-from icrl_dist.training.batches import Batch
-
-
-def batch_loss(model: PretrainedTransformer, batch: Batch) -> Float[Tensor, ""]:
-    """Eq. (1) over every (prefix, query) pair of a batch, and with windows eq. (6), every label counting the same."""
-    device = model.low.device
-
-    def put(array: object) -> Tensor:
-        return torch.as_tensor(array, device=device)
-
-    context = Transitions(*map(put, (batch.observations, batch.actions, batch.next_observations, batch.rewards)))
-    cache = model.encode(context)
-    total = model.reads.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
-    if batch.windows is not None:
-        states, taken, gained, labels = batch.windows
-        followed = model.follow(Windows(put(states), put(taken), put(gained)), cache, put(batch.window_prefix))
-        count = states.shape[1] * states.shape[2]
-        share = count / (count + batch.prefix.shape[1])
-        total = (1 - share) * total + share * model.reads.loss(followed, put(labels))
-    return total
 
 
 class Optimizer:
     """AdamW of appendix B.2; with ``optim.muon``, Muon for the trunk's matrices and AdamW for the rest."""
 
-    def __init__(self, model: PretrainedTransformer, config: OptimConfig) -> None:
+    def __init__(self, model: nn.Module, config: OptimConfig) -> None:
         named = list(model.named_parameters())
         matrices = [p for name, p in named if config.muon and name.startswith("trunk.") and p.ndim == 2]
         others = [p for _, p in named if all(p is not matrix for matrix in matrices)]
@@ -88,16 +66,16 @@ def rate(step: int, steps: int, warmup: int) -> float:
 
 
 def fit(
-    model: PretrainedTransformer,
+    model: nn.Module,
     opt: Optimizer,
     config: OptimConfig,
     learning_rate: float,
     steps: int,
-    batch: Callable[[int], Batch],
+    loss: Callable[[int], Tensor],
     progress: Callable[[int, float], None] = lambda step, value: None,
     first: int = 0,
 ) -> float:
-    """Minimise eq. (1) for ``steps`` steps at peak rate ``learning_rate``; ``batch(step)`` draws the data.
+    """Minimize a loss for ``steps`` steps at peak rate ``learning_rate``; ``loss(step)`` draws the data of a step.
 
     A step depends on its number, the weights and the optimizer alone, so a fit stopped after
     ``first`` steps goes on as if it had never stopped.  Returns the mean loss of the last
@@ -107,7 +85,7 @@ def fit(
     warmup = min(config.warmup, max(1, steps // 10))
     total, counted = 0.0, 0
     for step in range(first, steps):
-        value = batch_loss(model, batch(step))
+        value = loss(step)
         value.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip)
         opt.step(learning_rate * rate(step, steps, warmup))

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+from icrl_dist.methods.recipes import METHODS
 
 import icrl_dist
 from actors import beliefs
@@ -17,8 +18,8 @@ from actors.weight_cache import LivePolicy
 from actors.worker import Worker
 from icrl_dist.collect import jobs
 from icrl_dist.config.run import dumps
-from icrl_dist.methods.recipes import METHODS
-from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom.posterior import Room
 from icrl_dist.problems.registry import spec

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist.agent import ood_score
-from icrl_dist.agent.in_context_agent import InContextAgent, calibrated, load_agent, model_of, outcomes_of, shipped
+from icrl_dist.agent.in_context_agent import InContextAgent
+from icrl_dist.agent.loading import calibrated, load_agent, model_of, outcomes_of, shipped
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, parse
-from icrl_dist.methods.recipes import METHODS
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.outcome_readout import RARE, WINDOWS, OutcomeModel
 from icrl_dist.problems import registry, splits

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist.agent.in_context_agent import SHIPPED, load_agent, model_of, shipped
+from icrl_dist.agent.loading import SHIPPED, load_agent, model_of, shipped
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, parse
-from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import splits
 from icrl_dist.results import evaluate
 from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file

@@ -10,7 +10,8 @@ import pytest
 
 from icrl_dist.config import run as config
 from icrl_dist.config import sac
-from icrl_dist.config.run import ConfigError, Run, StreamConfig
+from icrl_dist.config.run import ConfigError, Run
+from icrl_dist.config.sections import StreamConfig
 from icrl_dist.problems import registry
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import psutil
 import pytest
 
-from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.agent.loading import load_agent
 from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink

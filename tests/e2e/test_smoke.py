@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
-from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import load
 from icrl_dist.methods import recipes
 from icrl_dist.problems.darkroom.exact_agents import RULES

@@ -5,17 +5,19 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from icrl_dist.methods.recipes import METHODS, self_labelled
 
 from icrl_dist.collect import jobs
-from icrl_dist.config.run import AdversaryConfig, ConfigError, validate
-from icrl_dist.config.sac import ControlConfig, SACConfig
+from icrl_dist.config.run import ConfigError, validate
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import cache, train
 from icrl_dist.experts.cache import LED, History
 from icrl_dist.experts.sac import batched
 from icrl_dist.experts.train import ExpertPolicy, ScriptedPolicy
-from icrl_dist.methods.recipes import METHODS, self_labelled
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import registry, splits
+from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.metaworld import environment
 from icrl_dist.results import evaluate, heldout

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from icrl_dist.config.run import DAggerConfig
+from icrl_dist.config.sections import DAggerConfig
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch.train import TrainInterrupted
 from icrl_dist.types import Identity

@@ -5,10 +5,10 @@ import json
 
 import pytest
 
+from icrl_dist.config.sections import AlertsConfig
 from icrl_dist.launch import train as launch
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.memory_link import MemoryLink
-from icrl_dist.telemetry.alerts import AlertsConfig
 from icrl_dist.telemetry.metrics import NAMES, TEXTS
 from learner import reporter, service
 

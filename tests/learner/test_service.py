@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import ConfigError
 from icrl_dist.launch import train
 from icrl_dist.storage.dataset import Store

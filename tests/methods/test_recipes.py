@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from icrl_dist.methods.recipes import METHODS, self_labelled
 
 from icrl_dist.collect import jobs
-from icrl_dist.config.run import DAggerConfig
-from icrl_dist.methods.recipes import METHODS, self_labelled
+from icrl_dist.config.sections import DAggerConfig
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels

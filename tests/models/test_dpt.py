@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from icrl_dist.config.run import ModelConfig, OptimConfig
+from icrl_dist.config.sections import ModelConfig, OptimConfig
 from icrl_dist.models import gpt
-from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, load_weights, weights_of
+from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions
 from icrl_dist.models.gpt import GPT
 from icrl_dist.models.heads import Categorical
+from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.training import batches, fit
 from icrl_dist.training.batches import Batch, Examples, Pool
 from icrl_dist.types import Spec

@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from icrl_dist import InContextAgent, make
-from icrl_dist.agent.in_context_agent import load_agent
+from icrl_dist.agent.loading import load_agent
 from icrl_dist.cli import main
-from icrl_dist.config.run import ConfigError, ContextConfig, EvaluateConfig
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import ContextConfig, EvaluateConfig
 from icrl_dist.console.terminal import returns_table
-from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom import divergence, room
 from icrl_dist.problems.darkroom.exact_agents import RULES, ExactAgent

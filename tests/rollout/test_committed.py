@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.collect import jobs
-from icrl_dist.config.run import ConfigError, ContextConfig, ModelConfig, OptimConfig
-from icrl_dist.methods.recipes import METHODS
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import ContextConfig, ModelConfig, OptimConfig
 from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, Windows
 from icrl_dist.models.heads import Gaussian
 from icrl_dist.problems import registry, splits
@@ -19,7 +20,8 @@ from icrl_dist.problems.darkroom import room
 from icrl_dist.problems.darkroom.room import next_cell
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels
 from icrl_dist.rollout import deployment
-from icrl_dist.rollout.deployment import CommittedPolicy, InContextPolicy, deploy_online, episode
+from icrl_dist.rollout.deployment import CommittedPolicy, InContextPolicy
+from icrl_dist.rollout.episode import deploy_online, episode
 from icrl_dist.training import batches, fit
 from icrl_dist.training.batches import Examples, Pool
 from icrl_dist.types import Adversary, Job, Spec, Step, Variation

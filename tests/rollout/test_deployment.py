@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist.config.run import ContextConfig, ModelConfig
+from icrl_dist.config.sections import ContextConfig, ModelConfig
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
+from icrl_dist.models.sampling import sample
 from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import room
-from icrl_dist.rollout.deployment import InContextPolicy, RandomPolicy, deploy_offline, deploy_online, episode, sample
+from icrl_dist.rollout.deployment import InContextPolicy
+from icrl_dist.rollout.episode import deploy_offline, deploy_online, episode
+from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import Adversary, Variation
 
 HORIZON = 6

@@ -3,7 +3,8 @@
 import pytest
 
 from icrl_dist.config.run import ConfigError, load, parse
-from icrl_dist.telemetry.alerts import Alerts, AlertsConfig
+from icrl_dist.config.sections import AlertsConfig
+from icrl_dist.telemetry.alerts import Alerts
 
 
 def told(alerts, silent=None, now=0.0):

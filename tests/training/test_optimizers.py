@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist.config.run import ConfigError, OptimConfig
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import OptimConfig
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.training import batches, fit, optimizers
@@ -28,8 +29,9 @@ def model(small_run):
 
 @pytest.fixture
 def batch(small_run):
-    from icrl_dist.collect import jobs
     from icrl_dist.methods.recipes import METHODS
+
+    from icrl_dist.collect import jobs
 
     method, run = METHODS["dpt"], dataclasses.replace(small_run, method="dpt")
     (phase,) = method.phases(run)

@@ -25,7 +25,7 @@ from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED, Lockstep, apart
 from icrl_dist.experts.sac.reference import Reference
 from icrl_dist.experts.sac.replay import Replay, Transitions
 from icrl_dist.experts.sac.stacked import Shape, outputs
-from icrl_dist.problems.registry import Batch
+from icrl_dist.interfaces import Batch
 from icrl_dist.types import Spec, Step
 
 Products = Literal["float32", "bfloat16"]

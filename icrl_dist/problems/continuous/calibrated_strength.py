@@ -14,8 +14,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from icrl_dist.config.sac import ControlConfig, SACConfig
+from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.toml import ConfigError
+from icrl_dist.problems.continuous.config import ControlConfig
 
 _FORM = re.compile(r"drop:(0?\.\d+|\d+e-\d+)")
 _FIELDS = {"problem": str, "forces": list, "metres": float, "drop": float, "strength": float}

@@ -1,10 +1,9 @@
-"""The override adversary of Dark Room (appendix C.1): its law, exactly, and its priors."""
+"""The override adversary of Dark Room (appendix C.1): its distribution, exactly, and its priors."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import gammainc, gammaln
 
 from icrl_dist.types import NULL, Adversary
 
@@ -12,13 +11,15 @@ ALPHA_RANGE = (0.05, 2.0)
 """Prior of each Dirichlet parameter; the paper gives none (docs/decisions.md)."""
 
 
-def argmax_law(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
+def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     """q_b = P(argmax of x ~ Dirichlet(alpha) is b), to about 1e-9.
 
     x is a normalised vector of independent Gamma(alpha_b), so
     q_b = integral of f_b(t) * prod_{c != b} F_c(t) dt.  With t = exp(y) the integrand is
     smooth and dies off at both ends, where the trapezoid rule converges exponentially.
     """
+    from scipy.special import gammainc, gammaln  # takes a moment, which the command line should not wait for
+
     a = np.asarray(alpha, dtype=np.float64)[:, None]
     y = np.linspace(-120.0, 7.0, 6001)[None, :]
     t = np.exp(y)
@@ -29,7 +30,7 @@ def argmax_law(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     return q / q.sum()
 
 
-def override_law(adversary: Adversary, actions: int) -> tuple[float, Float64[np.ndarray, " A"]]:
+def override_distribution(adversary: Adversary, actions: int) -> tuple[float, Float64[np.ndarray, " A"]]:
     """``(p, q)``: with probability p the executed action is drawn from q.
 
     Raises ValueError if p is outside [0, 1] or the adversary is of another family.
@@ -45,7 +46,7 @@ def override_law(adversary: Adversary, actions: int) -> tuple[float, Float64[np.
         alpha = tuple(float(a) for a in adversary.vector("alpha"))
         if len(alpha) != actions or min(alpha) <= 0:
             raise ValueError(f"adversary alpha={alpha}: expected {actions} numbers above 0, one an action")
-        return p, argmax_law(alpha)
+        return p, argmax_distribution(alpha)
     raise ValueError(f"adversary {adversary.kind!r}: Dark Room knows null, uniform and dirichlet")
 
 

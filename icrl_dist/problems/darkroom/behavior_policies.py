@@ -1,4 +1,4 @@
-"""Behaviour policies: who walks through the contexts of pretraining (pi_b of section 2).
+"""Behavior policies: who walks through the contexts of pretraining (pi_b of section 2).
 
 None of them knows the goal, so a context says of the task only what its transitions say
 (Assumption E.1).
@@ -12,6 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from icrl_dist.problems.darkroom.room import ACTIONS, MOVES, cells
+from icrl_dist.rollout.policies import DiscretePolicy
+
+KINDS = ("random", "persistent", "goals", "sweep")
+"""Names of the policies."""
 
 KEEP = (0.65, 0.95)
 """A persistent walk goes on as before with a probability drawn from here, once an episode."""
@@ -31,7 +35,7 @@ def towards(here: Float[np.ndarray, "B 2"], target: Float[np.ndarray, "B 2"]) ->
     return result
 
 
-class Walks:
+class Walks(DiscretePolicy):
     """One episode of a behavior policy in each of B rows.
 
     ``random``: uniform over the actions.  ``persistent``: the last action again, or a random

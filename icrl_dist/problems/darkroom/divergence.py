@@ -11,29 +11,24 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.special import rel_entr
 
-from icrl_dist.config.run import ConfigError, Run
-from icrl_dist.models.dpt import PretrainedTransformer, Transitions
-from icrl_dist.problems import registry, splits
+from icrl_dist.config.random_keys import RandomKey, generator
+from icrl_dist.config.run import Run
+from icrl_dist.interfaces import Batch, MakePolicy
+from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom.adversaries import adversary_set
 from icrl_dist.problems.darkroom.behavior_policies import Walks
-from icrl_dist.problems.darkroom.room import ACTIONS, cells
-from icrl_dist.problems.darkroom.solver import (
-    Hypotheses,
-    cell_numbers,
-    heuristic_labels,
-    log_likelihood,
-    posterior,
-    posterior_action,
-    soft_labels,
-)
-from icrl_dist.results import evaluate
-from icrl_dist.results.evaluate import MakePolicy, Result
-from icrl_dist.rollout.deployment import deploy_online, episode
-from icrl_dist.types import Task, Variation
+from icrl_dist.problems.darkroom.config import DarkRoomConfig
+from icrl_dist.problems.darkroom.labels import labels_of
+from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom, cells
+from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior, posterior_action
+from icrl_dist.rollout.episode import deploy_online, episode
+from icrl_dist.types import Variation
+
+Decide = Callable[[Sequence[np.ndarray], Float32[np.ndarray, "B N S"], Int64[np.ndarray, "B N"]], Float64[np.ndarray, "B N A"]]
+"""A model's distributions at query states, each given its own prefix of the transitions (``Method.distributions``)."""
 
 KINDS = ("random walk", "persistent walk", "on policy")
 LEVELS = (0.0, 0.2)
@@ -47,13 +42,11 @@ same few, drawn anew from the prior.
 """
 CONTEXTS, EPISODES = 160, 2
 """Contexts of each kind and p, and episodes a context."""
-RESAMPLES = 4000
 _ADVERSARIES = 16
 _CHUNK = 32
-_TRUTH = 104  # a spawn key that no trajectory and no task has (envs.tasks)
 
 
-class Context(NamedTuple):
+class RoomContext(NamedTuple):
     """T transitions of each of B contexts: what ``Transitions`` holds, in numpy."""
 
     observations: Float32[np.ndarray, "B T S"]
@@ -80,10 +73,11 @@ class Divergence:
         return result
 
 
-def variations(run: Run, heldout: bool) -> list[tuple[Variation, ...]]:
+def training_variations(run: Run, heldout: bool) -> list[tuple[Variation, ...]]:
     """The K variations of every training goal, as trained on; of every held-out one, numbered after them."""
-    split = splits.split(run)
-    groups = [splits.variations(run, i, task)[: _count(run)] for i, task in enumerate((*split.train, *split.test))]
+    split = registry.of(run).split
+    tasks = enumerate((*split.train, *split.test))
+    groups = [registry.training_variations(run, i, task)[: _count(run)] for i, task in tasks]
     return groups[len(split.train) :] if heldout else groups[: len(split.train)]
 
 
@@ -98,27 +92,28 @@ def levels(run: Run) -> tuple[float, ...]:
 
 def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
     """What may be true, equally, by each of ``LAWS``: of the training goals, or for held-out contexts of all goals."""
-    groups = variations(run, False) + (variations(run, True) if heldout else [])
-    rng = np.random.default_rng(np.random.SeedSequence(run.seed, spawn_key=(_TRUTH,)))
+    groups = training_variations(run, False) + (training_variations(run, True) if heldout else [])
+    rng = generator(run.seed, RandomKey.POSTERIOR_SUITE)
     sets = range(-(-_ADVERSARIES // _count(run)) if _count(run) > 1 else 1)
     several = [a for _ in sets for a in adversary_set(rng, _count(run), ACTIONS, run.adversary.p_max)]
     own = [v for group in groups for v in group]
     return Hypotheses.of(own), Hypotheses.of([Variation(group[0].task, a) for group in groups for a in several])
 
 
-def divergences(run: Run, model: PretrainedTransformer, heldout: bool) -> Iterator[tuple[Divergence, Divergence]]:
+def divergences(
+    run: Run, config: DarkRoomConfig, decide: Decide, act: MakePolicy, heldout: bool
+) -> Iterator[tuple[Divergence, Divergence]]:
     """T_theta beside the exact posterior by each of ``LAWS``, in contexts of every kind and p."""
-    room, groups = run.darkroom, variations(run, heldout)
+    room, groups = config, training_variations(run, heldout)
     laws = hypotheses(run, heldout)
-    labels = [heuristic_labels(h) if room.labels == "heuristic" else soft_labels(h, room.gamma, room.label_slack) for h in laws]
+    labels = [labels_of(h, room.labels, room.gamma, room.label_slack) for h in laws]
     for level, p in enumerate(levels(run)):
         for number, kind in enumerate(KINDS):
-            seed = np.random.SeedSequence(run.seed, spawn_key=(_TRUTH, int(heldout), level, number))
-            rng = np.random.default_rng(seed)
+            rng = generator(run.seed, RandomKey.POSTERIOR_SUITE, int(heldout), level, number)
             rows = [_disturbed(rng, groups[row % len(groups)], p) for row in range(CONTEXTS)]
-            context = contexts(kind, rows, evaluate.in_context(run, model, "paper"), rng.spawn(CONTEXTS))
+            context = contexts(kind, rows, act, rng.spawn(CONTEXTS))
             query = rng.integers(0, room.size**2, size=(CONTEXTS, 1 + EPISODES * room.horizon))
-            decided = model_decisions(model, context, query, room.size)
+            decided = model_decisions(decide, context, query, room.size)
             met = np.pad(context.rewards.cumsum(axis=1) > 0, ((0, 0), (1, 0)))
             exact = (exact_decisions(h, known, context, query) for h, known in zip(laws, labels, strict=True))
             one, other = (Divergence(kind, p, law, decided, met) for law in exact)
@@ -133,21 +128,22 @@ def _disturbed(rng: np.random.Generator, group: tuple[Variation, ...], p: float)
     return Variation(chosen.task, chosen.adversary.replace(p=p))
 
 
-def contexts(kind: str, rows: Sequence[Variation], act: MakePolicy, rngs: Sequence[np.random.Generator]) -> Context:
+def contexts(kind: str, rows: Sequence[Variation], act: MakePolicy, rngs: Sequence[np.random.Generator]) -> RoomContext:
     """Two episodes in each row: walks from random cells as in training, or deployed as at test."""
     if kind == "on policy":
-        rows = [Variation(splits.deployed(v.task), v.adversary) for v in rows]
-        episodes = list(deploy_online(registry.batch(rows), act(rows), [rngs] * EPISODES))
+        rows = [Variation(v.task.replace(start=(0, 0)), v.adversary) for v in rows]
+        env: Batch = DarkRoom(rows)
+        episodes = list(deploy_online(env, act(rows, env), [rngs] * EPISODES))
     else:
-        env, size = registry.batch(rows), int(rows[0].task.number("size"))
+        env, size = DarkRoom(rows), int(rows[0].task.number("size"))
         walks = [Walks(size, env.spec.horizon, [kind.removesuffix(" walk")] * len(rows), rngs) for _ in range(EPISODES)]
         episodes = [episode(env, walk, rngs) for walk in walks]
     columns = [(e.observations[:, :-1], e.actions.astype(np.int64), e.observations[:, 1:], e.rewards) for e in episodes]
-    return Context(*(np.concatenate(column, axis=1) for column in zip(*columns, strict=True)))
+    return RoomContext(*(np.concatenate(column, axis=1) for column in zip(*columns, strict=True)))
 
 
 def exact_decisions(
-    h: Hypotheses, labels: Float32[np.ndarray, "M C A"], context: Context, query: Int64[np.ndarray, "B N"]
+    h: Hypotheses, labels: Float32[np.ndarray, "M C A"], context: RoomContext, query: Int64[np.ndarray, "B N"]
 ) -> Float64[np.ndarray, "B N A"]:
     """P(a* | cell ``query[b, t]``, the first t transitions of context b), all of ``h`` equally likely before."""
     here, arrived = cell_numbers(context.observations, h.size), cell_numbers(context.next_observations, h.size)
@@ -160,18 +156,15 @@ def exact_decisions(
     return np.stack(result)
 
 
-@torch.inference_mode()
 def model_decisions(
-    model: PretrainedTransformer, context: Context, query: Int64[np.ndarray, "B N"], size: int
+    decide: Decide, context: RoomContext, query: Int64[np.ndarray, "B N"], size: int
 ) -> Float64[np.ndarray, "B N A"]:
-    """T_theta in the same places."""
+    """The model's distributions in the same places."""
     prefix = np.broadcast_to(np.arange(query.shape[1]), query.shape)
     result = []
     for first in range(0, len(query), _CHUNK):
-        chunk = [np.array(a[first : first + _CHUNK]) for a in (*context, cells(size)[query], prefix)]
-        *transitions, queries, seen = (torch.from_numpy(a).to(model.low.device) for a in chunk)
-        logits: torch.Tensor = model(Transitions(*transitions), queries, seen)
-        result.append(logits.double().softmax(dim=-1).cpu().numpy())
+        *transitions, queries, seen = [np.array(a[first : first + _CHUNK]) for a in (*context, cells(size)[query], prefix)]
+        result.append(decide(transitions, queries, seen))
     return np.concatenate(result)
 
 
@@ -210,30 +203,17 @@ def curves(found: Sequence[Divergence], bins: int = 10) -> dict[str, Any]:
     }
 
 
-def gaps(
-    run: Run,
-    act: MakePolicy,
-    goals: Sequence[Task],
-    progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
-) -> dict[str, Any]:
-    """By p: how far the online return of an agent is from the exact agent's under Algorithm 1, as a share of it.
+class PosteriorSuite:
+    """The comparison with the exact posterior, as ``Problem.posterior``."""
 
-    Both meet the same goals, adversaries and chance; the mean is over all episodes.
-    """
-    agents = {"model": act, "exact": evaluate.exact(run, "paper")}
-    results = evaluate.online(run, agents, progress, goals)
-    return {f"{model.p:g}": gap(model, exact, run.seed) for model, exact in zip(results[::2], results[1::2], strict=True)}
+    kinds, priors = KINDS, LAWS
+    levels = staticmethod(levels)
+    summary = staticmethod(summary)
+    curves = staticmethod(curves)
 
+    def __init__(self, config: DarkRoomConfig) -> None:
+        self._config = config
 
-def gap(model: Result, exact: Result, seed: int) -> dict[str, float]:
-    """Ratio of mean returns less 1, with its 95% bootstrap interval: goals, and of each its seeds, drawn anew in pairs."""
-    one, two = (r.returns.mean(axis=2) for r in (model, exact))
-    goals, seeds = one.shape
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_TRUTH,)))
-    chosen = rng.integers(0, goals, size=(RESAMPLES, goals, 1)), rng.integers(0, seeds, size=(RESAMPLES, goals, seeds))
-    if not two.mean() > 0:
-        raise ConfigError(f"the exact agent's return is {two.mean():g} at p = {model.p:g}: no ratio to it; try more --episodes")
-    above = two[chosen].mean(axis=(1, 2))
-    low, high = np.percentile(one[chosen].mean(axis=(1, 2))[above > 0] / above[above > 0] - 1, (2.5, 97.5))
-    means = {"model": float(one.mean()), "exact": float(two.mean())}
-    return {"gap": means["model"] / means["exact"] - 1, "low": float(low), "high": float(high), **means}
+    def divergences(self, run: Run, decide: Decide, act: MakePolicy, heldout: bool) -> Iterator[tuple[Divergence, Divergence]]:
+        """See ``divergences``."""
+        return divergences(run, self._config, decide, act, heldout)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int
 
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior
+from icrl_dist.rollout.policies import DiscretePolicy
 
 Rule = Literal["paper", "every step", "windows", "committed", "zeta"]
 WINDOW = 5
@@ -29,7 +30,7 @@ RULES: dict[Rule, str] = {
 """What tables and figures call the exact agent of each rule."""
 
 
-class ExactAgent:
+class ExactAgent(DiscretePolicy):
     """The agent that Theorem E.3 promises: actions from the exact posterior, no network.
 
     ``paper``: Algorithm 1, a hypothesis a step, the posterior updated at an episode's end.
@@ -123,7 +124,7 @@ def _normalised(weight: Float64[np.ndarray, "B M"]) -> Float64[np.ndarray, "B M"
     return result
 
 
-class OptimalAgent:
+class OptimalAgent(DiscretePolicy):
     """The oracle: knows tau and phi, and follows pi*_{tau,phi} of eq. (5)."""
 
     def __init__(self, labels: Float32[np.ndarray, "B C A"], size: int) -> None:

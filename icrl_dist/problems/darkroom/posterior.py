@@ -8,14 +8,15 @@ mixture of optimal policies that is nearest to them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.room import cells, task
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior, soft_labels
-from icrl_dist.types import Adversary, Variation
+from icrl_dist.types import NULL, Adversary, Variation
 
 Context = Sequence[np.ndarray]
 """Observations (T, S), actions (T), next observations (T, S) and rewards (T): ``rollout.InContextPolicy.context``."""
@@ -100,7 +101,7 @@ def exact(h: Hypotheses, context: Context) -> Float64[np.ndarray, " C"]:
 class Believer(Protocol):
     """Whoever can be asked what it would do anywhere, and what it has seen (``rollout.InContextPolicy``, ``agent``)."""
 
-    def law(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]: ...
+    def distribution(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]: ...
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]: ...
 
@@ -130,8 +131,30 @@ class Room:
 
         Raises ValueError if these refute every hypothesis.
         """
-        found = implied(of.law(self._cells, row)[None], self._policies)
+        found = implied(of.distribution(self._cells, row)[None], self._policies)
         context = of.context(row)
         begin = 0 if last is None else max(0, len(context[1]) - last)
         right = exact(self._h, [column[begin:] for column in context])
         return Belief(by_goal(self._h, found.weight[0]), right, float(found.divergence[0]), len(context[1]))
+
+
+class RoomBelief:
+    """Reads the belief about the goal of one variation, for the monitor plane."""
+
+    def __init__(self, config: DarkRoomConfig, variation: Variation) -> None:
+        task = variation.task
+        adversaries = list(dict.fromkeys((NULL, variation.adversary)))
+        self._size, self._goal = int(task.number("size")), [int(c) for c in task.vector("goal")]
+        self._room = Room(self._size, int(task.number("horizon")), adversaries, config.gamma, config.label_slack)
+
+    def message(self, policy: Believer, row: int) -> dict[str, Any]:
+        """``size``, ``goal``, the implied and the exact distribution over cells, their divergence, the context's length."""
+        belief = self._room.read(policy, row)
+        return {
+            "size": self._size,
+            "goal": self._goal,
+            "implied": [round(float(p), 6) for p in belief.implied],
+            "exact": [round(float(p), 6) for p in belief.exact],
+            "divergence": belief.divergence,
+            "transitions": belief.transitions,
+        }

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float64, Int, UInt8
 
-from icrl_dist.problems.darkroom.adversaries import override_law
+from icrl_dist.problems.darkroom.adversaries import override_distribution
 from icrl_dist.types import Spec, Step, Task, Variation
 
 MOVES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
@@ -83,7 +83,7 @@ class DarkRoom:
         self._goal = np.array([int(g[0]) * size + int(g[1]) for g in (t.vector("goal") for t in tasks)])
         starts = [t.get("start", "random") for t in tasks]
         self._start = np.array([-1 if isinstance(s, (str, int, float)) else int(s[0]) * size + int(s[1]) for s in starts])
-        laws = {a: override_law(a, ACTIONS) for a in {v.adversary for v in variations}}
+        laws = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
         self._p = np.array([laws[v.adversary][0] for v in variations])
         # One uniform number u decides a step: u < p overrides, and u / p picks the action.
         self._edges = np.stack([laws[v.adversary][0] * np.cumsum(laws[v.adversary][1])[:-1] for v in variations])

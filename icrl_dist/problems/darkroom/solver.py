@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
-from icrl_dist.problems.darkroom.adversaries import override_law
+from icrl_dist.problems.darkroom.adversaries import override_distribution
 from icrl_dist.problems.darkroom.room import ACTIONS, MOVES, cells, check, next_cell
 from icrl_dist.types import Trajectory, Variation
 
@@ -40,7 +40,7 @@ class Hypotheses:
         if len(shapes) != 1:
             raise ValueError(f"hypotheses must share one size and horizon, not {sorted(shapes)}")
         (size, horizon) = shapes.pop()
-        known = {a: override_law(a, ACTIONS) for a in {v.adversary for v in variations}}
+        known = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
         laws = [known[v.adversary] for v in variations]
         goal = np.array([int(g[0]) * size + int(g[1]) for g in (v.task.vector("goal") for v in variations)])
         return cls(size, horizon, goal, np.array([p for p, _ in laws]), np.stack([q for _, q in laws]))

@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float32, Float64, Int
 
 from icrl_dist.experts.cache import own_seed
 from icrl_dist.experts.delivery import delivered, labelled, lead, scripted
-from icrl_dist.experts.train import Tell, assembled, unheard
-from icrl_dist.problems import registry
+from icrl_dist.experts.payloads import ScriptedContexts
+from icrl_dist.experts.train import assembled
+from icrl_dist.interfaces import Problem, Progress, no_progress
 from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.rollout.recorder import Recorder
 from icrl_dist.types import Identity, Job, Spec, Trajectory
@@ -29,14 +30,16 @@ LAPSES = 0.03
 LAPSE = 20
 
 
-def scripted_context(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Trajectory]:
+def scripted_context(job: Job, problem: Problem, worker: str, progress: Progress = no_progress) -> Iterator[Trajectory]:
     """Episodes D^{i,k} that the scripted policy leads in each variation, query states and labels.
 
     Of its trials every other one is told the true goal; the rest are told places in the box that goals
     lie in, a new one at some step.  Settings: ``queries`` a trajectory; ``windows``, ``window`` and
     ``decoy_fraction`` as for ``train_expert``.  Raises RuntimeError for a variation whose simulation keeps breaking down.
     """
-    env = registry.batch(job.variations)
+    payload = job.payload
+    assert isinstance(payload, ScriptedContexts)
+    env = problem.batch(job.variations)
     recorder, count = Recorder(env, job.trials, job.trials), len(job.variations)
     goals = np.array([variation.task.vector("goal") for variation in job.variations])
     for trial in range(job.trials):
@@ -44,15 +47,15 @@ def scripted_context(job: Job, worker: str, tell: Tell = unheard) -> Iterator[Tr
         leads = [Lead.drawn(rng, goal, trial % 2 == 0, env.spec) for rng, goal in zip(rngs, goals, strict=True)]
         recorder.reset(rngs)
         for step in range(env.spec.horizon):
-            recorder.step(_actions(env.truth, leads, step))  # type: ignore[attr-defined]
-        tell(f"{count * (trial + 1)} of {count * job.trials} episodes of the scripted policy")
-    columns = labelled(recorder.columns(), None)
-    if int(str(job.setting("windows"))):
-        led = lead(env, None, [own_seed(variation, job.seed) for variation in job.variations], range(count))
+            recorder.step(_actions(problem, env.truth, leads, step))  # type: ignore[attr-defined]
+        progress(f"{count * (trial + 1)} of {count * job.trials} episodes of the scripted policy")
+    columns = labelled(recorder.columns(), problem, None)
+    if payload.labelling.windows:
+        led = lead(env, problem, None, [own_seed(variation, job.seed) for variation in job.variations], range(count))
     else:
         led = {name: column[:, :0] for name, column in columns.items() if name != "adversary"}
-    found = assembled(job, job.variations, columns, led, np.zeros((count, 0), np.float32), tell)
-    yield from delivered(job, found, worker, None)
+    found = assembled(job, job.variations, columns, led, np.zeros((count, 0), np.float32), progress)
+    yield from delivered(job, problem, payload.labelling, found, worker, None)
 
 
 class Lead(NamedTuple):
@@ -87,9 +90,9 @@ def _lapses(rng: np.random.Generator, steps: int, actions: int) -> tuple[Bool[np
     return lapsed, instead
 
 
-def _actions(truth: Float64[np.ndarray, "B S"], leads: list[Lead], step: int) -> Float32[np.ndarray, "B A"]:
+def _actions(problem: Problem, truth: Float64[np.ndarray, "B S"], leads: list[Lead], step: int) -> Float32[np.ndarray, "B A"]:
     """What each row's leader does at this step."""
     told = np.concatenate([truth[:, :-3], np.stack([one.goals[step] for one in leads])], axis=1)
-    noisy = np.clip(scripted(told) + np.stack([one.noise[step] for one in leads]), -1.0, 1.0)
+    noisy = np.clip(scripted(problem, told) + np.stack([one.noise[step] for one in leads]), -1.0, 1.0)
     lapsed = np.array([one.lapsed[step] for one in leads])[:, None]
     return np.where(lapsed, np.stack([one.instead[step] for one in leads]), noisy).astype(np.float32)

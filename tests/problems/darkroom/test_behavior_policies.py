@@ -7,7 +7,7 @@ from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import room
 from icrl_dist.problems.darkroom.behavior_policies import KEEP, Walks, towards
 from icrl_dist.problems.darkroom.room import MOVES
-from icrl_dist.rollout.deployment import episode
+from icrl_dist.rollout.episode import episode
 from icrl_dist.types import Variation
 
 SIZE, HORIZON = 6, 80

@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist.config.run import AdversaryConfig, ConfigError, EvaluateConfig, Run
+from icrl_dist.config.run import ConfigError, Run
+from icrl_dist.config.sections import AdversaryConfig, EvaluateConfig
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom import divergence
-from icrl_dist.problems.darkroom.adversaries import argmax_law
+from icrl_dist.problems.darkroom.adversaries import argmax_distribution
 from icrl_dist.problems.darkroom.divergence import KINDS, LAWS, Context, Divergence
 from icrl_dist.problems.darkroom.exact_agents import ExactAgent
 from icrl_dist.problems.darkroom.room import ACTIONS
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, soft_labels
 from icrl_dist.results import evaluate
 from icrl_dist.results.evaluate import Result
-from icrl_dist.rollout.deployment import RandomPolicy
+from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import NULL, Adversary, Variation
 from tests.problems.darkroom.test_exact_agents import Transition, likelihood
 from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, HORIZON, SIZE, Room, every_cell, normalised, slow_q
@@ -113,7 +114,7 @@ def test_the_first_law_is_the_one_trained_on(run: Run) -> None:
         flat = [v for group in known for v in group]
         assert h.goal.tolist() == [3 * int(v.task.vector("goal")[0]) + int(v.task.vector("goal")[1]) for v in flat]
         assert h.p.tolist() == [0.0 if v.adversary == NULL else v.adversary.number("p") for v in flat]
-        q = [[0.2] * 5 if v.adversary == NULL else argmax_law(v.adversary.vector("alpha")) for v in flat]
+        q = [[0.2] * 5 if v.adversary == NULL else argmax_distribution(v.adversary.vector("alpha")) for v in flat]
         np.testing.assert_allclose(h.q, q)
 
 

@@ -9,12 +9,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from icrl_dist.models.sampling import sample
 from icrl_dist.problems.darkroom import exact_agents, solver
 from icrl_dist.problems.darkroom import room as darkroom
 from icrl_dist.problems.darkroom.exact_agents import RULES, WINDOW, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.problems.darkroom.solver import Hypotheses
-from icrl_dist.rollout.deployment import sample
 from icrl_dist.types import NULL, Adversary, Task, Variation
 from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, normalised, outcomes
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist.agent.in_context_agent import load_agent
-from icrl_dist.config.run import ContextConfig, ModelConfig
+from icrl_dist.agent.loading import load_agent
+from icrl_dist.config.sections import ContextConfig, ModelConfig
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import posterior
@@ -15,7 +15,9 @@ from icrl_dist.problems.darkroom.exact_agents import ExactAgent
 from icrl_dist.problems.darkroom.posterior import Room, by_goal, exact, hypotheses, implied
 from icrl_dist.problems.darkroom.room import cells
 from icrl_dist.problems.darkroom.solver import soft_labels
-from icrl_dist.rollout.deployment import RandomPolicy, episode, in_context
+from icrl_dist.rollout.deployment import in_context
+from icrl_dist.rollout.episode import episode
+from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import NULL, Adversary, Spec, Variation
 
 UNIFORM = Adversary.of("uniform", p=0.3)

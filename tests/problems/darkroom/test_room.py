@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.problems.darkroom import room as darkroom
-from icrl_dist.problems.darkroom.adversaries import argmax_law
+from icrl_dist.problems.darkroom.adversaries import argmax_distribution
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.types import NULL, Adversary, Step, Task, Variation
 
@@ -71,7 +71,7 @@ def test_adversary_takes_over_with_p_and_draws_from_q() -> None:
     size, horizon, rows, p = 203, 100, 60, 0.3
     variation = Variation(darkroom.task((0, 0), size, horizon, start=(101, 101)), MEDDLER)
     direction = {move: b for b, move in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1), (0, 0)])}
-    q, n = argmax_law(ALPHA), horizon * rows
+    q, n = argmax_distribution(ALPHA), horizon * rows
     for a in range(ACTIONS):
         start, steps = play(
             DarkRoom([variation] * rows), range(a * rows, (a + 1) * rows), np.full((horizon, rows), a, np.int64)

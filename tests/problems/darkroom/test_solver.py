@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.problems.darkroom import solver
-from icrl_dist.problems.darkroom.adversaries import argmax_law
+from icrl_dist.problems.darkroom.adversaries import argmax_distribution
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.problems.darkroom.solver import Hypotheses
 from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
@@ -37,7 +37,7 @@ def law_of(variation: Variation) -> tuple[float, list[float]]:
         return 0.0, [0.2] * 5
     if variation.adversary.kind == "uniform":
         return variation.adversary.number("p"), [0.2] * 5
-    return variation.adversary.number("p"), [float(q) for q in argmax_law(variation.adversary.vector("alpha"))]
+    return variation.adversary.number("p"), [float(q) for q in argmax_distribution(variation.adversary.vector("alpha"))]
 
 
 def moved(cell: Cell, action: int, size: int) -> Cell:

@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist.collect import jobs
-from icrl_dist.config.run import AdversaryConfig, ConfigError, load, override
-from icrl_dist.config.sac import ControlConfig
+from icrl_dist.config.run import ConfigError, load, override
+from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import delivery
-from icrl_dist.methods.recipes import METHODS
 from icrl_dist.problems import registry
+from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.metaworld import environment, pick_place, scripted_contexts
 from icrl_dist.problems.metaworld.scripted_contexts import Lead
 from icrl_dist.stream import wire

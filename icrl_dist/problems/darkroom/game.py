@@ -10,16 +10,19 @@ import functools
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.config.run import Run
+from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.posterior import Belief, Room
 from icrl_dist.problems.darkroom.room import ACTIONS, cells, next_cell
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from icrl_dist.types import NULL, Adversary
+
+if TYPE_CHECKING:
+    from icrl_dist.agent.in_context_agent import InContextAgent
 
 EPISODES = 400
 """Returns that are kept and shown."""
@@ -51,7 +54,8 @@ class PlayGame:
 
     def __init__(self, agent: InContextAgent, run: Run, seed: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         """``run``: what the agent was trained by.  ``clock``: seconds, for hands that let go."""
-        room, goals = run.darkroom, agent.manifest.get("test_goals") or [[run.darkroom.size - 1] * 2]
+        room: DarkRoomConfig = run.section("darkroom")
+        goals = agent.manifest.get("test_goals") or [[room.size - 1] * 2]
         self.agent, self.size, self.horizon = agent, room.size, room.horizon
         self.goal, self.p, self.law = int(goals[0][0]) * room.size + int(goals[0][1]), 0.0, _UNIFORM
         self.speed, self.paused, self.keep = 8.0, False, False

@@ -1,0 +1,117 @@
+"""Agents from checkpoints, run folders and the package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from icrl_dist.agent.in_context_agent import InContextAgent
+from icrl_dist.agent.ood_score import calibrate
+from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.run import ConfigError, Deployment, parse
+from icrl_dist.methods import registry as methods
+from icrl_dist.models.outcome_readout import OutcomeModel
+from icrl_dist.models.weights import load_weights
+from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
+from icrl_dist.types import Spec
+
+_AGENTS = Path(str(resources.files("icrl_dist.agent.shipped")))
+SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
+"""Agents that come with the package (docs/results/engine.md says how each was made)."""
+
+
+def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | None = None) -> InContextAgent:
+    """The agent of a run folder (its newest version), of one checkpoint file, or a shipped one by its name.
+
+    ``load_agent("darkroom")`` works at once; a run folder of such a name is ``"./darkroom"``.
+
+    Raises ConfigError if there is no such thing or it was not trained to be deployed so, StoreError
+    if it was not written by this system.  Loading executes no code from the file.
+    """
+    checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
+    manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
+    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint))
+
+
+def shipped(name: str | Path) -> Path:
+    """The checkpoint of an agent that comes with the package.  Raises ConfigError if there is none."""
+    if name not in SHIPPED:
+        raise ConfigError(f"--pretrained {name}: no agent of that name is shipped; there are {', '.join(SHIPPED)}")
+    return _AGENTS / f"{name}.npz"
+
+
+def slim(checkpoint: Checkpoint) -> Checkpoint:
+    """What deployment needs of a checkpoint: the weights and where they come from, not the optimizer or the dataset's list."""
+    manifest = {key: value for key, value in checkpoint.manifest.items() if key != "dataset"}
+    return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith(("model/", "outcomes/"))}, manifest)
+
+
+def is_slim(path: Path) -> bool:
+    """Whether a file is an agent as ``slim`` leaves it: to replace it loses nothing that training needs."""
+    try:
+        checkpoint = load_checkpoint(path)
+    except StoreError:
+        return False
+    kept = slim(checkpoint)
+    return kept.arrays.keys() == checkpoint.arrays.keys() and kept.manifest.keys() == checkpoint.manifest.keys()
+
+
+def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda episodes: None) -> Checkpoint:
+    """The checkpoint with the outcome readout of its model (``ood_score.calibrate``).
+
+    As it is if it has one, or if its method shows no states.
+    """
+    if checkpoint.part("outcomes"):
+        return checkpoint
+    found = trained(checkpoint)
+    if not found.method.shows_states:
+        return checkpoint
+    outcomes = calibrate(found, progress).arrays()
+    arrays = {**checkpoint.arrays, **{f"outcomes/{name}": value for name, value in outcomes.items()}}
+    return Checkpoint(arrays, checkpoint.manifest)
+
+
+def checkpoint_file(what: Path, version: int | None = None) -> Path:
+    """The checkpoint at this path, or this (else the newest) version in a run folder."""
+    if not what.is_dir():
+        if what.is_file():
+            return what
+        raise ConfigError(f"{what}: no such run folder or checkpoint; `icrl-dist train demo` makes one in runs/demo")
+    found = version_file(what, newest_version(what) if version is None else version)
+    if not found.is_file():
+        raise ConfigError(f"{what}: holds no {'checkpoint' if version is None else f'version {version}'} yet")
+    return found
+
+
+def trained(checkpoint: Checkpoint) -> TrainedModel:
+    """The model that a checkpoint holds, with the run that trained it.
+
+    Raises StoreError if the arrays are not those of the model that the manifest describes.
+    """
+    try:
+        run = parse(checkpoint.manifest["run"], "checkpoint")
+        spec, method = spec_from(checkpoint.manifest["spec"]), methods.of(run)
+        model = method.build(spec, run)
+        load_weights(model, checkpoint.part("model"))
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise StoreError(f"checkpoint: not an agent of this version of icrl-dist ({' '.join(str(error).split())})") from None
+    return TrainedModel(run, method, spec, model.eval())
+
+
+def outcomes_of(checkpoint: Checkpoint) -> OutcomeModel | None:
+    """What the checkpoint's model expects to happen; None if it was not calibrated.
+
+    Raises StoreError if its arrays are others than a calibrated checkpoint's.
+    """
+    try:
+        return OutcomeModel.of(checkpoint.part("outcomes"))
+    except TypeError as error:
+        raise StoreError(f"checkpoint: not calibrated by this version of icrl-dist ({error})") from None
+
+
+def spec_from(fields: dict[str, Any]) -> Spec:
+    """The inverse of ``dataclasses.asdict`` after a passage through JSON."""
+    low, high = tuple(fields["low"]), tuple(fields["high"])
+    return Spec(low, high, fields["actions"], fields["horizon"], fields["discrete"])

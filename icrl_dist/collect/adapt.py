@@ -1,0 +1,74 @@
+"""Online rollouts of the in-context policy in each variation (Algorithm 3, line 12; DAgger rounds)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from icrl_dist.collect.trajectories import trajectory, unlabelled
+from icrl_dist.config.ranges import Positive
+from icrl_dist.config.sections import ContextConfig, Deployment
+from icrl_dist.interfaces import Method, Policy, Problem, Weighted
+from icrl_dist.rollout.episode import deploy_online
+from icrl_dist.types import Identity, Job, Payload, Trajectory, Variation
+
+Look = Callable[[Policy, int, Identity, Variation], None]
+"""Called after every decision with the policy, a row of it, and that row's identity and variation; changes nothing."""
+
+
+@dataclass(frozen=True)
+class Rollouts(Payload):
+    """Histories of T^j without labels: its own later actions become labels, by the learner's choice (ICAA)."""
+
+    kind: ClassVar[str] = "adapt"
+    context_max: Positive
+    """As ``context.max``."""
+    deploy: Deployment
+    """The deployment rule."""
+
+
+@dataclass(frozen=True)
+class LabelledRollouts(Rollouts):
+    """Histories of T^j that the problem labels: a DAgger round."""
+
+    kind: ClassVar[str] = "adapt_labelled"
+    labelling: Any
+    """The problem's ``Labelling``."""
+
+
+def rollouts(
+    job: Job, problem: Problem, method: Method, weights: Weighted, worker: str, look: Look | None = None
+) -> Iterator[Trajectory]:
+    """N + 1 trials of T^j in each variation; one T^j, the version that the job names, acts in all of them.
+
+    Raises RuntimeError if a simulation diverges.
+    """
+    payload = job.payload
+    assert isinstance(payload, Rollouts)
+    model, weights_digest = weights.at(job.policy_version)
+    env = problem.batch(job.variations)
+    trial, shown = 0, env.batch - 1
+
+    def watch(*decision: np.ndarray) -> None:
+        if look is not None:
+            look(policy, shown, rows[trial][shown], job.variations[shown])
+
+    context = ContextConfig(max=payload.context_max, keep="all")
+    policy = method.policy(model, env.batch, context, payload.deploy, watch if look else None)
+    labeller = None
+    if isinstance(payload, LabelledRollouts):
+        assert problem.labeller is not None, "validation refuses DAgger rounds of problems without exact answers"
+        labeller = problem.labeller(job, payload.labelling)
+    rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
+    rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
+    for row, draws, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
+        if ran.diverged is not None and ran.diverged.any():
+            lost = [str(identity) for identity, gone in zip(row, ran.diverged, strict=True) if gone]
+            raise RuntimeError(f"{', '.join(lost)}: the simulation diverged, so nothing may be learned from this episode")
+        labelled = labeller(row, draws) if labeller else [unlabelled(env.spec)] * len(row)
+        for b, identity in enumerate(row):
+            yield trajectory(job, identity, ran, b, worker, weights_digest, labelled[b])
+        trial = min(trial + 1, job.trials - 1)

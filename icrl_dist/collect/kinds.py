@@ -1,0 +1,66 @@
+"""Every kind of job, and doing a job of any kind."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from icrl_dist.collect.adapt import LabelledRollouts, Look, Rollouts, rollouts
+from icrl_dist.collect.behavior import BehaviorContexts, behavior_contexts
+from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.experts.train import train_expert
+from icrl_dist.interfaces import JobKind, Method, Problem, Progress, Weighted, no_progress
+from icrl_dist.stream import schema
+from icrl_dist.stream.excerpts import nearest
+from icrl_dist.types import Job, Payload, Trajectory
+
+_WITHOUT_MODEL: dict[str, JobKind] = {
+    BehaviorContexts.kind: JobKind(BehaviorContexts, behavior_contexts),
+    ExpertHistories.kind: JobKind(ExpertHistories, train_expert),
+}
+_WITH_MODEL: dict[str, type[Payload]] = {kind.kind: kind for kind in (Rollouts, LabelledRollouts)}
+
+
+def read_payload(kind: str, problem: Problem, data: Any) -> Payload:
+    """The payload of a job of this kind from plain data, decoded strictly.
+
+    Raises ValueError for an unknown kind, an unknown or missing field, a wrong type or a value out of range.
+    """
+    found = _payloads(problem)
+    if kind not in found:
+        raise ValueError(f"job kind {kind!r}{nearest(kind, list(found))}: this worker has {', '.join(found)}")
+    payload = schema.read(found[kind], data, "payload")
+    labelling = getattr(payload, "labelling", None)
+    if isinstance(labelling, dict):
+        labelling = schema.read(problem.Labelling, labelling, "payload.labelling")
+        payload = dataclasses.replace(payload, labelling=labelling)  # type: ignore[call-arg]
+    return payload
+
+
+def do(
+    job: Job,
+    problem: Problem,
+    method: Method,
+    weights: Weighted,
+    worker: str,
+    progress: Progress = no_progress,
+    look: Look | None = None,
+) -> Iterator[Trajectory]:
+    """Do the job; yields each trajectory when its episode ends.
+
+    ``look`` reads the in-context policy at work, and must leave it unchanged.  Raises ValueError for a job
+    of an unknown kind.
+    """
+    if isinstance(job.payload, Rollouts):
+        return rollouts(job, problem, method, weights, worker, look)
+    kinds = {**_WITHOUT_MODEL, **problem.job_kinds}
+    if job.kind not in kinds:
+        known = [*_WITH_MODEL, *kinds]
+        raise ValueError(f"job kind {job.kind!r}{nearest(job.kind, known)}: this worker has {', '.join(known)}")
+    return kinds[job.kind].do(job, problem, worker, progress)
+
+
+def _payloads(problem: Problem) -> dict[str, type[Payload]]:
+    kinds = {**_WITHOUT_MODEL, **problem.job_kinds}
+    return {**_WITH_MODEL, **{name: kind.payload for name, kind in kinds.items()}}

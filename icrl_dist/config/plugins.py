@@ -1,0 +1,56 @@
+"""Problems and methods by name: ours and those of other installed packages, through entry points.
+
+A package adds a problem with one line in its ``pyproject.toml``::
+
+    [project.entry-points."icrl_dist.problems"]
+    my-problem = "my_package.problem:MyProblem"
+"""
+
+from __future__ import annotations
+
+import functools
+from importlib import metadata
+from typing import Any, Literal
+
+from icrl_dist.config.toml import ConfigError, nearest
+
+Group = Literal["problems", "methods"]
+
+
+@functools.cache
+def _entries(group: Group) -> dict[str, metadata.EntryPoint]:
+    found = metadata.entry_points(group=f"icrl_dist.{group}")
+    return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
+
+
+def names(group: Group) -> tuple[str, ...]:
+    """The names of all installed problems or methods, sorted."""
+    return tuple(_entries(group))
+
+
+@functools.cache
+def find(group: Group, name: str) -> Any:
+    """The class of this name.  Raises ConfigError, with the nearest name, if there is none or if it cannot be imported."""
+    kind = group.removesuffix("s")
+    if name not in names(group):
+        known = f"choose one of {', '.join(names(group))}"
+        raise ConfigError(f"{kind} = {name!r}{nearest(name, names(group))}: {known}")
+    try:
+        return _entries(group)[name].load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{kind} = {name!r}: its package cannot be imported ({error}); reinstall that package") from None
+
+
+@functools.cache
+def sections(problem: str | None) -> dict[str, type]:
+    """The sections of a run file that a problem and the installed methods add: name and dataclass.
+
+    With None the sections of all problems.  Raises ConfigError if two dataclasses share a section's name.
+    """
+    owners = [find("problems", name) for name in (names("problems") if problem is None else (problem,))]
+    owners += [method for method in (find("methods", name) for name in names("methods")) if method.section]
+    found: dict[str, type] = {}
+    for owner in owners:
+        if found.setdefault(owner.section, owner.Config) is not owner.Config:
+            raise ConfigError(f"section [{owner.section}] belongs to {found[owner.section].__module__} and {owner.__module__}")
+    return found

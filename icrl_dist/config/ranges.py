@@ -1,0 +1,27 @@
+"""Ranges that many numbers of a run share; each is written beside the field that it limits."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Interval, Lt
+
+from icrl_dist.stream.schema import Remedy
+
+_ABOVE_0 = Remedy("must be above 0 and finite")
+_NOT_NEGATIVE = Remedy("must not be negative, and be finite")
+
+Positive = Annotated[int, Gt(0), Lt(2**63), _ABOVE_0]
+"""A whole number above 0."""
+PositiveFloat = Annotated[float, Gt(0), _ABOVE_0]
+"""A number above 0."""
+NotNegative = Annotated[int, Ge(0), Lt(2**63), _NOT_NEGATIVE]
+"""A whole number, 0 or more."""
+NotNegativeFloat = Annotated[float, Ge(0), _NOT_NEGATIVE]
+"""A number, 0 or more."""
+Probability = Annotated[float, Interval(ge=0, le=1), Remedy("a probability lies in [0, 1]")]
+"""A probability."""
+Share = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0, 1]")]
+"""A share of a whole."""
+Seed = Annotated[int, Ge(0), Lt(2**63), Remedy("a seed is a whole number from 0 to 2^63 - 1")]
+"""A seed of random numbers."""

@@ -1,0 +1,42 @@
+"""What jobs of SAC experts and scripted policies carry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from icrl_dist.config.ranges import NotNegative, Positive, Share
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.types import Payload
+
+
+@dataclass(frozen=True)
+class ExpertLabelling:
+    """Query states and action windows of a trajectory that an expert labels."""
+
+    queries: Positive
+    """Query states a trajectory."""
+    window: Positive
+    """States of an action window."""
+    windows: NotNegative
+    """Action windows a trajectory."""
+    decoy_fraction: Share
+    """Share of the windows in which another task's expert acts."""
+
+
+@dataclass(frozen=True)
+class ExpertHistories(Payload):
+    """Histories of SAC experts, trained or from the cache."""
+
+    kind: ClassVar[str] = "train_expert"
+    arrives_at_once: ClassVar[bool] = True
+    sac: SACConfig
+    labelling: ExpertLabelling
+
+
+@dataclass(frozen=True)
+class ScriptedContexts(Payload):
+    """Episodes of a scripted policy, with noise."""
+
+    kind: ClassVar[str] = "scripted_context"
+    labelling: ExpertLabelling

@@ -1,0 +1,29 @@
+"""The loss of the DPT family: eq. (1), and with action windows eq. (6)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from icrl_dist.models.dpt import PretrainedTransformer, Transitions, Windows
+from icrl_dist.training.batches import TrainingBatch
+
+
+def batch_loss(model: PretrainedTransformer, batch: TrainingBatch) -> Float[Tensor, ""]:
+    """Eq. (1) over every (prefix, query) pair of a batch, and with windows eq. (6), every label counting the same."""
+    device = model.low.device
+
+    def put(array: object) -> Tensor:
+        return torch.as_tensor(array, device=device)
+
+    context = Transitions(*map(put, (batch.observations, batch.actions, batch.next_observations, batch.rewards)))
+    cache = model.encode(context)
+    total = model.reads.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
+    if batch.windows is not None:
+        states, taken, gained, labels = batch.windows
+        followed = model.follow(Windows(put(states), put(taken), put(gained)), cache, put(batch.window_prefix))
+        count = states.shape[1] * states.shape[2]
+        share = count / (count + batch.prefix.shape[1])
+        total = (1 - share) * total + share * model.reads.loss(followed, put(labels))
+    return total

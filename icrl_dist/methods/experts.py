@@ -1,0 +1,29 @@
+"""``method = "experts"``: only the SAC experts of ICAG's variations are trained and kept, for later runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from icrl_dist.config.run import Run
+from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.interfaces import Draw, Phase, TrajectoryDataset
+from icrl_dist.methods.icag import ICAG
+from icrl_dist.problems import registry
+
+
+class Experts(ICAG):
+    """Collects what ICAG collects, and fits nothing."""
+
+    name = "experts"
+    trains = False
+
+    def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        if not isinstance(registry.of(run).contexts(run).payload, ExpertHistories):
+            yield "method", run.method, f"{run.problem} is pretrained without experts: use dpt, icag or icaa"
+
+    def phases(self, run: Run) -> tuple[Phase, ...]:
+        return (Phase("pretrain", 0, 0, run.optim.learning_rate),)
+
+    def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
+        """Nothing is drawn, because the phase has no steps."""
+        raise ValueError("method 'experts' trains no model")

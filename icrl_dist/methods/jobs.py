@@ -1,0 +1,76 @@
+"""What methods ask for: jobs of pretraining contexts and of rollouts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from icrl_dist.collect.adapt import LabelledRollouts, Rollouts
+from icrl_dist.config.run import Run
+from icrl_dist.config.sections import Deployment
+from icrl_dist.interfaces import Phase
+from icrl_dist.problems import registry
+from icrl_dist.types import Job, Payload, Task, Variation
+
+Choose = Callable[[int, Task], tuple[Variation, ...]]
+"""The variations of training task number i."""
+
+
+def pretraining_contexts(run: Run, phase: Phase, choose: Choose) -> tuple[Job, ...]:
+    """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
+
+    All methods and all K share the same ``pretrain.contexts`` episodes.
+    """
+    problem = registry.of(run)
+    chosen = [choose(i, task) for i, task in enumerate(problem.split.train)]
+    trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
+    contexts = problem.contexts(run)
+    if contexts.most_trials is not None:
+        trials = min(trials, contexts.most_trials)
+    return grouped(run, phase, chosen, trials, contexts.payload)
+
+
+def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], trials: int, payload: Payload) -> tuple[Job, ...]:
+    """Jobs of ``stream.job_tasks`` tasks each, given the K variations of every task."""
+    jobs = []
+    for first in range(0, len(chosen), run.stream.job_tasks):
+        group = chosen[first : first + run.stream.job_tasks]
+        flat = tuple(v for variations in group for v in variations)
+        jobs.append(
+            Job(
+                kind=payload.kind,
+                stage=phase.stage,
+                round=phase.round,
+                task=first,
+                variations=flat,
+                trials=trials,
+                policy_version=phase.policy_version,
+                seed=run.seed,
+                payload=payload,
+                tasks=len(group),
+            )
+        )
+    return tuple(jobs)
+
+
+def rollouts(run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployment) -> tuple[Job, ...]:
+    """T^j is deployed in every variation, from the start of test episodes, without labels."""
+    return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule))
+
+
+def dagger_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment]) -> tuple[Job, ...]:
+    """T^j makes a history in every training variation, started as at test; its queries are labelled as those of D_pre.
+
+    The jobs of one round take the deployment rules in turn, because each rule makes histories of its own kind.
+    """
+    payload = LabelledRollouts(run.context.max, rules[0], registry.of(run).labelling(run))
+    jobs = grouped(run, phase, _at_test_start(run, choose), run.dagger.trials, payload)
+    return tuple(
+        dataclasses.replace(job, payload=dataclasses.replace(payload, deploy=rules[(phase.round + number) % len(rules)]))
+        for number, job in enumerate(jobs)
+    )
+
+
+def _at_test_start(run: Run, choose: Choose) -> list[tuple[Variation, ...]]:
+    problem = registry.of(run)
+    return [choose(i, problem.at_test_start(task)) for i, task in enumerate(problem.split.train)]

@@ -1,0 +1,19 @@
+"""Parameters of a model as numpy arrays, out and in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import nn
+
+
+def weights_of(model: nn.Module) -> dict[str, np.ndarray]:
+    """The parameters as numpy arrays by name: copies, little-endian."""
+    return {name: value.detach().cpu().numpy().copy() for name, value in model.state_dict().items()}
+
+
+def load_weights(model: nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises RuntimeError naming the parameters unless names and shapes are the model's own."""
+    model.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in arrays.items()})

@@ -1,0 +1,132 @@
+"""What DeepMind Control and Meta-World share as problems: vectors of actions, network adversaries, SAC experts."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrl_dist.config.sections import AdversaryConfig
+from icrl_dist.config.toml import ConfigError
+from icrl_dist.experts.payloads import ExpertHistories, ExpertLabelling
+from icrl_dist.interfaces import Batch, Contexts, MakePolicy, Policy, Problem, Reference
+from icrl_dist.problems.continuous import calibrated_strength
+from icrl_dist.problems.continuous.config import ControlConfig
+from icrl_dist.problems.continuous.network_adversary import network, networks
+from icrl_dist.rollout.policies import RandomVectorPolicy
+from icrl_dist.types import Adversary, Variation
+
+if TYPE_CHECKING:
+    from icrl_dist.config.run import Run
+
+EXPERT, SCRIPTED = "SAC expert", "scripted expert"
+"""Names of references: experts of the undisturbed tasks, and a scripted policy of the true states."""
+
+
+class ContinuousProblem(Problem):
+    """A simulated problem whose actions are vectors, disturbed by a network of what is observed."""
+
+    section = "control"
+    Config = ControlConfig
+    Labelling = ExpertLabelling
+    free_in_forks = ("strength", "solved")
+    config: ControlConfig
+
+    @property
+    @abc.abstractmethod
+    def disturbances(self) -> int:
+        """Components of the adversary's action."""
+
+    @property
+    def strength(self) -> float:
+        """Strength of a training adversary: the number given, or what a relative loss comes to."""
+        return calibrated_strength.strength(self.config, self.name)
+
+    @property
+    def train_count(self) -> int:
+        return self.config.train_tasks
+
+    def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
+        return networks(rng, config.count, self.spec, self.disturbances, self.strength)
+
+    def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
+        """A network of another seed, of ``strength`` times ``control.strength``; ``prior`` has no effect."""
+        return network(int(rng.integers(2**31)), self.spec.observation, self.disturbances, strength * self.strength)
+
+    def labelling(self, run: Run) -> ExpertLabelling:
+        of = run.pretrain
+        return ExpertLabelling(
+            queries=of.queries, window=run.model.window, windows=of.windows, decoy_fraction=of.decoy_fraction
+        )
+
+    def contexts(self, run: Run) -> Contexts:
+        """Histories of SAC experts: no more episodes than their training has."""
+        most = max(1, run.sac.steps // self.horizon)
+        return Contexts(ExpertHistories(run.sac, self.labelling(run)), most)
+
+    def references(self, run: Run) -> dict[str, Reference]:
+        return {"random": Reference(_random)}
+
+    def resolved(self) -> ControlConfig:
+        return calibrated_strength.resolved(self.config, self.name)
+
+    def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        of, count = self.config, self.config.train_tasks
+        if isinstance(of.strength, str):
+            try:
+                calibrated_strength.share(of.strength)
+            except ConfigError:
+                yield (
+                    "control.strength",
+                    of.strength,
+                    "write a number, or drop:SHARE, as in drop:0.25: the share of the undisturbed expert's return that is "
+                    "to be lost, above 0 and below 1",
+                )
+        yield from self._own_objections(run)
+        alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
+        if run.pretrain.windows and run.pretrain.decoy_fraction and alone:
+            remedy = (
+                f"0, or a stream.job_tasks that leaves none of the {count} tasks alone in a job: decoys need another's expert"
+            )
+            yield "pretrain.decoy_fraction", run.pretrain.decoy_fraction, remedy
+
+    @abc.abstractmethod
+    def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        """What this problem's simulator does not allow."""
+
+    def manifest(self) -> dict[str, Any]:
+        return {"split_seed": self.config.split_seed, **super().manifest()}
+
+
+def _random(rows: Sequence[Variation], env: Batch) -> Policy:
+    return RandomVectorPolicy()
+
+
+def experts_of(problem: Problem, run: Run) -> MakePolicy | None:
+    """The SAC experts of the evaluated tasks, undisturbed, if all of them are in the cache of this machine."""
+    from icrl_dist.experts import cache
+    from icrl_dist.experts.train import ExpertPolicy
+
+    asked = {task: cache.any_kept(Variation(task), problem.horizon, run.sac, run.seed) for task in problem.evaluated}
+    found = {task: history for task, history in asked.items() if history is not None}
+    if len(found) < len(asked):
+        return None
+    return lambda rows, env: ExpertPolicy([found[row.task] for row in rows], run.sac)
+
+
+def missing_experts(problem: Problem, run: Run, what: str) -> str:
+    """Why no expert stands beside the models, and the command that trains them; empty if they are there."""
+    from icrl_dist.experts import cache
+
+    if not run.sac.cache:
+        return "no SAC expert stands beside the models: with sac.cache = '' none is kept"
+    missing = [
+        task for task in problem.evaluated if cache.any_kept(Variation(task), problem.horizon, run.sac, run.seed) is None
+    ]
+    if not missing:
+        return ""
+    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this machine"
+    train = f"icrl-dist train experts-{what} --out OTHER"
+    return f"no SAC expert stands beside the models: {where}; `{train}` trains them"

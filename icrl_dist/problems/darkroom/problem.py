@@ -1,0 +1,219 @@
+"""Dark Room as a ``Problem``: exact labels, exact agents, override adversaries."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from icrl_dist.collect.behavior import BehaviorContexts
+from icrl_dist.config.random_keys import RandomKey, generator
+from icrl_dist.config.sections import AdversaryConfig
+from icrl_dist.interfaces import (
+    Batch,
+    BeliefReader,
+    Contexts,
+    Labeller,
+    MakeBehavior,
+    MakeDrawing,
+    MakePolicy,
+    Policy,
+    Problem,
+    Reference,
+)
+from icrl_dist.problems.darkroom import picture, room
+from icrl_dist.problems.darkroom.adversaries import adversary_set, sample_dirichlet
+from icrl_dist.problems.darkroom.behavior_policies import KINDS, Walks
+from icrl_dist.problems.darkroom.config import DarkRoomConfig
+from icrl_dist.problems.darkroom.exact_agents import RULES, ExactAgent, OptimalAgent, Rule
+from icrl_dist.problems.darkroom.labels import RoomLabeller, RoomLabelling
+from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, optimal_returns, soft_labels
+from icrl_dist.rollout.policies import RandomPolicy
+from icrl_dist.types import Adversary, Job, Spec, Split, Task, Variation
+
+if TYPE_CHECKING:
+    from icrl_dist.config.run import Run
+
+ORACLE = "oracle"
+
+
+class ExactRoom:
+    """Exact answers of one kind of room."""
+
+    def __init__(self, config: DarkRoomConfig) -> None:
+        self._config = config
+        self._known: dict[Adversary, tuple[Hypotheses, Float32[np.ndarray, "M C A"]]] = {}
+
+    def optimum(self, variations: Sequence[Variation]) -> Float64[np.ndarray, " M"]:
+        """Expected return of the optimal policy from the origin, by value iteration."""
+        return optimal_returns(Hypotheses.of(variations))
+
+    def optimal(
+        self, variation: Variation, states: Float32[np.ndarray, "Q 2"], labels: Float32[np.ndarray, "Q A"]
+    ) -> Float[np.ndarray, " Q"]:
+        """1 where the most probable action of a label is among the optimal ones, else 0."""
+        hypotheses = Hypotheses.of([variation])
+        best = soft_labels(hypotheses, self._config.gamma, self._config.label_slack)[0]
+        good: Float[np.ndarray, " Q"] = (best[cell_numbers(states, hypotheses.size), labels.argmax(axis=1)] > 0).astype(float)
+        return good
+
+    def agent(self, run: Run, rule: str) -> MakePolicy:
+        """The exact agent that knows every row's adversary; each cell is the goal with equal probability."""
+
+        def make(rows: Sequence[Variation], env: Batch) -> ExactAgent:
+            adversaries = list(dict.fromkeys(v.adversary for v in rows))
+            families, labels = zip(*(self._any_goal(a) for a in adversaries), strict=True)
+            chosen: Rule = rule  # type: ignore[assignment]
+            return ExactAgent(families, labels, np.array([adversaries.index(v.adversary) for v in rows]), chosen)
+
+        return make
+
+    def _any_goal(self, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
+        """Every goal under this adversary, with its labels; the newest adversaries are kept."""
+        if adversary not in self._known:
+            size, horizon = self._config.size, self._config.horizon
+            goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
+            hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
+            self._known[adversary] = hypotheses, soft_labels(hypotheses, self._config.gamma, self._config.label_slack)
+            if len(self._known) > 64:
+                del self._known[next(iter(self._known))]
+        return self._known[adversary]
+
+
+class DarkRoomProblem(Problem):
+    """A hidden goal in a square room (appendix C.1)."""
+
+    section = "darkroom"
+    Config = DarkRoomConfig
+    Labelling = RoomLabelling
+    earns_in_contexts: ClassVar[bool] = False  # a random walk may never meet the goal
+    config: DarkRoomConfig
+
+    def spec_of(self, task: Task) -> Spec:
+        return room.spec(task)
+
+    @property
+    def horizon(self) -> int:
+        return self.config.horizon
+
+    @property
+    def train_count(self) -> int:
+        return round(self.config.train_fraction * self.config.size**2)
+
+    def make_split(self) -> Split:
+        """All goals, shuffled by ``split_seed``, cut at ``train_fraction``."""
+        of = self.config
+        goals = [(x, y) for x in range(of.size) for y in range(of.size)]
+        order = generator(of.split_seed, RandomKey.SPLIT).permutation(len(goals))
+        tasks = [room.task(goals[i], of.size, of.horizon) for i in order]
+        return Split(tuple(tasks[: self.train_count]), tuple(tasks[self.train_count :]))
+
+    def batch(self, variations: Sequence[Variation]) -> Batch:
+        return room.DarkRoom(variations)
+
+    def at_test_start(self, task: Task) -> Task:
+        """Every test episode starts in the origin (appendix C.1)."""
+        return task.replace(start=(0, 0))
+
+    def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
+        return adversary_set(rng, config.count, room.ACTIONS, config.p_max)
+
+    def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
+        """``uniform``: q_b = 1/5 (Figures 3c, 6c); ``unseen``: a Dirichlet prior never trained on (Figures 3d, 6d)."""
+        if prior == "uniform":
+            return Adversary.of("uniform", p=strength)
+        return sample_dirichlet(rng, room.ACTIONS, 1.0).replace(p=strength)
+
+    def labelling(self, run: Run) -> RoomLabelling:
+        of, windows = self.config, run.pretrain.windows
+        goals = (task.vector("goal") for task in self.split.train)
+        decoys = tuple(int(x) * of.size + int(y) for x, y in goals) if windows else ()
+        return RoomLabelling(
+            labels=of.labels,
+            gamma=of.gamma,
+            slack=of.label_slack,
+            queries=run.pretrain.queries,
+            window=run.model.window,
+            windows=windows,
+            decoy_fraction=run.pretrain.decoy_fraction,
+            decoys=decoys,
+        )
+
+    def contexts(self, run: Run) -> Contexts:
+        return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
+
+    def references(self, run: Run) -> dict[str, Reference]:
+        """A random policy, the exact agent by each rule, and the oracle that knows goal and adversary."""
+
+        def random(rows: Sequence[Variation], env: Batch) -> Policy:
+            return RandomPolicy(room.ACTIONS)
+
+        def optimal(rows: Sequence[Variation], env: Batch) -> Policy:
+            hypotheses = Hypotheses.of(rows)
+            return OptimalAgent(soft_labels(hypotheses, self.config.gamma, slack=0.0), hypotheses.size)
+
+        exact = {name: Reference(self.exact.agent(run, rule)) for rule, name in RULES.items()}
+        return {"random": Reference(random), **exact, ORACLE: Reference(optimal, ceiling=True)}
+
+    def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        of = self.config
+        if not 0 < self.train_count < of.size**2:
+            yield "darkroom.train_fraction", of.train_fraction, "leave goals to train and to test"
+        for name in run.pretrain.behaviors:
+            if name not in KINDS:
+                yield "pretrain.behaviors", run.pretrain.behaviors, f"choose from {', '.join(KINDS)}"
+
+    def title(self, tasks: int) -> str:
+        return f"{tasks} held-out goals of a {self.config.size}x{self.config.size} Dark Room"
+
+    def manifest(self) -> dict[str, Any]:
+        goals = [[int(c) for c in task.vector("goal")] for task in self.split.test]
+        return {"split_seed": self.config.split_seed, "size": self.config.size, "test_goals": goals}
+
+    @functools.cached_property
+    def exact(self) -> ExactRoom:
+        return ExactRoom(self.config)
+
+    @property
+    def labeller(self) -> Callable[[Job, RoomLabelling], Labeller]:
+        return RoomLabeller
+
+    @property
+    def behavior(self) -> MakeBehavior:
+        """Walks through the room, one named kind a row."""
+
+        def walks(names: Sequence[str], rngs: Sequence[np.random.Generator], env: Batch) -> Policy:
+            return Walks(round(env.spec.high[0]) + 1, env.spec.horizon, names, rngs)
+
+        return walks
+
+    @property
+    def belief(self) -> Callable[[Variation], BeliefReader]:
+        from icrl_dist.problems.darkroom.posterior import RoomBelief
+
+        return functools.partial(RoomBelief, self.config)
+
+    @property
+    def drawing(self) -> MakeDrawing:
+        return picture.drawing
+
+    @property
+    def message_optimum(self) -> Callable[[Mapping[str, Any], Mapping[str, Any]], float | None]:
+        return picture.message_optimum
+
+    @property
+    def posterior(self) -> Any:
+        """The comparison with the exact posterior (``problems.darkroom.divergence``)."""
+        from icrl_dist.problems.darkroom.divergence import PosteriorSuite
+
+        return PosteriorSuite(self.config)
+
+    @property
+    def game(self) -> Any:
+        """``icrl-dist play`` in a room (``problems.darkroom.game``)."""
+        from icrl_dist.problems.darkroom.game import PlayGame
+
+        return PlayGame

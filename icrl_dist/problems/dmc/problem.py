@@ -1,0 +1,93 @@
+"""A problem of the DeepMind Control Suite as a ``Problem`` (appendix C.3)."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrl_dist.config.random_keys import RandomKey, generator
+from icrl_dist.interfaces import Batch, MakeDrawing, Reference
+from icrl_dist.problems.continuous.problem import EXPERT, ContinuousProblem, experts_of, missing_experts
+from icrl_dist.problems.dmc import domains
+from icrl_dist.types import Spec, Split, Task, Variation
+
+if TYPE_CHECKING:
+    from icrl_dist.config.run import Run
+
+_TASKS = domains.GRID**2
+
+
+class DMCProblem(ContinuousProblem):
+    """One task of one domain, varied over a grid of two physical parameters."""
+
+    template = "dmc"
+
+    def spec_of(self, task: Task) -> Spec:
+        return domains.spec(task)
+
+    @property
+    def horizon(self) -> int:
+        return self.config.horizon or domains.HORIZON
+
+    @property
+    def disturbances(self) -> int:
+        return domains.problem(self.name).forces[self.config.forces].count
+
+    def make_split(self) -> Split:
+        """Training tasks: the centre of the grid of parameters; test tasks: others of the grid, drawn by ``split_seed``."""
+        of = self.config
+        middle = domains.grid(self.name, math.isqrt(of.train_tasks))
+        others = [task for task in domains.grid(self.name) if task not in middle]
+        order = generator(of.split_seed, RandomKey.SPLIT).permutation(len(others))
+        outer = [others[i] for i in order[: of.test_tasks]]
+        horizon = {"horizon": of.horizon} if of.horizon else {}
+        train, test = (tuple(task.replace(forces=of.forces, **horizon) for task in part) for part in (middle, outer))
+        return Split(train, test)
+
+    @property
+    def evaluated(self) -> tuple[Task, ...]:
+        """As in the paper (appendix D.4) the tasks that the experts were trained in."""
+        return self.split.train
+
+    def batch(self, variations: Sequence[Variation]) -> Batch:
+        from icrl_dist.problems.dmc.simulation import Variations  # MuJoCo takes a moment to import
+
+        return Variations(variations)
+
+    def references(self, run: Run) -> dict[str, Reference]:
+        """A random policy, and the experts of the undisturbed tasks where this machine has them."""
+        experts = experts_of(self, run)
+        return super().references(run) | ({} if experts is None else {EXPERT: Reference(experts, ceiling=True)})
+
+    def missing_reference(self, run: Run, what: str) -> str:
+        return missing_experts(self, run, what)
+
+    def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        of, count = self.config, self.config.train_tasks
+        if of.histories == "scripted":
+            yield "control.histories", of.histories, "only Meta-World has a scripted policy"
+        if count not in (4, 16, 36):
+            yield "control.train_tasks", count, "the centre of the grid has 4, 16 or 36 tasks"
+        elif of.test_tasks > _TASKS - count:
+            yield "control.test_tasks", of.test_tasks, f"the grid has {_TASKS - count} others"
+
+    def title(self, tasks: int) -> str:
+        return f"{tasks} training tasks of {self.name}"
+
+    @property
+    def drawing(self) -> MakeDrawing:
+        return functools.partial(_sticks, self.name)
+
+
+def _sticks(name: str, states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
+    """A ``sticks`` drawing: ``frames`` of segments ``[x0, y0, x1, y1]`` in metres, ``frame_s`` apart, ``force`` in 0..1."""
+    if states.shape[1] != len(domains.problem(name).scale):
+        raise ValueError(f"{states.shape[1]} observation components are not those of {name}")
+    from icrl_dist.problems.dmc import picture
+
+    force = [round(float(value), 3) for value in np.minimum(adversary, 1.0)]
+    return {"kind": "sticks", "frames": picture.sticks(name, states), "frame_s": every * picture.step_s(name), "force": force}

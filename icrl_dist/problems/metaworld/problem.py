@@ -1,0 +1,120 @@
+"""Meta-World's ML1 pick-place as a ``Problem`` (appendix C.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from icrl_dist.experts.payloads import ScriptedContexts
+from icrl_dist.interfaces import Batch, Contexts, JobKind, MakeDrawing, Policy, Problem, Progress, Reference
+from icrl_dist.problems.continuous.problem import SCRIPTED, ContinuousProblem
+from icrl_dist.problems.metaworld import pick_place
+from icrl_dist.types import Job, Spec, Split, Task, Trajectory, Variation
+
+if TYPE_CHECKING:
+    from icrl_dist.config.run import Run
+
+_TASKS = 50
+"""Training tasks that ML1 has."""
+_HAND, _OBJECT = slice(0, 2), slice(4, 6)
+"""Where the observation has x and y of hand and object."""
+
+
+def _scripted_context(job: Job, problem: Problem, worker: str, progress: Progress) -> Iterator[Trajectory]:
+    from icrl_dist.problems.metaworld.scripted_contexts import scripted_context  # with torch, which a run file needs not
+
+    return scripted_context(job, problem, worker, progress)
+
+
+class MetaWorldProblem(ContinuousProblem):
+    """A hidden goal to which an object has to be carried; an adversary disturbs the observation."""
+
+    template: ClassVar[str] = ""
+    job_kinds: ClassVar[Mapping[str, JobKind]] = {ScriptedContexts.kind: JobKind(ScriptedContexts, _scripted_context)}
+
+    def spec_of(self, task: Task) -> Spec:
+        return pick_place.spec(task)
+
+    @property
+    def horizon(self) -> int:
+        return self.config.horizon or pick_place.HORIZON
+
+    @property
+    def spec(self) -> Spec:  # without ML1, which takes seconds to make its tasks
+        place = {"object": (0.0, 0.6, 0.02), "goal": (0.0, 0.8, 0.1)}
+        return self.spec_of(Task.of(pick_place.KIND, **place, horizon=self.horizon))
+
+    @property
+    def disturbances(self) -> int:
+        return pick_place.MOVED
+
+    def make_split(self) -> Split:
+        """Training tasks: the first of ML1's, in its order for ``split_seed``; test tasks: the next."""
+        from icrl_dist.problems.metaworld.environment import ml1_tasks
+
+        of = self.config
+        chosen = ml1_tasks(of.train_tasks + of.test_tasks, of.split_seed)
+        horizon = {"horizon": of.horizon} if of.horizon else {}
+        chosen = tuple(task.replace(disturbance=of.disturbance, **horizon) for task in chosen)
+        return Split(chosen[: of.train_tasks], chosen[of.train_tasks :])
+
+    def batch(self, variations: Sequence[Variation]) -> Batch:
+        from icrl_dist.problems.metaworld.environment import PickPlace  # MuJoCo takes a moment to import
+
+        return PickPlace(variations)
+
+    def contexts(self, run: Run) -> Contexts:
+        """Episodes of the scripted policy, or histories of SAC experts, by ``control.histories``."""
+        if self.config.histories == "scripted":
+            return Contexts(ScriptedContexts(self.labelling(run)))
+        return super().contexts(run)
+
+    def references(self, run: Run) -> dict[str, Reference]:
+        """A random policy, and the scripted policy that reads the true state, goal included."""
+        from icrl_dist.experts.train import ScriptedPolicy
+
+        def scripted(rows: Sequence[Variation], env: Batch) -> Policy:
+            return ScriptedPolicy(self, env)
+
+        return super().references(run) | {SCRIPTED: Reference(scripted, ceiling=True)}
+
+    @property
+    def scripted(self) -> Callable[[Float[np.ndarray, "N T"]], Float32[np.ndarray, "N A"]]:
+        """Meta-World's scripted policy, given true states that show the goal."""
+        from icrl_dist.problems.metaworld.environment import expert
+
+        return expert
+
+    def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        of, most = self.config, _TASKS - self.config.test_tasks
+        if of.train_tasks > most:
+            yield "control.train_tasks", of.train_tasks, f"ML1 has {_TASKS} tasks: use 1 to {most}, or test fewer"
+        if of.horizon > pick_place.HORIZON:
+            yield "control.horizon", of.horizon, f"Meta-World allows at most {pick_place.HORIZON} steps"
+        if isinstance(of.strength, str) and of.disturbance == 0:
+            yield "control.disturbance", of.disturbance, "a drop needs a distance to multiply"
+        if run.method == "experts" and of.histories == "scripted":
+            yield "control.histories", of.histories, "experts are made for sac"
+
+    @property
+    def drawing(self) -> MakeDrawing:
+        return _paths
+
+
+def _paths(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
+    """A ``paths`` drawing: named lists of points from above in metres, and ``goal``."""
+    goal = task.get("goal")
+    if not isinstance(goal, (list, tuple)) or len(goal) != 3 or not all(type(c) in (int, float) for c in goal):
+        raise ValueError("no pick-place episode")
+    if states.shape[1] < 7 or not np.isfinite(goal).all():
+        raise ValueError("no pick-place episode")
+    drawn = {"hand": _HAND, "object": _OBJECT}
+    paths = [{"name": name, "points": [_rounded(p) for p in states[:, place]]} for name, place in drawn.items()]
+    return {"kind": "paths", "paths": paths, "goal": _rounded(np.array(goal[:2]))}
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [round(float(value), 3) for value in values]
