@@ -34,7 +34,7 @@ LOCAL_ACTORS = 2
 def train(arguments: Train, console: Console) -> int:
     """``icrl-dist train``: both programs to their end, then the evaluation."""
     from actors.fleet import check_cores
-    from icrl_dist.console.terminal import Display
+    from icrl_dist.console.display import Display
     from icrl_dist.launch import run_folder
     from icrl_dist.launch import train as launch
     from icrl_dist.storage.files import atomic_write, hold
@@ -117,7 +117,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     """``icrl-dist evaluate``: per-episode returns beside the oracle's."""
     from icrl_dist.agent.in_context_agent import checkpoint_file
     from icrl_dist.config.run import default_deployment, parse
-    from icrl_dist.console.terminal import Display
+    from icrl_dist.console.display import Display
     from icrl_dist.results import heldout
     from icrl_dist.storage.files import load_checkpoint
 
@@ -165,7 +165,7 @@ def _evaluated(arguments: Evaluate) -> tuple[Path, Path]:
 def export(arguments: Export, console: Console) -> int:
     """``icrl-dist export``: an agent without what only training needs."""
     from icrl_dist.agent.in_context_agent import checkpoint_file, is_slim, slim
-    from icrl_dist.console.terminal import Display
+    from icrl_dist.console.display import Display
     from icrl_dist.results import heldout
     from icrl_dist.storage.files import save_checkpoint
 

@@ -16,13 +16,14 @@ from icrl_dist.agent import ood_score
 from icrl_dist.agent.in_context_agent import calibrated, checkpoint_file, model_of, outcomes_of
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.config.run import Deployment, Run, default_deployment
-from icrl_dist.console.terminal import Display, experts_table, gap_table, kl_table, returns_table
+from icrl_dist.console.display import Display
 from icrl_dist.experts import cache
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom import divergence
 from icrl_dist.problems.darkroom.exact_agents import RULES
 from icrl_dist.results import evaluate, plots
+from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.rollout import deployment
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.files import Checkpoint, atomic_write, load_checkpoint, save_checkpoint

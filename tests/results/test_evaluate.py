@@ -13,7 +13,6 @@ from icrl_dist import InContextAgent, make
 from icrl_dist.agent.in_context_agent import load_agent
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, ContextConfig, EvaluateConfig
-from icrl_dist.console.terminal import returns_table
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom import divergence, room
@@ -22,6 +21,7 @@ from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft
 from icrl_dist.problems.registry import spec
 from icrl_dist.results import evaluate
 from icrl_dist.results.statistics import mean_and_error
+from icrl_dist.results.tables import returns_table
 from icrl_dist.storage.files import Checkpoint, StoreError, save_checkpoint, version_file
 from icrl_dist.types import Variation
 from learner import checkpoints
