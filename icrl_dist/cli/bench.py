@@ -1,20 +1,74 @@
-"""What ``icrl-dist bench`` does with its arguments."""
+"""``icrl-dist bench``."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
+import tyro
 from rich.console import Console
 
-from icrl_dist.cli.commands import FAILED, OK
+from icrl_dist.cli.exit_codes import FAILED, OK
 from icrl_dist.config.run import ConfigError
 
-if TYPE_CHECKING:
-    from icrl_dist.cli.arguments import Bench
+
+@dataclass(frozen=True)
+class BenchArguments:
+    """Measure one part of the system on this machine, beside what it is compared with."""
+
+    name: tyro.conf.Positional[
+        Literal[
+            "env",
+            "stream",
+            "ingest",
+            "scale",
+            "broadcast",
+            "recovery",
+            "soak",
+            "fuzz",
+            "incontext",
+            "experts",
+            "disturbance",
+            "monitor",
+        ]
+    ]
+    """``env``: environment steps a second, of simulated problems beside their library's own loop;
+    ``stream``: trajectories a second through the stream and, in the same run, as Ray actor returns;
+    ``ingest``: trajectories a second onto the disk, with and without fsync; ``scale``: the same from
+    1 to 256 simulated workers; ``broadcast``: weights
+    to eight processes, beside ``ray.put`` and ``get``; ``recovery``: how soon a run is at work again
+    after a worker or the learner was killed; ``soak``: does any process of a long run grow;
+    ``fuzz``: 100,000 hostile inputs to every reader of bytes; ``incontext``: deployment and
+    training of the model, beside DPT's official layout; ``experts``: updates of experts in
+    lockstep, beside stable-baselines3; ``disturbance``: the return that an undisturbed expert loses
+    under each default adversary; ``monitor``: what it costs a run to be watched, and a view to watch a
+    thousand streams."""
+    problem: str | None = None
+    """Which environment: one such as ``dmc-cheetah-run`` (env: ``darkroom`` if not given;
+    disturbance: every simulated one)."""
+    seconds: float | None = None
+    """How long to measure (env, stream, ingest, scale and soak)."""
+    quick: bool = False
+    """One seed instead of three (incontext), 3 turns instead of 15 (experts), experts that have learned
+    little and 3 episodes instead of 10 (disturbance), 2 pairs of short windows instead of 8 (monitor)."""
+    drop: float | None = None
+    """disturbance: instead, the strength at which that share of the return is lost, as in 0.25; solved once
+    a problem and kept for ``control.strength`` of later runs, as ``drop:0.25``."""
+    steps: int | None = None
+    """Steps of the experts' training (disturbance --drop), or those of it with updates (experts --device cuda)."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """experts: ``cuda`` measures 160 experts on a GPU beside stable-baselines3 on one core, and trains an
+    expert set of the paper for a while to tell how long it takes; ``auto``: on a GPU if there is one."""
+    folder: Path = Path("runs")
+    """Whose disk to write to (ingest, scale, recovery), where to put the figure (soak, incontext) or an
+    input that breaks something (fuzz), where to keep finished trainings (incontext)."""
+    json: bool = False
+    """Print one JSON object on the last line."""
 
 
-def bench(arguments: Bench, console: Console) -> int:
+def bench(arguments: BenchArguments, console: Console) -> int:
     """``icrl-dist bench``: one benchmark."""
     from icrl_dist.bench import (
         broadcast,

@@ -14,23 +14,24 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from icrl_dist.cli import arguments, bench, commands
-from icrl_dist.cli.commands import FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, train
+from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.storage.fork import parse_source
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
-    "train": (arguments.Train, commands.train),
-    "evaluate": (arguments.Evaluate, commands.evaluate),
-    "monitor": (arguments.Monitor, commands.monitor),
-    "tap": (arguments.Tap, commands.tap),
-    "bench": (arguments.Bench, bench.bench),
-    "explain": (arguments.Explain, commands.explain),
-    "export": (arguments.Export, commands.export),
-    "chaos": (arguments.Chaos, commands.chaos),
-    "play": (arguments.Play, commands.play),
-    "doctor": (arguments.Doctor, commands.doctor),
-    "plan": (arguments.Plan, commands.plan),
+    "train": (train.TrainArguments, train.train),
+    "evaluate": (evaluate.EvaluateArguments, evaluate.evaluate),
+    "monitor": (monitor.MonitorArguments, monitor.monitor),
+    "tap": (monitor.TapArguments, monitor.tap),
+    "bench": (bench.BenchArguments, bench.bench),
+    "explain": (explain.ExplainArguments, explain.explain),
+    "export": (export.ExportArguments, export.export),
+    "chaos": (chaos.ChaosArguments, chaos.chaos),
+    "play": (play.PlayArguments, play.play),
+    "doctor": (doctor.DoctorArguments, doctor.doctor),
+    "plan": (plan.PlanArguments, plan.plan),
 }
 
 
@@ -43,11 +44,11 @@ def _help() -> str:
 def _parse(name: str, words: Sequence[str]) -> Any:
     kind, prog = COMMANDS[name][0], f"icrl-dist {name}"
     found: Any = tyro.cli(kind, prog=prog, args=list(words))
-    if isinstance(found, arguments.Train) and (found.run or found.source):
+    if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
         base = load(found.run or str(parse_source(found.source or "")[0] / "run.toml"))
         return tyro.cli(
-            kind, prog=prog, args=list(words), default=arguments.Train(run=found.run, given=tuple(words), config=base)
+            kind, prog=prog, args=list(words), default=TrainArguments(run=found.run, given=tuple(words), config=base)
         )
     return found
 

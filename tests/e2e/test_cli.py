@@ -14,7 +14,8 @@ from importlib import metadata
 import pytest
 
 from icrl_dist.agent import in_context_agent
-from icrl_dist.cli import commands, main
+from icrl_dist.cli import main
+from icrl_dist.cli.train import _resuming
 from icrl_dist.launch import train
 from icrl_dist.results import heldout
 
@@ -200,7 +201,7 @@ def test_an_evaluation_that_is_stopped_says_how_to_go_on(monkeypatch, tmp_path, 
     ],
 )
 def test_the_command_that_goes_on_is_the_one_that_was_given(given, printed):
-    assert commands._resuming(shlex.split(given)) == f"icrl-dist train {printed}"
+    assert _resuming(shlex.split(given)) == f"icrl-dist train {printed}"
 
 
 def test_a_run_stopped_before_it_began_promises_no_checkpoint(monkeypatch, tmp_path, capsys):
