@@ -1,4 +1,4 @@
-"""``icrl-dist chaos``."""
+"""``icrl-dist chaos``: deliberate faults in a small run."""
 
 from __future__ import annotations
 
@@ -15,50 +15,49 @@ from icrl_dist.config.run import ConfigError
 
 @dataclass(frozen=True)
 class ChaosArguments:
-    """Disturb a small job on a seeded schedule: every digest must equal the undisturbed run's.
+    """Inject faults into a small run on a seeded schedule: every digest must equal the undisturbed run's.
 
-    RUN is run once undisturbed, then once for each fault: kill-worker, kill-learner and
-    kill-tree (SIGKILL), stop-learner (SIGSTOP for 15 s), cut-link (12 s of silence), torn-tail
-    and flip-byte (a damaged dataset), full-disk (needs root, or user namespaces).  A fault that
-    did not land, for nothing died, was sent again or was repaired, fails the command as another
-    digest does.  ``icrl-dist chaos smoke`` takes some minutes on two cores.
+    RUN is run once undisturbed, then once with each fault: kill-worker, kill-learner and
+    kill-tree (SIGKILL), stop-learner (SIGSTOP for 15 s), cut-link (no traffic for 12 s), torn-tail
+    and flip-byte (a damaged dataset), full-disk (needs root, or user namespaces).  The command
+    fails if a digest differs, and also if a fault had no effect: no process died, nothing was sent
+    again, nothing was repaired.  ``icrl-dist chaos smoke`` takes some minutes on two cores.
     """
 
     run: tyro.conf.Positional[str] = "smoke"
     """Name of a packaged run, or path of a run file."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """SECTION.NAME=VALUE, as in icaa.trials=60; may be given many times."""
+    """SECTION.NAME=VALUE, such as icaa.trials=60.  Can be repeated."""
     seeds: int = 1
-    """Schedules to run: each strikes elsewhere."""
+    """Number of schedules; each places the faults at other moments."""
     seed: int = 0
-    """The first schedule's seed."""
+    """Seed of the first schedule."""
     faults: str = ""
-    """Some of the faults, such as kill-worker,torn-tail; all if not given."""
+    """Faults to inject, such as kill-worker,torn-tail.  Default: all."""
     actors: int = 2
-    """Workers."""
+    """Number of workers."""
     out: Path = Path("runs/chaos")
-    """Where run folders and logs are made; those of faults that changed nothing are removed."""
+    """Folder for run folders and logs.  Those of passed faults are removed."""
     reference: Path | None = None
-    """Folder of a finished run with the same numbers, to compare with instead of running it."""
+    """Folder of a finished run with the same settings, used in place of the undisturbed run."""
     json: bool = False
     """Print one JSON object on the last line."""
 
 
 def chaos(arguments: ChaosArguments, console: Console) -> int:
-    """``icrl-dist chaos``: exit code 1 if a fault did not land or changed a digest."""
+    """Run the campaign.  Returns FAILED if a fault had no effect or changed a digest, else OK."""
     from icrl_dist.chaos.campaign import Campaign
     from icrl_dist.chaos.training import Broken
     from icrl_dist.launch.learner_process import TrainFailed
 
-    given = arguments
-    if given.seeds < 1 or given.actors < 1:
-        raise ConfigError(f"--seeds {given.seeds} --actors {given.actors}: at least 1 of each is needed")
-    seeds = range(given.seed, given.seed + given.seeds)
-    with Campaign(given.run, given.set, given.actors, given.out, console) as campaign:
+    if arguments.seeds < 1 or arguments.actors < 1:
+        raise ConfigError(f"--seeds {arguments.seeds} --actors {arguments.actors}: at least 1 of each is needed")
+    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
+    with Campaign(arguments.run, arguments.set, arguments.actors, arguments.out, console) as campaign:
         try:
-            answer = campaign.run(given.faults, seeds, given.reference)
+            answer = campaign.run(arguments.faults, seeds, arguments.reference)
         except Broken as error:
             raise TrainFailed(f"undisturbed: {error}") from None
-    if given.json:
+    if arguments.json:
         print(json.dumps(answer))
     return OK if answer["ok"] else FAILED

@@ -1,4 +1,4 @@
-"""``icrl-dist doctor``."""
+"""``icrl-dist doctor``: checks of this machine, a cluster file or a cluster."""
 
 from __future__ import annotations
 
@@ -12,34 +12,35 @@ from icrl_dist.cli.exit_codes import FAILED, OK
 
 @dataclass(frozen=True)
 class DoctorArguments:
-    """Check this machine: versions, cores, memory, ports, folders; one line and a remedy each.
+    """Check this machine: versions, cores, memory, ports, folders; one line and one remedy per check.
 
-    Or, with --cluster, a cluster file before `ray up`, without asking any machine or cloud; run it
-    where `ray up` will be run.  Or, with --address on its head, a cluster that is up: every
-    machine's versions, clock, shared memory, certificates, and the ports between them.
+    With --cluster: check a cluster file before `ray up`, without contacting a node or a cloud.  Run
+    it where you will run `ray up`.  With --address, on the head of a running cluster: check every
+    node's versions, clock, shared memory and certificates, and the ports between the nodes.
     """
 
     cluster: Path | None = None
-    """Cluster file to look through, such as deploy/clusters/aws.yaml."""
+    """Cluster file to check, such as deploy/clusters/aws.yaml."""
     address: str | None = None
-    """Address of a Ray cluster, such as ``auto``."""
+    """Address of a running Ray cluster, such as ``auto``."""
     certificates: str = ""
-    """With --address: the folder of certificates on its machines."""
+    """With --address: the folder of the certificates on its nodes."""
     endpoint: str = "tcp/127.0.0.1:0"
-    """Where a learner would listen."""
+    """Endpoint at which a learner would listen."""
     folder: Path = Path("runs")
-    """Where run folders would be made."""
+    """Folder in which run folders would be created."""
 
 
 def doctor(arguments: DoctorArguments, console: Console) -> int:
-    """``icrl-dist doctor``: exit code 1 if anything would stop a run."""
-    from icrl_dist.diagnostics.doctor import diagnose, diagnose_cluster, diagnose_file, table
+    """Print the checks.  Returns FAILED if one of them would stop a run, else OK."""
+    from icrl_dist.diagnostics.checks import table
+    from icrl_dist.diagnostics.doctor import diagnose, diagnose_cluster, diagnose_file
 
     if arguments.cluster is not None:
-        findings = diagnose_file(arguments.cluster, Path())
+        checks = diagnose_file(arguments.cluster, Path())
     elif arguments.address is not None:
-        findings = diagnose_cluster(arguments.address, arguments.endpoint, arguments.certificates)
+        checks = diagnose_cluster(arguments.address, arguments.endpoint, arguments.certificates)
     else:
-        findings = diagnose(arguments.endpoint, arguments.folder)
-    console.print(table(findings), highlight=False, markup=False)
-    return FAILED if any(finding.ok is False for finding in findings) else OK
+        checks = diagnose(arguments.endpoint, arguments.folder)
+    console.print(table(checks), highlight=False, markup=False)
+    return FAILED if any(check.ok is False for check in checks) else OK

@@ -3,5 +3,5 @@
 import signal
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
-UNREAD = 128 + signal.SIGPIPE
-"""As a shell tells it of a command that nobody read to its end."""
+BROKEN_PIPE = 128 + signal.SIGPIPE
+"""The reader of standard output has closed it; the code that a shell reports for a process killed by SIGPIPE."""

@@ -1,4 +1,4 @@
-"""``icrl-dist explain``."""
+"""``icrl-dist explain``: the origin of a training example."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from icrl_dist.types import Identity
 
 @dataclass(frozen=True)
 class ExplainArguments:
-    """Where a training example came from: task, adversary, weights, seed, worker, labels, bytes.
+    """Show the origin of a training example: task, adversary, weights, seed, worker, labels, bytes.
 
-    Without IDENTITY: the whole ledger, a JSON line a trajectory.
+    Without IDENTITY: print the whole ledger, one JSON line per trajectory.
     """
 
     what: tyro.conf.Positional[Path]
@@ -26,26 +26,26 @@ class ExplainArguments:
     identity: tyro.conf.Positional[str | None] = None
     """STAGE/ROUND/TASK/VARIATION/TRIAL, such as adapt/0/3/1/7."""
     rerun: bool = False
-    """Make it once more on this machine and compare every byte."""
+    """Repeat the rollout on this machine and compare every byte."""
     json: bool = False
     """Print one JSON object on the last line."""
 
 
 def explain(arguments: ExplainArguments, console: Console) -> int:
-    """``icrl-dist explain``: one trajectory's origin, or the whole ledger."""
-    from icrl_dist.diagnostics import explain as explaining
+    """Print the origin of one trajectory, or the whole ledger.  Returns FAILED if a stored byte has changed."""
+    from icrl_dist.diagnostics import explain as origin
 
     if arguments.identity is None:
-        for line in explaining.ledger(arguments.what):
+        for line in origin.ledger(arguments.what):
             print(json.dumps(line))
         return OK
     try:
         identity = Identity.parse(arguments.identity)
     except ValueError as error:
         raise ConfigError(f"explain: {error}") from None
-    answer = explaining.explain(arguments.what, identity, arguments.rerun)
-    console.print(explaining.describe(answer), highlight=False, markup=False)
+    answer = origin.explain(arguments.what, identity, arguments.rerun)
+    console.print(origin.describe(answer), highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(answer))
-    sound = answer["intact"] and answer.get("weights_intact", True) and answer.get("rerun_equal", True)
-    return OK if sound else FAILED
+    unchanged = answer["intact"] and answer.get("weights_intact", True) and answer.get("rerun_equal", True)
+    return OK if unchanged else FAILED

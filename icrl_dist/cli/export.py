@@ -1,4 +1,4 @@
-"""``icrl-dist export``."""
+"""``icrl-dist export``: a trained agent as one file."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from icrl_dist.config.run import ConfigError
 
 @dataclass(frozen=True)
 class ExportArguments:
-    """Write what a run made in a form for others to use."""
+    """Write the trained agent of a run to one file for use elsewhere."""
 
     what: tyro.conf.Positional[Path]
-    """A run folder (its newest version), or a checkpoint file."""
+    """A run folder, of which the newest version is exported, or a checkpoint file."""
     to: Literal["agent"] = "agent"
-    """``agent``: weights and manifest in one file for ``load_agent``, without what only training
-    needs."""
+    """``agent``: weights and manifest in one file for ``icrl_dist.load_agent``, without the state that
+    only training needs."""
     out: Path | None = None
-    """File to write; agent.npz in the run folder, or beside the checkpoint, if not given."""
+    """File to write.  Default: agent.npz in the run folder, or beside the checkpoint file."""
 
 
 def export(arguments: ExportArguments, console: Console) -> int:
-    """``icrl-dist export``: an agent without what only training needs."""
+    """Write the agent.  Returns the exit code.  Raises ConfigError if the file exists and is no exported agent."""
     from icrl_dist.agent.in_context_agent import checkpoint_file, is_slim, slim
     from icrl_dist.console.display import Display
     from icrl_dist.results import heldout
@@ -38,7 +38,7 @@ def export(arguments: ExportArguments, console: Console) -> int:
     if out.is_dir():
         raise ConfigError(f"--out {out}: is a folder; name a file, such as {out / 'agent.npz'}")
     if out.exists() and not is_slim(out):
-        raise ConfigError(f"--out {out}: exists, and is no agent that was exported; name another file")
+        raise ConfigError(f"--out {out}: exists and is not an exported agent; name another file")
     with Display(console) as display:
         save_checkpoint(out, slim(heldout.calibrate(source, display)))
     console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)

@@ -1,4 +1,4 @@
-"""The command line: ``icrl-dist COMMAND``.
+"""The command line ``icrl-dist COMMAND``: parses the arguments and calls the command.
 
 Exit codes: 0 done, 1 the run failed, 2 bad usage or config, 130 interrupted with a
 checkpoint written.
@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
 def _help() -> str:
     lines = ["icrl-dist: robust in-context reinforcement learning, distributed", "", "usage: icrl-dist COMMAND ...", ""]
     lines += [f"  {name:<10} {(kind.__doc__ or '').splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
-    return "\n".join([*lines, "", "`icrl-dist COMMAND --help` explains a command; begin with `icrl-dist train demo`."])
+    return "\n".join([*lines, "", "`icrl-dist COMMAND --help` explains a command; start with `icrl-dist train demo`."])
 
 
 def _parse(name: str, words: Sequence[str]) -> Any:
@@ -54,9 +54,9 @@ def _parse(name: str, words: Sequence[str]) -> Any:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """The ``icrl-dist`` command.  Returns its exit code."""
+    """Run ``icrl-dist`` with these words (default: ``sys.argv``).  Returns the exit code."""
     words = list(sys.argv[1:] if words is None else words)
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's threads, here and in what is started: see docs/decisions.md
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: docs/decisions.md
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
@@ -69,7 +69,7 @@ def main(words: Sequence[str] | None = None) -> int:
         print(__version__)
         return OK
     if words[0] not in COMMANDS:
-        print(f"icrl-dist: no command {words[0]!r}; there are {', '.join(COMMANDS)}", file=sys.stderr)
+        print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE
     try:
         return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
@@ -78,16 +78,16 @@ def main(words: Sequence[str] | None = None) -> int:
     except Exception as error:
         from icrl_dist.storage.files import explained
 
-        told = explained(error)
-        code = _code(told)
+        explanation = explained(error)
+        code = _code(explanation)
         if code is None:
             raise
-        print(f"icrl-dist: {' '.join(str(told).split())}", file=sys.stderr)
+        print(f"icrl-dist: {' '.join(str(explanation).split())}", file=sys.stderr)
         return code
 
 
 def _code(error: Exception) -> int | None:
-    """The exit code of an error that its message explains; None for a bug, which keeps its trace."""
+    """Exit code of an error whose message explains it; None for a bug, whose traceback is printed."""
     from icrl_dist.storage.files import StoreError
     from icrl_dist.stream.link import LinkError, Unanswered
 

@@ -1,4 +1,4 @@
-"""``icrl-dist monitor`` and ``icrl-dist tap``: views of a run that is on."""
+"""``icrl-dist monitor`` and ``icrl-dist tap``: live views of a run."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from typing import Literal
 import tyro
 from rich.console import Console
 
-from icrl_dist.cli.exit_codes import FAILED, OK, UNREAD
+from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, OK
 from icrl_dist.config.run import ConfigError, load
 
 
 @dataclass(frozen=True)
 class MonitorArguments:
-    """Watch a run live, in the terminal or in a browser; or play one again that has ended.
+    """Watch a run live in the terminal or in a browser, or replay a run that has ended.
 
-    Without WHAT: the newest run under runs/ that is on.  A view reads the monitor plane only, so
-    it can slow nobody down.  ``icrl-dist monitor runs/demo`` plays the run in that folder again
-    once it has ended, at any speed.
+    Without WHAT: the newest active run under runs/.  A view only reads the monitor plane, so it
+    cannot slow the run down.  ``icrl-dist monitor runs/demo`` replays the run in that folder, at any
+    speed, if it has ended.
     """
 
     what: tyro.conf.Positional[Path | None] = None
-    """Run folder: watched if the run is on, played again if it has ended or crashed."""
+    """Run folder.  An active run is shown live; a run that has ended or crashed is replayed."""
     connect: str | None = None
     """Instead, the endpoint of a learner, such as tcp/127.0.0.1:7447."""
     certificates: str | None = None
-    """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/; the run's own if
-    not given."""
+    """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/.  Default: the run's
+    folder of certificates."""
     web: int | None = None
-    """Serve a page at this port instead; 0 takes a free one."""
+    """Serve the view as a web page at this port; 0 chooses a free port."""
     host: str = "127.0.0.1"
-    """Where the page is served: only to this machine unless you change it."""
+    """Address at which the page is served.  The default allows this computer only."""
     speed: float = 10.0
-    """Seconds of then a second, of a run that is played again; the views can change it."""
+    """Speed of a replay: seconds of the run per second.  It can be changed in the view."""
     timeout: float = 30.0
-    """Seconds to wait for the learner."""
+    """Seconds to wait for a connection to the learner."""
 
 
 def monitor(arguments: MonitorArguments, console: Console) -> int:
-    """``icrl-dist monitor``: the live view."""
+    """Show the view until the user ends it.  Returns the exit code."""
     from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
     from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
@@ -53,13 +53,13 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
     if arguments.speed <= 0:
         raise ConfigError(f"--speed {arguments.speed:g}: must be above 0")
     if arguments.web is None and not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
-        raise ConfigError("monitor: no terminal here; --web PORT serves it as a page, `icrl-dist tap` prints a JSON line each")
+        raise ConfigError("monitor: no terminal here; use --web PORT for a web page, or `icrl-dist tap` for JSON lines")
     what = arguments.what
     with contextlib.ExitStack() as stack:
-        if what is not None and not arguments.connect and not _on(what, console):
+        if what is not None and not arguments.connect and not _is_active(what, console):
             feed: LiveFeed | ReplayFeed = stack.enter_context(ReplayFeed(what, arguments.speed))
         else:
-            endpoint, certificates, run = _learner(what, arguments.connect, arguments.certificates)
+            endpoint, certificates, run = _learner_of(what, arguments.connect, arguments.certificates)
             settings = security.client(certificates, "monitor")
             link = stack.enter_context(ZenohLink.connect(endpoint, arguments.timeout, settings))
             feed = stack.enter_context(LiveFeed(link, run))
@@ -74,75 +74,79 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
 
 @dataclass(frozen=True)
 class TapArguments:
-    """Print one JSON line a trajectory, live, from the monitor plane of a run that is on.
+    """Print one JSON line per trajectory, live, from the monitor plane of an active run.
 
-    ``icrl-dist tap --task 3 --adversary dirichlet --every 10`` prints every tenth of those that
-    pass both filters.
+    ``icrl-dist tap --task 3 --adversary dirichlet --every 10`` prints every tenth trajectory that
+    passes both filters.
 
-    Nothing that a tap does can slow the run: what it cannot take in time is dropped.
+    A tap cannot slow the run down: messages that it does not read in time are dropped.
     """
 
     what: tyro.conf.Positional[Path | None] = None
-    """Run folder to listen to; the newest under runs/ if neither this nor --connect is given."""
+    """Folder of an active run.  Default, without --connect: the newest under runs/."""
     connect: str | None = None
     """Endpoint of a learner, such as tcp/127.0.0.1:7447."""
     certificates: str | None = None
-    """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/; the run's own if
-    not given."""
+    """Folder with ca.pem, monitor.pem and monitor.key, for a learner at tls/.  Default: the run's
+    folder of certificates."""
     task: tuple[int, ...] = ()
-    """Only these tasks, by their numbers."""
+    """Print only these tasks, by their numbers."""
     adversary: tuple[str, ...] = ()
-    """Only these adversaries: numbers of variations, or kinds such as ``dirichlet`` or ``null``."""
+    """Print only these adversaries: numbers of variations, or kinds such as ``dirichlet`` or ``null``."""
     every: int = 1
-    """Of those that pass, only every so manyth."""
+    """Print only every n-th of the trajectories that pass the filters."""
     format: Literal["json", "msgpack"] = "json"
-    """``json``: a line each; ``msgpack``: the same maps one after another, as a msgpack stream."""
+    """``json``: one line per trajectory.  ``msgpack``: the same maps as a msgpack stream."""
     count: int = 0
-    """End after so many trajectories; 0 goes on until Ctrl-C."""
+    """End after this many trajectories; 0 continues until Ctrl-C."""
     timeout: float = 30.0
-    """Seconds to wait for the learner."""
+    """Seconds to wait for a connection to the learner."""
 
 
 def tap(arguments: TapArguments, console: Console) -> int:
-    """``icrl-dist tap``: a JSON line a trajectory."""
+    """Print trajectories until Ctrl-C or ``--count``.  Returns the exit code."""
     from icrl_dist.monitor.tap import Tapped
     from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
-    endpoint, certificates, run = _learner(arguments.what, arguments.connect, arguments.certificates)
-    over = threading.Event()
-    tapped = Tapped(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, over.set)
+    endpoint, certificates, run = _learner_of(arguments.what, arguments.connect, arguments.certificates)
+    ended = threading.Event()
+    tapped = Tapped(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, ended.set)
     for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, lambda *_: over.set())
+        signal.signal(name, lambda *_: ended.set())
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
         link.subscribe(f"icrl/{run or '*'}/mon/trajectories/**", tapped)
-        over.wait()
+        ended.wait()
     if tapped.error is None:
         return OK
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what was not written is not tried again at the end
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python must not try to flush the rest at exit
     if isinstance(tapped.error, BrokenPipeError):
-        return UNREAD
+        return BROKEN_PIPE
     print(f"icrl-dist: tap: standard output cannot be written: {tapped.error.strerror}", file=sys.stderr)
     return FAILED
 
 
-def _on(folder: Path, console: Console) -> bool:
-    """Whether a run folder's learner is there; a crash may have left its endpoint behind, which is said."""
+def _is_active(folder: Path, console: Console) -> bool:
+    """Whether a learner is running on the folder.
+
+    A crashed learner leaves its endpoint file behind; in that case a line explains why the run is replayed.
+    """
     from icrl_dist.storage.files import held
 
     if not (folder / "endpoint").is_file():
         return False
     if held(folder):
         return True
-    told = "its learner is gone without a word, the run is played again; --connect ENDPOINT watches one on another machine"
-    console.print(f"{folder}: {told}", highlight=False, markup=False)
+    text = "no learner is running here, so the run is replayed; for a learner on another machine use --connect ENDPOINT"
+    console.print(f"{folder}: {text}", highlight=False, markup=False)
     return False
 
 
-def _learner(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, str]:
-    """Where the learner is reached that a run folder or ``--connect`` means, the certificates to show it, and its run.
+def _learner_of(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, str]:
+    """The endpoint of the learner, the folder of certificates for it, and the name of its run.
 
-    The run's name is empty where only the endpoint says which it is.
+    The name is empty with ``--connect``, because the endpoint alone identifies the run.  Raises
+    ConfigError if no run is active, or if a TLS endpoint has no certificates.
     """
     from icrl_dist.storage.files import held
 
@@ -153,18 +157,21 @@ def _learner(what: Path | None, connect: str | None, certificates: str | None) -
             )
         return connect, certificates or "", ""
     files = [what / "endpoint"] if what else sorted(Path("runs").glob("[!.]*/endpoint"), key=lambda f: f.stat().st_mtime)
-    files = [file for file in files if held(file.parent)] or files  # a crash leaves its endpoint behind
+    files = [file for file in files if held(file.parent)] or files  # a crashed learner leaves its endpoint file behind
     if not files or not files[-1].is_file():
         raise ConfigError(
-            f"no run is on in {what or 'runs/'}: start one with `icrl-dist train`, or name it with --connect tcp/HOST:PORT"
+            f"no run is active in {what or 'runs/'}: start one with `icrl-dist train`, or name it with --connect tcp/HOST:PORT"
         )
     folder = files[-1].parent
     stream = load(str(folder / "run.toml")).stream
     endpoint = stream.connect or files[-1].read_text().strip()
-    return endpoint, certificates or stream.certificates, _name(folder)
+    return endpoint, certificates or stream.certificates, _run_name(folder)
 
 
-def _name(folder: Path) -> str:
-    """The name of the run in a folder; empty where a link gives the folder two, of which its learner goes by either."""
+def _run_name(folder: Path) -> str:
+    """The name of the run in a folder.
+
+    Empty if the folder is a symbolic link with another name: its learner may use either name.
+    """
     name = folder.absolute().name
     return name if folder.resolve().name == name else ""

@@ -1,4 +1,4 @@
-"""``icrl-dist plan``."""
+"""``icrl-dist plan``: an estimate of a run's time, network and disk."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from icrl_dist.config.run import load, override
 
 @dataclass(frozen=True)
 class PlanArguments:
-    """What a run would take on N machines: hours, network, disk, and what holds it up first.
+    """Estimate what a run takes on N nodes: hours, network, disk, and its first bottleneck.
 
-    Times a little of each part of the run on this machine, some tens of seconds while nothing else
-    should run; machines are taken to be like this one.
+    Measures a small part of each stage of the run on this machine.  This takes some tens of seconds,
+    during which nothing else should run.  The nodes are assumed to be as fast as this machine.
     """
 
     run: tyro.conf.Positional[str]
     """Name of a packaged run, or path of a run file."""
     nodes: int = 1
-    """Machines that run workers."""
+    """Nodes that run workers."""
     cores: int | None = None
-    """Workers on each; as many as this machine has cores if not given."""
+    """Workers on each node.  Default: the number of cores of this machine."""
     gbit: float = 1.0
-    """What the learner's network carries, Gbit/s."""
+    """Bandwidth of the learner's network, Gbit/s."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """SECTION.NAME=VALUE, as in adversary.count=16; may be given many times."""
+    """SECTION.NAME=VALUE, such as adversary.count=16.  Can be repeated."""
     rates: Path | None = None
-    """Rates that were measured before, or on another machine: what --json printed there."""
+    """File with the output of --json from an earlier measurement, or from another machine; nothing is measured then."""
     json: bool = False
-    """Print one JSON object on the last line, the rates included."""
+    """Print one JSON object, including the measured rates, on the last line."""
 
 
 def plan(arguments: PlanArguments, console: Console) -> int:
-    """``icrl-dist plan``: an estimate from measured rates."""
+    """Measure the rates, or read them from a file, and print the estimate.  Returns the exit code."""
     from icrl_dist.bench import rates
     from icrl_dist.diagnostics import estimate
 
     run = override(load(arguments.run), arguments.set, "--set")
     if arguments.rates is not None:
-        found = estimate.Rates.read(arguments.rates, arguments.run)
+        measured = estimate.Rates.read(arguments.rates, arguments.run)
     else:
         with console.status("plan") as status:
-            found = rates.measure(run, arguments.run, lambda said: status.update(f"timing {said}"))
-    answer = estimate.estimate(found, arguments.nodes, arguments.cores or found.cores, arguments.gbit)
+            measured = rates.measure(run, arguments.run, lambda part: status.update(f"timing {part}"))
+    answer = estimate.estimate(measured, arguments.nodes, arguments.cores or measured.cores, arguments.gbit)
     console.print(estimate.describe(answer), highlight=False, markup=False)
     if arguments.json:
-        print(json.dumps({**answer, "rates": found.as_dict()}))
+        print(json.dumps({**answer, "rates": measured.as_dict()}))
     return OK

@@ -1,4 +1,4 @@
-"""``icrl-dist play``."""
+"""``icrl-dist play``: a game against a trained agent, in the browser."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from icrl_dist.config.run import ConfigError, Deployment
 
 @dataclass(frozen=True)
 class PlayArguments:
-    """Be the adversary of a trained agent in a Dark Room, live in the browser.
+    """Play the adversary of a trained agent in a Dark Room, live in the browser.
 
-    Move the goal, override actions by hand or by a law, and watch it adapt: its returns beside the
-    oracle's, its surprise, and what it believes of the goal beside the exact posterior.
+    Move the goal, or override actions by hand or from an action distribution.  The page shows the
+    agent's returns beside the oracle's, its OOD score (surprise), and its distribution over goals
+    beside the exact posterior.
     """
 
     what: tyro.conf.Positional[Path | None] = None
     """A run folder, or a checkpoint file."""
     pretrained: str | None = None
-    """Instead, the name of an agent that comes with the package: ``darkroom``."""
+    """Instead, the name of an agent that is part of the package: ``darkroom``."""
     web: int = 8000
-    """Port of the page; 0 takes a free one."""
+    """Port of the page; 0 chooses a free port."""
     host: str = "127.0.0.1"
-    """Address to listen on.  Whoever reaches another than this machine's own may play."""
+    """Address to listen on.  Everybody who can connect to it can play; the default allows this computer only."""
     deploy: Deployment | None = None
-    """As for ``evaluate``."""
+    """Same as for ``icrl-dist evaluate``."""
     seed: int = 0
-    """Of the agent's and the adversary's draws."""
+    """Seed of the agent's and the adversary's draws."""
     paused: bool = False
-    """Begin paused, so that the same clicks give the same game."""
+    """Start paused, so that the same clicks give the same game."""
 
 
 def play(arguments: PlayArguments, console: Console) -> int:
-    """``icrl-dist play``: until Ctrl-C."""
+    """Serve the game until Ctrl-C.  Returns the exit code."""
     from icrl_dist.agent.in_context_agent import shipped
     from icrl_dist.monitor import player
 

@@ -1,4 +1,4 @@
-"""What a run shows in the terminal: a bar a stage, events between them, a table at the end."""
+"""Progress of a run in the terminal: one bar per stage, and events as lines."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 _PERIOD_S = 10.0
+"""Seconds between progress lines where there is no terminal."""
 
 
 class Display:
-    """Shows a run's events; without a terminal it prints a line a stage and every ten seconds."""
+    """Shows a run's events as bars and lines, as a context.
+
+    Without a terminal it prints lines only: at the start and the end of a stage, and every ``_PERIOD_S`` seconds.
+    """
 
     def __init__(self, console: Console) -> None:
         self.console = console
@@ -46,13 +50,13 @@ class Display:
         elif kind == "labels":
             self.console.print(
                 f"  labels of round {event['round']}: {event['agreement']:.0%} optimal; return {event['label_return']:.1f}"
-                f" in the trials that label, {event['context_return']:.1f} in those before, {event['optimum']:.1f} at best",
+                f" in the label trials, {event['context_return']:.1f} in the context trials, {event['optimum']:.1f} optimal",
                 highlight=False,
             )
         elif kind == "listening":
             where = f"learner on {event['host']} ({event['device']})"
-            told = f"{where} listens at {event['endpoint']}, weights version {event['version']}"
-            self.console.print(told, highlight=False, markup=False)
+            text = f"{where} listens at {event['endpoint']}, policy version {event['version']}"
+            self.console.print(text, highlight=False, markup=False)
         elif kind in ("note", "worker", "alert", "crash", "quarantine", "released", "repaired", "interrupted"):
             self.console.print(event["text"], highlight=False, markup=False)
 
@@ -65,8 +69,8 @@ class Display:
                 self._bars[name] = self._progress.add_task(name, total=total, info=info)
             self._progress.update(self._bars[name], completed=done, info=info)
             return
-        when, ended = self._printed.get(name, (time.monotonic(), False))
-        if not ended and (done == total or time.monotonic() - when >= _PERIOD_S or name not in self._printed):
+        printed_at, ended = self._printed.get(name, (time.monotonic(), False))
+        if not ended and (done == total or time.monotonic() - printed_at >= _PERIOD_S or name not in self._printed):
             self._printed[name] = (time.monotonic(), done == total)
             if done or event.get("doing"):
                 self.console.print(f"{name:<26} {done:>7}/{total:<7} {info}", highlight=False)
@@ -87,7 +91,7 @@ def _info(event: dict[str, Any]) -> str:
         return f"loss {event['loss']:.3f}"
     drops = sum(event["drops"].values())
     dropped = f", {drops} dropped" if drops else ""
-    acting = f", weights v{event['version']}, lag {event['lag']}" if event["phase"] == "adapt" else ""
+    policy = f", policy v{event['version']}, lag {event['lag']}" if event["phase"] == "adapt" else ""
     if event.get("doing"):
-        return f"{event['workers']} workers{acting}{dropped}; {'; '.join(event['doing'])}"
-    return f"{event['per_s']:.0f} trajectories/s, {event['workers']} workers{acting}{dropped}"
+        return f"{event['workers']} workers{policy}{dropped}; {'; '.join(event['doing'])}"
+    return f"{event['per_s']:.0f} trajectories/s, {event['workers']} workers{policy}{dropped}"

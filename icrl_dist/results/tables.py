@@ -12,7 +12,11 @@ from icrl_dist.results.evaluate import EXPERT, ORACLE, SCRIPTED, Result
 
 
 def returns_table(results: Sequence[Result], title: str) -> Table:
-    """Mean return by online episode, a row an agent and p, the last column beside the optimum."""
+    """Mean return by online episode, one row per agent and p.
+
+    The last column is the return of the last episodes as a fraction of the best reference that is
+    present: the oracle, a scripted policy, the experts or, without any of them, the exact optimum.
+    """
     episodes = results[0].returns.shape[2]
     shown = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes]
     last = min(5, episodes)
@@ -48,22 +52,25 @@ def _share(value: float, ceiling: float) -> str:
 
 
 def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Returns of each expert's first and last recorded episode, a row a variation."""
-    table = Table(title="SAC experts: return of the first and of the last episode that was recorded", title_justify="left")
+    """Returns of each expert's first and last recorded episode, one row per variation."""
+    table = Table(title="SAC experts: return of the first and of the last recorded episode", title_justify="left")
     for name in ("task", "adversary", "first", "last"):
         table.add_column(name, justify="left" if name in ("task", "adversary") else "right")
     for row in rows:
-        told = ", ".join(f"{name} {value:g}" for name, value in row["task"].items()) or "-"
-        table.add_row(told, row["adversary"], *(f"{value:.1f}" for value in row["returns"]))
+        task = ", ".join(f"{name} {value:g}" for name, value in row["task"].items()) or "-"
+        table.add_row(task, row["adversary"], *(f"{value:.1f}" for value in row["returns"]))
     return table
 
 
-def kl_table(report: Mapping[str, Any], law: str, title: str) -> Table:
-    """Divergence from the exact posterior by one law, a row a kind of context and p, and all of them together."""
+def kl_table(report: Mapping[str, Any], suffix: str, title: str) -> Table:
+    """Divergence from the exact posterior under one prior, one row per kind of context and p, and their mean.
+
+    ``suffix`` names the prior in the keys of ``report``.
+    """
     table = Table(title=title, title_justify="left")
     for name in ("goals", "context", "p", "KL", "+-", "goal met", "not met", "met in"):
         table.add_column(name, justify="left" if name in ("goals", "context") else "right")
-    for name, goals in ((f"kl_nats{law}", "trained on"), (f"kl_heldout{law}", "never trained on")):
+    for name, goals in ((f"kl_nats{suffix}", "trained on"), (f"kl_heldout{suffix}", "never trained on")):
         for index, row in enumerate(report[f"{name}_cells"]):
             numbers = [_nats(row[key]) for key in ("kl", "standard_error", "goal_met", "goal_unmet")]
             table.add_row("" if index else goals, row["kind"], f"{row['p']:g}", *numbers, f"{row['met']:.0%}")
@@ -77,7 +84,7 @@ def _nats(value: float | None) -> str:
 
 
 def gap_table(report: Mapping[str, Any], title: str) -> Table:
-    """Online return over the exact agent's, a row a set of goals and p, with 95% intervals."""
+    """Online return relative to the exact agent's, one row per set of goals and p, with 95% intervals."""
     table = Table(title=title, title_justify="left")
     for name in ("goals", "p", "model", "exact", "gap", "95%"):
         table.add_column(name, justify="left" if name == "goals" else "right")

@@ -230,4 +230,4 @@ def test_cells_are_given_as_places() -> None:
 
 def test_it_cannot_be_given_a_time(capsys: pytest.CaptureFixture[str]) -> None:
     assert main.main(["bench", "incontext", "--seconds", "3"]) == 2
-    assert "it takes as long as it takes" in capsys.readouterr().err
+    assert "this benchmark has a fixed size" in capsys.readouterr().err
