@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Makes what the stream needs to leave this machine: certificates.sh FOLDER [HOST ...]
+# Makes the certificates for a stream between machines: certificates.sh FOLDER [HOST ...]
 #
-# FOLDER gets ca.pem and ca.key (a certificate authority of your own) and, made with it,
-# learner, worker and monitor, each a .pem and a .key.  HOST is every name or address under which
-# workers and monitors reach the learner; this machine's loopback is always among them.
+# FOLDER receives ca.pem and ca.key (your own certificate authority) and the certificates that it
+# signs: learner, worker and monitor, each as .pem and .key.  HOST: every name or address under which
+# workers and monitors reach the learner; this machine's loopback is always included.
 #
-# Run it again with the same FOLDER and it makes new certificates with the same authority.
-# DAYS=n says how long they are good for (365).
+# Run it again with the same FOLDER for new certificates from the same authority.
+# DAYS=n sets their validity in days (365).
 set -euo pipefail
 umask 077
 
@@ -26,7 +26,7 @@ for host in "$@"; do
     if [[ $host == *:* || $host =~ ^[0-9.]+$ ]]; then names+=",IP:$host"; else names+=",DNS:$host"; fi
 done
 
-make() { # FILE DAYS COMMON-NAME EXTENSIONS... -- HOW TO SIGN: FILE.key and FILE.pem, whole or not at all
+make() { # FILE DAYS COMMON-NAME EXTENSIONS... -- SIGNING OPTIONS: writes FILE.key and FILE.pem, each in one step
     local file=$1 days=$2 name=$3 extensions=()
     shift 3
     while [[ $1 != -- ]]; do
@@ -47,17 +47,17 @@ if [[ ! -e ca.key ]]; then
         "keyUsage=critical,keyCertSign,cRLSign" "subjectKeyIdentifier=hash" -- -signkey ca.key.new
 fi
 
-issue() { # ROLE EXTENSIONS...: the role is the common name, by which the learner tells what a client may do
+issue() { # ROLE EXTENSIONS...: the common name is the role, which decides what the learner allows a client
     make "$1" "$days" "$1" "basicConstraints=critical,CA:FALSE" "keyUsage=critical,digitalSignature" \
         "subjectKeyIdentifier=hash" "authorityKeyIdentifier=keyid" "${@:2}" -- -CA ca.pem -CAkey ca.key
 }
-# Each is for one side of a connection only: a worker's certificate must not pass for the learner's.
+# Each is valid for one side of a connection only, so that a worker's certificate cannot be used as a learner's.
 issue learner "extendedKeyUsage=serverAuth" "subjectAltName=$names"
 issue worker "extendedKeyUsage=clientAuth"
 issue monitor "extendedKeyUsage=clientAuth"
 
-echo "in $folder, good for $days days, for a learner at $names:"
-echo "  learner.pem learner.key ca.pem   to the learner's machine"
-echo "  worker.pem  worker.key  ca.pem   to every worker's machine"
-echo "  monitor.pem monitor.key ca.pem   to whoever may watch"
-echo "  ca.key                           to nobody: who has it can make more"
+echo "in $folder, valid for $days days, for a learner at $names:"
+echo "  learner.pem learner.key ca.pem   to the learner's node"
+echo "  worker.pem  worker.key  ca.pem   to every worker's node"
+echo "  monitor.pem monitor.key ca.pem   to everybody who may watch"
+echo "  ca.key                           keep it secret: it signs new certificates"

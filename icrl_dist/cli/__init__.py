@@ -1,1 +1,1 @@
-"""The command line: what each command accepts, and what it does."""
+"""The command line: one file per command, with its arguments and its function."""

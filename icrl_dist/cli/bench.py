@@ -1,21 +1,74 @@
-"""What ``icrl-dist bench`` does with its arguments."""
+"""``icrl-dist bench``: benchmarks of parts of the system."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
+import tyro
 from rich.console import Console
 
-from icrl_dist.cli.commands import FAILED, OK
+from icrl_dist.cli.exit_codes import FAILED, OK
 from icrl_dist.config.run import ConfigError
 
-if TYPE_CHECKING:
-    from icrl_dist.cli.arguments import Bench
+
+@dataclass(frozen=True)
+class BenchArguments:
+    """Measure one part of the system on this machine, beside a baseline."""
+
+    name: tyro.conf.Positional[
+        Literal[
+            "env",
+            "stream",
+            "ingest",
+            "scale",
+            "broadcast",
+            "recovery",
+            "soak",
+            "fuzz",
+            "incontext",
+            "experts",
+            "disturbance",
+            "monitor",
+        ]
+    ]
+    """``env``: environment steps per second, for simulated problems beside their library's own loop.
+    ``stream``: trajectories per second through the stream and, in the same run, as Ray actor returns.
+    ``ingest``: trajectories per second written to disk, with and without fsync.  ``scale``: the same
+    with 1 to 256 simulated workers.  ``broadcast``: weights sent to eight processes, beside ``ray.put``
+    and ``ray.get``.  ``recovery``: time until a run continues after a worker or the learner is killed.
+    ``soak``: memory growth of every process in a long run.  ``fuzz``: 100,000 hostile inputs to every
+    function that decodes bytes.  ``incontext``: deployment and training of the model, beside DPT's
+    official layout.  ``experts``: batched updates of many experts, beside stable-baselines3.
+    ``disturbance``: the return that an undisturbed expert loses under each default adversary.
+    ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
+    problem: str | None = None
+    """Problem to measure, such as ``dmc-cheetah-run`` (default for env: ``darkroom``; for disturbance:
+    every simulated problem)."""
+    seconds: float | None = None
+    """Duration of the measurement (env, stream, ingest, scale and soak)."""
+    quick: bool = False
+    """Measure less: one seed instead of three (incontext), 3 repetitions instead of 15 (experts), briefly
+    trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of 8 (monitor)."""
+    drop: float | None = None
+    """disturbance: instead, find the strength at which this fraction of the return is lost, such as 0.25.  The
+    strength of each problem is kept for later runs with ``control.strength = "drop:0.25"``."""
+    steps: int | None = None
+    """Training steps of the experts (disturbance --drop), or update steps (experts --device cuda)."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """experts: ``cuda`` measures 160 experts on a GPU beside stable-baselines3 on one core, and trains an
+    expert set of the paper for a short time to estimate its full duration.  ``auto``: a GPU if there is one."""
+    folder: Path = Path("runs")
+    """Folder on the disk to measure (ingest, scale, recovery), for figures (soak, incontext), for inputs
+    that cause an error (fuzz), and for finished trainings (incontext)."""
+    json: bool = False
+    """Print one JSON object on the last line."""
 
 
-def bench(arguments: Bench, console: Console) -> int:
-    """``icrl-dist bench``: one benchmark."""
+def bench(arguments: BenchArguments, console: Console) -> int:
+    """Run one benchmark and print its result.  Returns the exit code."""
     from icrl_dist.bench import (
         broadcast,
         disturbance,
@@ -42,7 +95,7 @@ def bench(arguments: Bench, console: Console) -> int:
         "monitor",
         "recovery",
     ):
-        raise ConfigError(f"bench {arguments.name}: --seconds: it takes as long as it takes; leave it out")
+        raise ConfigError(f"bench {arguments.name}: --seconds: this benchmark has a fixed size; leave the option out")
     if (arguments.name != "disturbance" or arguments.quick) and arguments.drop is not None:
         raise ConfigError(f"--drop {arguments.drop:g}: it belongs to `bench disturbance`, without --quick")
     if arguments.name != "experts" and arguments.device != "cpu":
@@ -53,17 +106,17 @@ def bench(arguments: Bench, console: Console) -> int:
         )
     if arguments.device != "cpu" and arguments.steps is not None and arguments.steps < 1:
         raise ConfigError(f"--steps {arguments.steps}: must be above 0")
-    timed: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
+    duration: dict[str, Any] = {} if arguments.seconds is None else {"seconds": arguments.seconds}
     match arguments.name:
         case "env":
-            result, text = (r := env.run(arguments.problem or "darkroom", **timed)), env.describe(r)
+            result, text = (r := env.run(arguments.problem or "darkroom", **duration)), env.describe(r)
         case "stream":
-            result, text = (r := stream.run(**timed)), stream.describe(r)
+            result, text = (r := stream.run(**duration)), stream.describe(r)
         case "ingest":
-            result, text = (r := ingest.run(arguments.folder, **timed)), ingest.describe(r)
+            result, text = (r := ingest.run(arguments.folder, **duration)), ingest.describe(r)
         case "scale":
             with console.status("scale"):
-                result = scale.run(arguments.folder, **timed)
+                result = scale.run(arguments.folder, **duration)
             text = scale.describe(result)
         case "broadcast":
             result, text = (r := broadcast.run()), broadcast.describe(r)
@@ -71,14 +124,14 @@ def bench(arguments: Bench, console: Console) -> int:
             result, text = (r := recovery.run(arguments.folder)), recovery.describe(r)
         case "soak":
             with console.status("soak") as status:
-                show = lambda elapsed, said: status.update(f"soak: {elapsed:.0f} s, {said}")  # noqa: E731
-                result = soak.run(folder=arguments.folder, report=show, **timed)
+                show = lambda elapsed, state: status.update(f"soak: {elapsed:.0f} s, {state}")  # noqa: E731
+                result = soak.run(folder=arguments.folder, report=show, **duration)
             text = soak.describe(result)
         case "fuzz":
             result, text = (r := fuzz.run(folder=arguments.folder)), fuzz.describe(r)
         case "incontext":
             with console.status("incontext") as status:
-                result = incontext.run(arguments.folder, arguments.quick, lambda said: status.update(f"incontext: {said}"))
+                result = incontext.run(arguments.folder, arguments.quick, lambda part: status.update(f"incontext: {part}"))
             text = incontext.describe(result)
         case "experts":
             with console.status("experts"):
@@ -86,7 +139,7 @@ def bench(arguments: Bench, console: Console) -> int:
                 result = experts_gpu.run(arguments.quick, arguments.steps) if on_gpu else experts.run(arguments.quick)
             text = (experts_gpu if on_gpu else experts).describe(result)
         case "disturbance":
-            say = lambda said: console.print(said, highlight=False, markup=False)  # noqa: E731
+            say = lambda text: console.print(text, highlight=False, markup=False)  # noqa: E731
             if arguments.drop is None:
                 text = disturbance.describe(result := disturbance.run(arguments.problem, arguments.quick, say))
             else:

@@ -1,4 +1,4 @@
-"""The command line: ``icrl-dist COMMAND``.
+"""The command line ``icrl-dist COMMAND``: parses the arguments and calls the command.
 
 Exit codes: 0 done, 1 the run failed, 2 bad usage or config, 130 interrupted with a
 checkpoint written.
@@ -14,48 +14,49 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from icrl_dist.cli import arguments, bench, commands
-from icrl_dist.cli.commands import FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, train
+from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.storage.fork import parse_source
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
-    "train": (arguments.Train, commands.train),
-    "evaluate": (arguments.Evaluate, commands.evaluate),
-    "monitor": (arguments.Monitor, commands.monitor),
-    "tap": (arguments.Tap, commands.tap),
-    "bench": (arguments.Bench, bench.bench),
-    "explain": (arguments.Explain, commands.explain),
-    "export": (arguments.Export, commands.export),
-    "chaos": (arguments.Chaos, commands.chaos),
-    "play": (arguments.Play, commands.play),
-    "doctor": (arguments.Doctor, commands.doctor),
-    "plan": (arguments.Plan, commands.plan),
+    "train": (train.TrainArguments, train.train),
+    "evaluate": (evaluate.EvaluateArguments, evaluate.evaluate),
+    "monitor": (monitor.MonitorArguments, monitor.monitor),
+    "tap": (monitor.TapArguments, monitor.tap),
+    "bench": (bench.BenchArguments, bench.bench),
+    "explain": (explain.ExplainArguments, explain.explain),
+    "export": (export.ExportArguments, export.export),
+    "chaos": (chaos.ChaosArguments, chaos.chaos),
+    "play": (play.PlayArguments, play.play),
+    "doctor": (doctor.DoctorArguments, doctor.doctor),
+    "plan": (plan.PlanArguments, plan.plan),
 }
 
 
 def _help() -> str:
     lines = ["icrl-dist: robust in-context reinforcement learning, distributed", "", "usage: icrl-dist COMMAND ...", ""]
     lines += [f"  {name:<10} {(kind.__doc__ or '').splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
-    return "\n".join([*lines, "", "`icrl-dist COMMAND --help` explains a command; begin with `icrl-dist train demo`."])
+    return "\n".join([*lines, "", "`icrl-dist COMMAND --help` explains a command; start with `icrl-dist train demo`."])
 
 
 def _parse(name: str, words: Sequence[str]) -> Any:
     kind, prog = COMMANDS[name][0], f"icrl-dist {name}"
     found: Any = tyro.cli(kind, prog=prog, args=list(words))
-    if isinstance(found, arguments.Train) and (found.run or found.source):
+    if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
         base = load(found.run or str(parse_source(found.source or "")[0] / "run.toml"))
         return tyro.cli(
-            kind, prog=prog, args=list(words), default=arguments.Train(run=found.run, given=tuple(words), config=base)
+            kind, prog=prog, args=list(words), default=TrainArguments(run=found.run, given=tuple(words), config=base)
         )
     return found
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """The ``icrl-dist`` command.  Returns its exit code."""
+    """Run ``icrl-dist`` with these words (default: ``sys.argv``).  Returns the exit code."""
     words = list(sys.argv[1:] if words is None else words)
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's threads, here and in what is started: see docs/decisions.md
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: docs/decisions.md
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
@@ -68,7 +69,7 @@ def main(words: Sequence[str] | None = None) -> int:
         print(__version__)
         return OK
     if words[0] not in COMMANDS:
-        print(f"icrl-dist: no command {words[0]!r}; there are {', '.join(COMMANDS)}", file=sys.stderr)
+        print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE
     try:
         return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
@@ -77,16 +78,16 @@ def main(words: Sequence[str] | None = None) -> int:
     except Exception as error:
         from icrl_dist.storage.files import explained
 
-        told = explained(error)
-        code = _code(told)
+        explanation = explained(error)
+        code = _code(explanation)
         if code is None:
             raise
-        print(f"icrl-dist: {' '.join(str(told).split())}", file=sys.stderr)
+        print(f"icrl-dist: {' '.join(str(explanation).split())}", file=sys.stderr)
         return code
 
 
 def _code(error: Exception) -> int | None:
-    """The exit code of an error that its message explains; None for a bug, which keeps its trace."""
+    """Exit code of an error whose message explains it; None for a bug, whose traceback is printed."""
     from icrl_dist.storage.files import StoreError
     from icrl_dist.stream.link import LinkError, Unanswered
 

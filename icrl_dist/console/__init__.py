@@ -1,1 +1,1 @@
-"""What a command shows in the terminal: progress and tables."""
+"""Progress of a run in the terminal."""

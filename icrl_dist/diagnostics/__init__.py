@@ -1,1 +1,1 @@
-"""Checks of a machine, a cluster or a run folder, and estimates before a run."""
+"""Checks of a machine, a cluster file, a cluster or a stored trajectory, and the estimate before a run."""

@@ -1,4 +1,4 @@
-"""A finding of the doctor, and the table of them."""
+"""One check of the doctor, and the table of all checks."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Finding:
-    """The answer to one question."""
+class Check:
+    """The result of one check."""
 
     name: str
     ok: bool | None
-    """None is a warning: a run starts, but something may go short."""
+    """False: a run would fail.  None is a warning: a run starts, but may be slow or end early."""
     value: str
     remedy: str = ""
-    """What to do; empty where there is nothing to do."""
+    """What to do; empty if the check passed."""
 
 
-def table(findings: Sequence[Finding]) -> str:
-    """The findings for people, one line each, the remedy behind an arrow."""
+def table(checks: Sequence[Check]) -> str:
+    """The checks as text, one line each, the remedy after an arrow."""
     mark = {True: "ok  ", None: "warn", False: "FAIL"}
-    width = max((len(f.name) for f in findings), default=0)
-    lines = [f"{mark[f.ok]}  {f.name:<{width}}  {f.value}" + (f"  -> {f.remedy}" if f.remedy else "") for f in findings]
+    width = max((len(check.name) for check in checks), default=0)
+    lines = [
+        f"{mark[check.ok]}  {check.name:<{width}}  {check.value}" + (f"  -> {check.remedy}" if check.remedy else "")
+        for check in checks
+    ]
     return "\n".join(line.replace("\n", " ") for line in lines)

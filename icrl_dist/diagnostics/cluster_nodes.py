@@ -1,4 +1,4 @@
-"""The doctor's questions to every machine of a cluster that is up; Ray comes as an argument."""
+"""The doctor's checks of every node of a running cluster; the module ``ray`` is an argument."""
 
 from __future__ import annotations
 
@@ -7,71 +7,73 @@ from collections.abc import Iterator
 from typing import Any
 
 from icrl_dist.diagnostics import node_facts
-from icrl_dist.diagnostics.checks import Finding
+from icrl_dist.diagnostics.checks import Check
 
 _PORTS = ("NodeManagerPort", "ObjectManagerPort")
-"""Where Ray's machines talk to each other, as ``ray.nodes`` names them."""
+"""Ports between Ray's nodes, by their keys in ``ray.nodes()``."""
 _ANSWER_S = 60.0
+"""Seconds to wait for the answer of a node."""
 _GIB = 1 << 30
 
 
-def examine(ray: Any, learner: tuple[str, int] | None, certificates: str) -> list[Finding]:
-    """What every machine answers; somebody listens at ``learner`` now, for them to reach, unless that is None."""
-    found = [node for node in ray.nodes() if node["Alive"]]
-    return [finding for node in found for finding in _machine(ray, node, found, learner, certificates)]
+def check_nodes(ray: Any, learner: tuple[str, int] | None, certificates: str) -> list[Check]:
+    """The checks of every node; ``learner``: host and port that each must reach, where a socket listens now, or None."""
+    nodes = [node for node in ray.nodes() if node["Alive"]]
+    return [check for node in nodes for check in _check_node(ray, node, nodes, learner, certificates)]
 
 
-def _machine(
-    ray: Any, node: dict[str, Any], machines: list[dict[str, Any]], learner: tuple[str, int] | None, certificates: str
-) -> Iterator[Finding]:
-    """What one machine answers, or that it does not."""
+def _check_node(
+    ray: Any, node: dict[str, Any], nodes: list[dict[str, Any]], learner: tuple[str, int] | None, certificates: str
+) -> Iterator[Check]:
+    """The checks of one node, or one failed check if it does not answer."""
     address = str(node["NodeManagerAddress"])
-    others = [one for one in machines if one is not node]
-    ports = [(str(one["NodeManagerAddress"]), int(one[kind])) for one in others for kind in _PORTS]
+    others = [other for other in nodes if other is not node]
+    ports = [(str(other["NodeManagerAddress"]), int(other[port])) for other in others for port in _PORTS]
     gcs = ray.get_runtime_context().gcs_address.rpartition(":")
-    where = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-    asked = ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=where)(node_facts.facts)
-    began = time.time()
+    placement = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+    remote_facts = ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=placement)(node_facts.facts)
     try:
-        ray.get(asked.remote(), timeout=_ANSWER_S)  # a new process of Ray's takes seconds, so the clock is asked next
-        began = time.time()
-        there = ray.get(
-            asked.remote(certificates, [*filter(None, [learner]), (gcs[0], int(gcs[2])), *ports]), timeout=_ANSWER_S
+        ray.get(remote_facts.remote(), timeout=_ANSWER_S)  # Ray starts a process, which takes seconds: the clock is read next
+        asked_at = time.time()
+        facts = ray.get(
+            remote_facts.remote(certificates, [*filter(None, [learner]), (gcs[0], int(gcs[2])), *ports]), timeout=_ANSWER_S
         )
     except Exception as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        yield Finding(
-            address, False, f"does not answer: {said}", "run `ray up` again, or look at its /tmp/ray/session_latest/logs"
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        yield Check(
+            address, False, f"does not answer: {reason}", "run `ray up` again, or read /tmp/ray/session_latest/logs there"
         )
         return
-    name = f"{there['host']} ({address})"
-    wrong = node_facts.differences(node_facts.facts(), there)
-    remedy = "run `ray up` again, so that all machines have the same"
-    yield Finding(
-        f"{name} versions", not wrong, ", ".join(wrong) or f"icrl-dist {there['code'][:8]}, as here", remedy if wrong else ""
+    name = f"{facts['host']} ({address})"
+    wrong = node_facts.differences(node_facts.facts(), facts)
+    remedy = "run `ray up` again, so that all nodes have the same versions"
+    yield Check(
+        f"{name} versions", not wrong, ", ".join(wrong) or f"icrl-dist {facts['code'][:8]}, as here", remedy if wrong else ""
     )
-    skew = max(0.0, began - there["time"], there["time"] - time.time())
+    skew = max(0.0, asked_at - facts["time"], facts["time"] - time.time())
     clock = True if skew < 1 else None if skew < 60 else False
-    yield Finding(
-        f"{name} clock", clock, f"{skew:.1f} s off", "" if clock else "run ntpd or chronyd: certificates depend on it"
+    yield Check(
+        f"{name} clock", clock, f"{skew:.1f} s off", "" if clock else "run ntpd or chronyd: certificates need the right time"
     )
-    yield _shared_memory_of(name, int(there["shared_memory"]))
-    files = True if there["open_files"] >= 4096 else None
-    yield Finding(
-        f"{name} open files", files, f"at most {there['open_files']}", "" if files else "ulimit -n 65536 before ray start"
+    yield _shared_memory_of(name, int(facts["shared_memory"]))
+    files = True if facts["open_files"] >= 4096 else None
+    yield Check(
+        f"{name} open files", files, f"at most {facts['open_files']}", "" if files else "ulimit -n 65536 before ray start"
     )
     if node["Resources"].get("CPU", 0) and certificates:
-        bad = str(there["certificates"])
-        yield Finding(f"{name} certificates", not bad, bad or "worker's, readable", "see docs/security.md" if bad else "")
+        bad = str(facts["certificates"])
+        yield Check(
+            f"{name} certificates", not bad, bad or "the worker's files are readable", "see docs/security.md" if bad else ""
+        )
     yield from (
-        Finding(f"{name} ports", False, said, "open it between the machines of the cluster") for said in there["unreached"]
+        Check(f"{name} ports", False, reason, "open it between the nodes of the cluster") for reason in facts["unreached"]
     )
-    if not there["unreached"]:
-        whose = "the learner's, Ray's" if learner else "Ray's"
-        yield Finding(f"{name} ports", True, f"reaches {whose} and {len(ports)} of the other machines")
+    if not facts["unreached"]:
+        first = "the learner's, Ray's" if learner else "Ray's"
+        yield Check(f"{name} ports", True, f"reaches {first} and {len(ports)} of the other nodes")
 
 
-def _shared_memory_of(name: str, free: int) -> Finding:
+def _shared_memory_of(name: str, free: int) -> Check:
     enough = True if free >= 0.5 * _GIB else None
     remedy = "mount -o remount,size=2G /dev/shm, or the container's --shm-size=2g"
-    return Finding(f"{name} shared memory", enough, f"{free / _GIB:.1f} GiB free", "" if enough else remedy)
+    return Check(f"{name} shared memory", enough, f"{free / _GIB:.1f} GiB free", "" if enough else remedy)

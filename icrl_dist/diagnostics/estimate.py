@@ -1,7 +1,7 @@
-"""What a run will take on N machines: arithmetic over measured rates, nothing else.
+"""Estimate of a run's time, network and disk on N nodes, computed from measured rates.
 
-A phase is collected by workers that take whole jobs, goes through one learner's inbox and the
-network in front of it, and is then fitted by the learner alone.
+In each phase workers collect whole jobs, their trajectories pass the learner's network and ingest,
+and then the learner fits alone.
 """
 
 from __future__ import annotations
@@ -19,45 +19,45 @@ from icrl_dist.config.toml import ConfigError
 
 @dataclass(frozen=True)
 class PhaseRates:
-    """A phase: how much there is of everything, and how fast each part of it goes."""
+    """The amounts and the measured rates of one phase."""
 
     name: str
     """``pretrain/0``, ``adapt/1``."""
     jobs: int
-    """Jobs, each done by one worker."""
+    """Jobs; one worker does one job."""
     trajectories: int
     env_steps: int
-    """Environment steps, of all its jobs together."""
+    """Environment steps, summed over all jobs."""
     labels: int
-    """Labelled query states, of all its trajectories together."""
+    """Labeled query states, summed over all trajectories."""
     job_s: float
-    """Seconds a job, on one worker."""
+    """Seconds per job, on one worker."""
     message_bytes: float
-    """Bytes a trajectory on the wire."""
+    """Bytes per trajectory on the wire."""
     stored_bytes: float
-    """Bytes a trajectory on the learner's disk."""
+    """Bytes per trajectory on the learner's disk."""
     fit_steps: int
     """Optimizer steps of the fit."""
     fit_step_s: float
-    """Seconds a step, on the learner."""
+    """Seconds per optimizer step, on the learner."""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Everything that ``plan`` measures, on one machine."""
+    """Everything that ``icrl-dist plan`` measures on one machine."""
 
     run: str
     machine: str
     cores: int
     phases: tuple[PhaseRates, ...]
     ingest_per_s: float
-    """Trajectories a second through the learner's inbox, durably."""
+    """Trajectories per second that the learner stores durably."""
     weights_bytes: int
-    """Bytes of a version's weights, as a worker receives them."""
+    """Bytes of the weights of one version, as a worker receives them."""
     checkpoint_bytes: int
-    """Bytes of a version on the learner's disk."""
+    """Bytes of the checkpoint of one version on the learner's disk."""
     start_s: float
-    """Seconds until learner and workers are up."""
+    """Seconds until the learner and the workers have started."""
     evaluate_s: float
     """Seconds of the evaluation at the end, on the learner."""
 
@@ -66,22 +66,22 @@ class Rates:
 
     @classmethod
     def read(cls, file: Path, run: str) -> Rates:
-        """From what ``plan --json`` printed.  Raises ConfigError for another file, or another run's."""
+        """Read the output of ``icrl-dist plan --json``.  Raises ConfigError for another file, or for another run."""
         try:
-            given = json.loads(file.read_text().splitlines()[-1])["rates"]
-            found = cls(**{**given, "phases": tuple(PhaseRates(**phase) for phase in given["phases"])})
+            fields = json.loads(file.read_text().splitlines()[-1])["rates"]
+            rates = cls(**{**fields, "phases": tuple(PhaseRates(**phase) for phase in fields["phases"])})
         except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-            raise ConfigError(f"--rates {file}: not what `icrl-dist plan {run} --json` prints ({error})") from None
-        if found.run != run:
-            raise ConfigError(f"--rates {file}: of {found.run!r}, not of {run!r}; measure them for this run")
-        return found
+            raise ConfigError(f"--rates {file}: not the output of `icrl-dist plan {run} --json` ({error})") from None
+        if rates.run != run:
+            raise ConfigError(f"--rates {file}: rates of {rates.run!r}, not of {run!r}; measure them for this run")
+        return rates
 
 
 def estimate(rates: Rates, nodes: int, cores: int, gbit_per_s: float) -> dict[str, Any]:
-    """Hours, bytes and the first bottleneck with ``nodes`` machines of ``cores`` workers each.
+    """Hours, bytes and the first bottleneck with ``nodes`` nodes of ``cores`` workers each.
 
-    Their workers are as fast as the one that was measured; the learner's network carries
-    ``gbit_per_s``.  Raises ConfigError for a number that is not above 0.
+    Every worker is assumed to be as fast as the measured one.  ``gbit_per_s`` is the bandwidth of the
+    learner's network.  Raises ConfigError for a number that is not above 0.
     """
     for name, value in (("nodes", nodes), ("cores", cores), ("gbit", gbit_per_s)):
         if not value > 0:
@@ -124,18 +124,18 @@ def estimate(rates: Rates, nodes: int, cores: int, gbit_per_s: float) -> dict[st
 
 PARTS = {
     "collecting": "more nodes shorten it, up to useful_workers",
-    "jobs": "fewer jobs than workers: smaller ones spread better (stream.job_tasks)",
-    "ingest": "the learner's inbox: more nodes change nothing, a faster disk and core do",
-    "network": "the learner's network: more nodes change nothing",
-    "fit": "the learner alone: a GPU or a faster machine for the head, not more nodes",
-    "evaluation": "the learner alone, at the end: fewer evaluate.episodes or evaluate.seeds",
-    "start": "processes and imports: the run is too short for a cluster",
+    "jobs": "fewer jobs than workers: use smaller jobs (stream.job_tasks)",
+    "ingest": "storing trajectories on the learner: a faster disk and core help, more nodes do not",
+    "network": "the learner's network: more bandwidth helps, more nodes do not",
+    "fit": "the learner alone: a GPU or a faster head helps, more nodes do not",
+    "evaluation": "the learner alone, at the end: reduce evaluate.episodes or evaluate.seeds",
+    "start": "starting processes and imports: the run is too short for a cluster",
 }
-"""Where time goes, and what would change it."""
+"""The parts of a run's time, and what reduces each."""
 
 
 def _collecting(phase: PhaseRates, rates: Rates, workers: int, gbit_per_s: float) -> dict[str, float]:
-    """Seconds that each limit alone would hold the phase up."""
+    """Seconds that the collection of the phase would take if only this limit applied, by limit."""
     turns = math.ceil(phase.jobs / workers) * phase.job_s
     return {
         "jobs" if workers > phase.jobs else "collecting": turns,
@@ -145,31 +145,31 @@ def _collecting(phase: PhaseRates, rates: Rates, workers: int, gbit_per_s: float
 
 
 def _peak(phase: PhaseRates, seconds: float) -> float:
-    """Megabits a second that come in while the phase is collected."""
+    """Mbit/s that the learner receives while the phase is collected."""
     return phase.trajectories * phase.message_bytes * 8e-6 / max(seconds, 1e-3)
 
 
 def _labels_per_s(rates: Rates) -> float:
-    """Labelled states a second, by one worker, in the phases that label."""
-    labelling = [p for p in rates.phases if p.labels]
-    return sum(p.labels for p in labelling) / sum(p.jobs * p.job_s for p in labelling) if labelling else 0.0
+    """Labeled states per second of one worker, in the phases with labels."""
+    labeled = [p for p in rates.phases if p.labels]
+    return sum(p.labels for p in labeled) / sum(p.jobs * p.job_s for p in labeled) if labeled else 0.0
 
 
 def describe(plan: Mapping[str, Any]) -> str:
-    """The estimate as lines for people."""
+    """The estimate as text."""
     hours = plan["hours"]
-    took = f"{hours:.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
+    duration = f"{hours:.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
     parts = {name: seconds for name, seconds in plan["seconds"].items() if seconds}
-    lines = [f"{plan['run']} with {plan['workers']} workers on {plan['nodes']} nodes: {took}"]
+    lines = [f"{plan['run']} with {plan['workers']} workers on {plan['nodes']} nodes: {duration}"]
     lines += [f"  {name:<11}{seconds:>10.0f} s  {seconds / hours / 36:>3.0f}%" for name, seconds in parts.items()]
     for row in plan["phases"]:
         lines.append(f"  {row['phase']:<11} collect {row['collect_s']:.0f} s (by {row['limit']}), fit {row['fit_s']:.0f} s")
     lines += [
         f"network  {plan['network_bytes'] / 1e9:.3g} GB, at most {plan['network_peak_mbit_per_s']:.3g} Mbit/s to the learner",
         f"disk     {plan['disk_bytes'] / 1e9:.3g} GB on the head",
-        f"rates    a worker {plan['env_steps_per_s']:,.0f} environment steps/s, {plan['labels_per_s']:,.0f} labels/s, "
-        f"{plan['bytes_a_trajectory']:,} bytes a trajectory, {plan['ingest_per_s']:,.0f} trajectories/s into the learner",
+        f"rates    per worker {plan['env_steps_per_s']:,.0f} environment steps/s, {plan['labels_per_s']:,.0f} labels/s, "
+        f"{plan['bytes_a_trajectory']:,} bytes per trajectory, {plan['ingest_per_s']:,.0f} trajectories/s into the learner",
         f"first bottleneck: {plan['bottleneck']} ({plan['why']})",
-        f"at most {plan['useful_workers']} workers have something to do at once",
+        f"at most {plan['useful_workers']} workers have a job at the same time",
     ]
     return "\n".join(lines)

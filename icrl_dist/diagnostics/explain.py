@@ -1,4 +1,4 @@
-"""Where a training example came from: the ledger's row, checked against everything that is left of it."""
+"""The origin of a training example: its row in the ledger, compared with the stored bytes and weights."""
 
 from __future__ import annotations
 
@@ -23,42 +23,42 @@ from icrl_dist.types import Adversary, Identity, Task
 
 
 def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, Any]:
-    """All that is known of one trajectory of a run; ``rerun`` makes it once more and compares the bytes.
+    """The origin of one trajectory of a run; ``rerun`` repeats its job and compares the bytes.
 
-    Raises ConfigError if the run has no such trajectory, Damaged if its bytes changed.
+    Raises ConfigError if the run has no such trajectory, Damaged if its bytes cannot be decoded.
     """
-    store, lineage = _opened(folder)
+    store, lineage = _open(folder)
     try:
         row = store.ledger[identity]
         trajectory = store.read(identity)
     except KeyError:
-        raise ConfigError(f"{folder}: has no trajectory {identity}; `icrl-dist explain {folder}` lists what it has") from None
+        raise ConfigError(f"{folder}: has no trajectory {identity}; `icrl-dist explain {folder}` lists all of them") from None
     finally:
         store.close()
-    produced = identity.next_version
-    seed = lineage.run_of(produced).seed
+    version = identity.next_version  # the first one that is fitted to this trajectory
+    seed = lineage.run_of(version).seed
     answer: dict[str, Any] = {
         **ledger_line(row, seed),
-        "task": _named(trajectory.variation.task),
-        "adversary": _named(trajectory.variation.adversary),
+        "task": _describe(trajectory.variation.task),
+        "adversary": _describe(trajectory.variation.adversary),
         "episode_return": trajectory.episode_return,
         "steps": len(trajectory.actions),
         "labels": len(trajectory.labels),
-        "learned_by": [f"T^{version}" for version in range(produced, newest_version(folder) + 1)],
-        "from_ancestor": produced <= max((newest for newest, _ in lineage.ancestors), default=-1),
+        "learned_by": [f"T^{later}" for later in range(version, newest_version(folder) + 1)],
+        "from_ancestor": version <= max((newest for newest, _ in lineage.ancestors), default=-1),
         "intact": wire.trajectory_digest(trajectory) == row.sha256,
     }
     if row.policy_version >= 0:
         manifest = load_checkpoint(checkpoint_file(folder, row.policy_version)).manifest
         answer["weights_intact"] = manifest["weights_digest"] == row.weights_digest
     if rerun:
-        answer["rerun_equal"] = _again(folder, lineage.run_of(produced), row) == row.sha256
+        answer["rerun_equal"] = _repeat(folder, lineage.run_of(version), row) == row.sha256
     return answer
 
 
 def ledger(folder: Path) -> Iterator[dict[str, Any]]:
-    """A line for every trajectory of a run, in canonical order."""
-    store, lineage = _opened(folder)
+    """The ledger as dictionaries, one per trajectory of a run, in canonical order."""
+    store, lineage = _open(folder)
     try:
         for row in store.ledger:
             yield ledger_line(row, lineage.run_of(row.identity.next_version).seed)
@@ -67,7 +67,7 @@ def ledger(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def ledger_line(row: Row, seed: int) -> dict[str, Any]:
-    """A row of the ledger as plain values."""
+    """A row of the ledger as values for JSON."""
     return {
         "identity": str(row.identity),
         "seed": seed,
@@ -84,48 +84,48 @@ def ledger_line(row: Row, seed: int) -> dict[str, Any]:
 
 
 def describe(answer: dict[str, Any]) -> str:
-    """The answer for people, a line a fact."""
-    acted = (
+    """The answer of ``explain`` as text, one fact per line."""
+    policy = (
         f"T^{answer['policy_version']} ({answer['weights_digest'][:16]})"
         if answer["policy_version"] >= 0
         else "a policy without weights"
     )
     if "weights_intact" in answer:
-        acted += ", whose checkpoint is there" if answer["weights_intact"] else ", whose checkpoint holds OTHER weights"
+        policy += ", equal to its checkpoint" if answer["weights_intact"] else ", whose checkpoint has DIFFERENT weights"
     origin = {"self": "later trials of its own variation (Algorithm 3, line 14)", "optimal": "the variation's optimal policy"}
     facts = {
-        "trajectory": answer["identity"] + (" (of the run that this one was forked from)" if answer["from_ancestor"] else ""),
+        "trajectory": answer["identity"] + (" (from the run that this one was forked from)" if answer["from_ancestor"] else ""),
         "task": answer["task"],
         "adversary": answer["adversary"],
-        "acted": acted,
+        "policy": policy,
         "seed": f"SeedSequence({answer['seed']}, spawn_key={tuple(answer['spawn_key'])})",
-        "made by": f"worker {answer['worker']}",
+        "collected by": f"worker {answer['worker']}",
         "return": f"{answer['episode_return']:g} in {answer['steps']} steps",
-        "labels": f"{answer['labels']} of its own, " if answer["labels"] else "",
-        "learned by": ", ".join(answer["learned_by"]) or "nothing yet",
+        "labels": f"{answer['labels']} in the trajectory, " if answer["labels"] else "",
+        "trained": ", ".join(answer["learned_by"]) or "no version yet",
         "stored": f"segment {answer['segment']}, byte {answer['byte']}, {answer['bytes']} bytes",
         "sha256": answer["sha256"] + (" (intact)" if answer["intact"] else " (CHANGED)"),
     }
     facts["labels"] += f"from {origin.get(answer['label_origin'], answer['label_origin'])}"
     if "rerun_equal" in answer:
-        facts["made again"] = "the same bytes" if answer["rerun_equal"] else "OTHER bytes: another machine, or other versions?"
-    return "\n".join(f"{name:<11} {fact}" for name, fact in facts.items())
+        facts["rerun"] = "the same bytes" if answer["rerun_equal"] else "DIFFERENT bytes: another machine or other versions?"
+    return "\n".join(f"{name:<12} {fact}" for name, fact in facts.items())
 
 
-def _opened(folder: Path) -> tuple[Store, Lineage]:
+def _open(folder: Path) -> tuple[Store, Lineage]:
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"{folder}: no such run folder")
     run = load(str(folder / "run.toml"))
     return Store(folder / "dataset", readonly=True), Lineage.of(folder, run)
 
 
-def _named(named: Task | Adversary) -> str:
-    return f"{named.kind} " + ", ".join(f"{name}={value}" for name, value in named.params)
+def _describe(part: Task | Adversary) -> str:
+    return f"{part.kind} " + ", ".join(f"{name}={value}" for name, value in part.params)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Checkpoints:
-    """The versions of a run folder, for a job that is done again."""
+    """The weights of a run folder, for a job that is repeated."""
 
     folder: Path
 
@@ -134,8 +134,8 @@ class _Checkpoints:
         return trained(checkpoint).model, str(checkpoint.manifest["weights_digest"])
 
 
-def _again(folder: Path, run: Run, row: Row) -> str:
-    """The digest of the trajectory, from its job done once more in this process."""
+def _repeat(folder: Path, run: Run, row: Row) -> str:
+    """Repeat the job of a trajectory in this process.  Returns the trajectory's new digest."""
     method, problem = methods.of(run), problems.of(run)
     for phase in method.phases(run):
         for job in method.ask(run, phase) if (phase.stage, phase.round) == row.identity[:2] else ():
@@ -144,4 +144,4 @@ def _again(folder: Path, run: Run, row: Row) -> str:
                 for trajectory in kinds.do(repeated, problem, method, _Checkpoints(folder), "explain"):
                     if trajectory.identity == row.identity:
                         return wire.trajectory_digest(trajectory)
-    raise ConfigError(f"{row.identity}: the run's present numbers ask for no such trajectory")
+    raise ConfigError(f"{row.identity}: the settings of the run request no such trajectory; was run.toml changed?")

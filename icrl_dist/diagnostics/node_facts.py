@@ -1,4 +1,4 @@
-"""What one machine of a cluster says of itself, and whether it reaches another: asked of every one before a run."""
+"""Facts about one node of a cluster, collected on every node before a run, and the comparison of two nodes."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from icrl_dist.version import digest as code_digest
 
 VERSIONS = ("ray", "torch", "eclipse-zenoh", "numpy", "msgpack")
 REACH_S = 3.0
-"""A port that has not answered after so long is not reached."""
+"""Seconds after which a port that has not answered counts as unreachable."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """A machine, as a run needs to know it."""
+    """Properties of a node that a run depends on."""
 
     host: str
     python: str
     version: str
     code: str
-    """``code_digest()`` of what it would run."""
+    """``version.digest()`` of its code."""
     versions: dict[str, str]
     time: float
-    """Its clock, seconds since 1970."""
+    """Its clock, in seconds since 1970."""
     cores: int
     shared_memory: int
-    """Free bytes in /dev/shm; 0 if there is none."""
+    """Free bytes in /dev/shm; 0 if it does not exist."""
     open_files: int
-    """How many it may have open at once."""
+    """Limit of open files."""
     certificates: str
-    """What is wrong with its certificates; empty if nothing is, or if none are needed."""
+    """The error of its certificates; empty if they are valid or not needed."""
     unreached: tuple[str, ...]
-    """Why it does not reach each of the ports that it was asked about and does not reach."""
+    """One error message for each requested port that it cannot reach."""
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def facts(certificates: str = "", ports: Sequence[tuple[str, int]] = ()) -> dict[str, Any]:
-    """This machine's ``Facts``, as a dictionary: another version of this package may read it.
+    """The ``Facts`` of this machine, as a dictionary, because another version of this package may read it.
 
-    ``certificates``: their folder, of which the worker's are looked at; ``ports``: hosts and ports
-    that it needs, where somebody listens now.
+    ``certificates``: the folder in which the worker's certificates are checked.  ``ports``: hosts and
+    ports that this machine must reach, where a socket listens now.
     """
     shm = Path("/dev/shm")
     return Facts(
@@ -90,7 +90,7 @@ def _certificates(folder: str) -> str:
 
 
 def reach(host: str, port: int, timeout_s: float = REACH_S) -> str:
-    """Why nothing is reached there from here; empty if something is."""
+    """Try to connect.  Returns the error message, or an empty string if the connection succeeds."""
     try:
         with socket.create_connection((host, port), timeout=timeout_s):
             return ""
@@ -100,9 +100,9 @@ def reach(host: str, port: int, timeout_s: float = REACH_S) -> str:
 
 @contextlib.contextmanager
 def listening(host: str, port: int) -> Iterator[int]:
-    """Somebody to reach: a port of this machine that takes connections and says nothing; yields its number.
+    """Accept connections at a port of this machine, for nodes that test whether they reach it; yields its number.
 
-    Raises OSError if it cannot be bound.
+    Raises OSError if the port cannot be bound.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=256) as server:
@@ -110,9 +110,9 @@ def listening(host: str, port: int) -> Iterator[int]:
 
 
 def differences(here: dict[str, Any], there: dict[str, Any]) -> list[str]:
-    """What another machine has otherwise than this one and a run cannot bear, in words: ``torch 2.8 there, 2.9 here``."""
+    """Differences of another node from this machine that a run does not allow, such as ``torch 2.8 there, 2.9 here``."""
     found = []
-    minor = [str(one["python"]).rsplit(".", 1)[0] for one in (here, there)]
+    minor = [str(facts["python"]).rsplit(".", 1)[0] for facts in (here, there)]
     if minor[0] != minor[1]:
         found.append(f"Python {there['python']} there, {here['python']} here")
     if there["version"] != here["version"]:

@@ -1,1 +1,1 @@
-"""Start the learner and the workers of one run and watch them."""
+"""Starts and supervises the learner and the workers of one run."""

@@ -1,4 +1,4 @@
-"""The learner as a child process of ``icrl-dist train``: its events, what it is told, its restarts, its end."""
+"""The learner as a child process of ``icrl-dist train``: events from it, messages to it, restarts, its end."""
 
 from __future__ import annotations
 
@@ -10,40 +10,39 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import ConfigError, Run
-
-Report = Callable[[dict[str, Any]], None]
+from icrl_dist.launch.run_folder import ReportEvent
 
 
 class TrainFailed(RuntimeError):  # noqa: N818
-    """The run failed; one line for the user."""
+    """The run failed; the message is one line for the user."""
 
 
 @contextlib.contextmanager
-def running(run: Run, folder: Path) -> Iterator[Learner]:
-    """A learner process for the run in this folder; when all is over it has ended."""
-    learner = Learner(folder, run.stream.endpoint, run.learner.restarts)
+def running(run: Run, folder: Path) -> Iterator[LearnerProcess]:
+    """A learner process for the run in this folder; it has ended when the context ends."""
+    learner = LearnerProcess(folder, run.stream.endpoint, run.learner.restarts)
     try:
         yield learner
     finally:
         learner.end()
 
 
-class Learner:
-    """The learner process: its events, its restarts, its end."""
+class LearnerProcess:
+    """A learner process that is restarted from its checkpoint if it is killed."""
 
     def __init__(self, folder: Path, endpoint: str, restarts: int) -> None:
-        self._folder, self.endpoint, self._budget = folder, endpoint, restarts
+        self._folder, self.endpoint, self._restarts_left = folder, endpoint, restarts
         self._queue: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._error = ""
         self._finished = False
         self._excused: list[str] = []
         self.deaths = 0
-        """Times that it was killed and started again."""
+        """Number of restarts."""
         self._start()
 
     def _start(self) -> None:
@@ -60,14 +59,14 @@ class Learner:
                 self._queue.put(json.loads(line))
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """What happened since the last call; waits a tenth of a second at most for the first."""
-        wait = 0.1
+        """Events since the last call; waits at most 0.1 s for the first one."""
+        timeout_s = 0.1
         while True:
             try:
-                event = self._queue.get(timeout=wait)
+                event = self._queue.get(timeout=timeout_s)
             except queue.Empty:
                 return
-            wait = 0.001
+            timeout_s = 0.001
             if event["event"] == "listening":
                 self.endpoint = event["endpoint"]
             elif event["event"] == "error":
@@ -77,21 +76,24 @@ class Learner:
             yield event
 
     def excuse(self, workers: Sequence[str]) -> None:
-        """Tell it of the workers, of all so far, that were lost with their machines: their jobs are not to blame."""
+        """Send the learner the workers that were lost with their nodes, so that their jobs do not count as failed.
+
+        ``workers``: all such workers since the start of the run; only the new ones are sent.
+        """
         if new := workers[len(self._excused) :]:
             self._excused += new
-            self._tell(new)
+            self._send(new)
 
-    def _tell(self, workers: Sequence[str]) -> None:
+    def _send(self, workers: Sequence[str]) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has died, and the next one is told
+        with contextlib.suppress(BrokenPipeError):  # the learner has died; watch() sends the list to the next one
             os.write(self._process.stdin.fileno(), json.dumps(workers).encode() + b"\n")
 
-    def watch(self, report: Report) -> None:
-        """Start the learner again from its checkpoint if it was killed.
+    def watch(self, report: ReportEvent) -> None:
+        """Restart the learner from its checkpoint if it was killed.
 
-        Raises ConfigError or TrainFailed with its own words if it gave up, TrainFailed if it
-        was killed more often than the budget allows.
+        Raises ConfigError or TrainFailed with the learner's message if it ended with an error, and
+        TrainFailed if it was killed more often than ``learner.restarts``.
         """
         code = self._process.poll()
         if code is None or self._finished:
@@ -103,17 +105,17 @@ class Learner:
             return
         if self._error:
             raise (ConfigError if code == 2 else TrainFailed)(self._error)
-        if self._budget == 0:
-            raise TrainFailed(f"the learner died too often (exit code {code}); its last words are in {self._log.name}")
-        self._budget -= 1
+        if self._restarts_left == 0:
+            raise TrainFailed(f"the learner died too often (exit code {code}); its error output is in {self._log.name}")
+        self._restarts_left -= 1
         self.deaths += 1
-        report({"event": "note", "text": f"the learner died (exit code {code}); starting it again from its checkpoint"})
-        self._let_go()
+        report({"event": "note", "text": f"the learner died (exit code {code}); restarting it from its checkpoint"})
+        self._close_files()
         self._start()
-        self._tell(self._excused)
+        self._send(self._excused)
 
-    def interrupt(self, report: Report) -> None:
-        """Ask it to write a checkpoint and end."""
+    def interrupt(self, report: ReportEvent) -> None:
+        """End the learner, which writes a checkpoint first."""
         self._process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=60)
@@ -121,7 +123,7 @@ class Learner:
             report(event)
 
     def end(self) -> None:
-        """Wait for a finished learner, end any other, and leave nothing behind."""
+        """Wait for the learner if it has finished, else terminate it; close its files."""
         try:
             if not self._finished:
                 self._process.terminate()
@@ -129,9 +131,9 @@ class Learner:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._let_go()
+        self._close_files()
 
-    def _let_go(self) -> None:
+    def _close_files(self) -> None:
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._log.close()

@@ -1,9 +1,9 @@
-"""Run folders: which files in one are this program's, where one may be, and how a run takes another's place.
+"""Run folders: the files that a run writes, the allowed places, and the replacement of one run by another.
 
-Nothing of the user's is ever deleted.  Only files that this program wrote are removed, by a list of
-their names that is kept here and nowhere else.  A folder with any other file is refused by the names
-of those files.  A run that is replaced lies beside its folder as ``.NAME.replaced`` until the new
-run has its first checkpoint, and comes back if the new run ends before that.
+User files are never deleted.  Only files that this program writes are removed; the list of their
+names is in this file only.  A folder with any other file is refused, and the message names the file.
+A replaced run is kept beside its folder as ``.NAME.replaced`` until the new run has its first
+checkpoint, and is restored if the new run ends before that.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from typing import IO, Any, Self
 from icrl_dist.config.run import ConfigError
 from icrl_dist.storage.files import StoreError, held, hold, newest_version
 
-Report = Callable[[dict[str, Any]], None]
+ReportEvent = Callable[[dict[str, Any]], None]
+"""Shows one event of a run, such as ``{"event": "note", "text": ...}``."""
 
 WAIT_S = 10.0
-"""A run that was just killed has so long to end before its folder counts as in use."""
+"""Seconds to wait for the processes of a killed run to end before its folder counts as in use."""
 
 _REPORTS = r"(online|posterior)-(.+-)?T\d+-[0-9a-f]*-.+\.(json|png)|(online|posterior)\.json|(adaptation|posterior)\.png"
 _NAMES = {
@@ -36,20 +37,20 @@ _NAMES = {
     "tensorboard": r"events\.out\.tfevents\..+",
     "": r"(run\.toml|env\.json|fork\.json|result\.json|metrics\.jsonl|agent\.npz|learner\.log|learner\.err|endpoint|\.lock)",
 }
-"""Every folder within a run folder, the deepest first, and a pattern of the names that this program writes there."""
+"""The folders within a run folder, the deepest first, each with a pattern of the file names that this program writes."""
 
 
 def owned(place: str, name: str) -> bool:
-    """Whether this program writes a file of this name into ``place``, a folder within a run folder ("" for the run folder).
+    """Whether this program writes a file of this name into ``place``, a folder within a run folder ("": the run folder).
 
-    The parts that ``files.atomic_write`` leaves behind when it is killed count too.
+    This includes the ``.part`` files that a killed ``files.atomic_write`` leaves behind.
     """
     pattern = _NAMES[place]
     return re.fullmatch(rf"(?s:{pattern}|\.({pattern})\.\d+\.part)", name) is not None
 
 
 def foreign(folder: Path) -> list[str]:
-    """What lies in a folder and is not this program's, by its path from there; links are never followed.
+    """Files in a run folder that this program does not write, as relative paths.  Links are not followed.
 
     Raises ConfigError for a folder that cannot be read.
     """
@@ -62,105 +63,106 @@ def foreign(folder: Path) -> list[str]:
 def _foreign(folder: Path, place: str) -> Iterator[str]:
     with os.scandir(folder / place) as entries:
         for entry in entries:
-            within = f"{place}/{entry.name}" if place else entry.name
+            path = f"{place}/{entry.name}" if place else entry.name
             if entry.is_dir(follow_symlinks=False):
-                if within in _NAMES:
-                    yield from _foreign(folder, within)
+                if path in _NAMES:
+                    yield from _foreign(folder, path)
                 else:
-                    yield f"{within}/"
+                    yield f"{path}/"
             elif not (entry.is_file(follow_symlinks=False) and owned(place, entry.name)):
-                yield within
+                yield path
 
 
 def remove(folder: Path) -> None:
-    """Remove a run folder that holds nothing but this program's files; one that is not there is no error.
+    """Remove a run folder if it exists and contains only files of this program.
 
-    ``run.toml`` goes first: a folder that was left half removed holds no run.  Raises ConfigError,
-    and removes nothing, if the folder is a link or holds other files.
+    ``run.toml`` is removed first, so that a half removed folder does not count as a run.  Raises
+    ConfigError, and removes nothing, if the folder is a link or contains other files.
     """
     if not os.path.lexists(folder):
         return
     if folder.is_symlink():
-        raise ConfigError(f"{folder}: is a link, and is not removed; remove it, or use another --out")
-    _only_ours(folder)
+        raise ConfigError(f"{folder}: is a symbolic link, which is never removed; remove it yourself, or use another --out")
+    _require_owned(folder)
     (folder / "run.toml").unlink(missing_ok=True)
     for place in _NAMES:
-        here = folder / place
-        if here.is_dir():
-            with os.scandir(here) as entries:
+        directory = folder / place
+        if directory.is_dir():
+            with os.scandir(directory) as entries:
                 names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False) and owned(place, entry.name)]
             for name in names:
-                (here / name).unlink(missing_ok=True)
-            here.rmdir()  # fails if a file has come that is not ours
+                (directory / name).unlink(missing_ok=True)
+            directory.rmdir()  # fails if another file has appeared meanwhile
 
 
-def _only_ours(folder: Path) -> None:
+def _require_owned(folder: Path) -> None:
     if others := foreign(folder):
-        named = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-        raise ConfigError(f"{folder}: holds {named}, not written by icrl-dist: move that away, or use another --out")
+        names = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
+        raise ConfigError(f"{folder}: holds {names}, not written by icrl-dist: move that away, or use another --out")
 
 
 def check_place(folder: Path, source: Path | None = None) -> None:
-    """Refuse a folder that is not, or cannot become, a run's own; ``source`` is the run that a fork begins with.
+    """Raise ConfigError if the folder cannot be a run folder.
 
-    Raises ConfigError.
+    Refused are links, files, the current folder, the home folder and their parents, and any overlap
+    with ``source``, the run of a fork.
     """
-    remedy = "name a folder of the run's own, such as runs/demo"
+    remedy = "name a folder for this run only, such as runs/demo"
     try:
-        real, here = folder.resolve(), Path.cwd().resolve()
+        real, current = folder.resolve(), Path.cwd().resolve()
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"--out {folder}: {error}; {remedy}") from None
     if folder.is_symlink():
-        raise ConfigError(f"--out {folder}: is a link; name the folder itself, {real}")
+        raise ConfigError(f"--out {folder}: is a symbolic link; name the folder itself, {real}")
     if folder.name == "..":
         raise ConfigError(f"--out {folder}: ends in ..; name the folder itself, {real}")
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"--out {folder}: is a file; {remedy}")
-    if _holds(real, here):
-        raise ConfigError(f"--out {folder}: is the current folder, as an empty --out also is, or holds it; {remedy}")
+    if _contains(real, current):
+        raise ConfigError(f"--out {folder}: is or contains the current folder (an empty --out means that folder); {remedy}")
     with contextlib.suppress(RuntimeError):  # no home folder
-        if _holds(real, Path.home().resolve()):
-            raise ConfigError(f"--out {folder}: is the home folder, or holds it; {remedy}")
+        if _contains(real, Path.home().resolve()):
+            raise ConfigError(f"--out {folder}: is or contains the home folder; {remedy}")
     if source is not None:
         parent = source.resolve()
-        if _holds(real, parent) or _holds(parent, real):
-            raise ConfigError(f"--out {folder}: is, holds or lies in {source}, the run of --from; use another --out")
+        if _contains(real, parent) or _contains(parent, real):
+            raise ConfigError(f"--out {folder}: overlaps with {source}, the run of --from; use another --out")
 
 
-def _holds(folder: Path, other: Path) -> bool:
+def _contains(folder: Path, other: Path) -> bool:
     return folder == other or folder in other.parents
 
 
 def aside_of(folder: Path) -> Path:
-    """Where the run that was in a folder lies while another replaces it."""
+    """Where the old run of a folder is kept while a new run replaces it."""
     return folder.with_name(f".{folder.name}.replaced")
 
 
 def recover(folder: Path) -> None:
-    """Put right what a command that was killed while it replaced the run in ``folder`` has left.
+    """Finish a replacement of the run in ``folder`` that was interrupted by a kill.
 
-    If the new run has a checkpoint, the old one is removed.  If the folder is gone, the old one
-    takes its place again.  If both are there, neither is touched.  Raises ConfigError in the last
-    case, and while such a command is still at work.
+    If the new run has a checkpoint, the old run is removed.  If the folder does not exist, the old
+    run is restored.  If both exist and the new run has no checkpoint, neither is changed and
+    ConfigError is raised; also while the command that replaces the run is still active.
     """
     aside = aside_of(folder)
     if not os.path.lexists(aside):
         return
     if held(aside) or held(folder):
-        raise ConfigError(f"--out {folder}: a run is on in this folder; end it, or use another --out")
-    if not (aside / "run.toml").is_file() or _has_come_far(folder):
+        raise ConfigError(f"--out {folder}: a run is active in this folder; end it, or use another --out")
+    if not (aside / "run.toml").is_file() or _has_checkpoint(folder):
         remove(aside)
     elif not os.path.lexists(folder):
         aside.rename(folder)
     else:
         raise ConfigError(
-            f"{folder}: a command that replaced the run in it was killed; the earlier run lies in {aside}: "
-            f"delete {folder} to have that one back, or {aside} to keep the new one, then give the command again"
+            f"{folder}: a command that was replacing this run was killed; the old run is in {aside}: "
+            f"delete {folder} to restore the old run, or {aside} to keep the new run, then repeat the command"
         )
 
 
-def _has_come_far(folder: Path) -> bool:
-    """Whether the run in a folder has made a checkpoint of its own, or ended."""
+def _has_checkpoint(folder: Path) -> bool:
+    """Whether the run in a folder has a checkpoint of its own, beyond those of its fork, or has ended."""
     first = -1
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         first = int(json.loads((folder / "fork.json").read_text())["version"])
@@ -168,42 +170,43 @@ def _has_come_far(folder: Path) -> bool:
 
 
 def take(folder: Path) -> IO[bytes]:
-    """Be the only one at work in a run folder until the returned file is closed.
+    """Lock a run folder until the returned file is closed.
 
-    Raises ConfigError while a run is on in it.
+    Raises ConfigError if a run is active in the folder, or if the folder cannot be written.
     """
     try:
         return hold(folder, WAIT_S)
     except StoreError:
-        raise ConfigError(f"--out {folder}: a run is on in this folder; end it, or use another --out") from None
+        raise ConfigError(f"--out {folder}: a run is active in this folder; end it, or use another --out") from None
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
 
 
-class Begun:
-    """A run that begins in a folder, as a context; ``set_aside`` makes it the successor of the one that is there.
+class FolderTransaction:
+    """Replaces the run in a folder by a new one, or restores it; a context around the new run.
 
-    The earlier run is removed once the new one has its first checkpoint, or the context ends well.
-    It comes back if the context ends with an error, or an interruption, before that.
+    After ``set_aside`` the old run is removed when the new run has its first checkpoint, or when the
+    context ends without an error.  The old run is restored if the context ends with an error, or is
+    interrupted, before that.  Without ``set_aside`` nothing is removed or restored.
     """
 
-    def __init__(self, folder: Path, first: int = -1) -> None:
-        """``first``: the version that the run begins with, of which it is not the maker; -1 if there is none."""
-        self.restored = False
-        """Whether the earlier run is in its folder again."""
-        self._folder, self._first = folder, first
-        self._report: Report = lambda event: None
+    def __init__(self, folder: Path, start_version: int = -1) -> None:
+        """``start_version``: the version that a fork starts from and did not produce; -1 for other runs."""
+        self.rolled_back = False
+        """Whether the old run is in its folder again."""
+        self._folder, self._start_version = folder, start_version
+        self._report: ReportEvent = lambda event: None
         self._lock: IO[bytes] | None = None
-        self._settling = threading.Lock()
+        self._deciding = threading.Lock()
 
     def set_aside(self) -> None:
-        """Move the run that is in the folder aside, where it stays locked.
+        """Move the old run to ``aside_of(folder)`` and keep it locked.
 
-        Raises ConfigError, and touches nothing, if the folder holds no run or anything else, or if a
-        run is on in it.
+        Raises ConfigError, and changes nothing, if the folder contains no run or other files, or if
+        a run is active in it.
         """
         folder = self._folder
-        _only_ours(folder)
+        _require_owned(folder)
         if not all((folder / name).is_file() for name in ("run.toml", "env.json")):
             raise ConfigError(f"--overwrite: {folder} holds no run; empty it, or use another --out")
         lock = take(folder)
@@ -214,20 +217,20 @@ class Begun:
             raise ConfigError(f"--overwrite: {folder} cannot be moved aside ({error.strerror}); use another --out") from None
         self._lock = lock
 
-    def heed(self, report: Report) -> Report:
-        """``report``, which also removes the earlier run as soon as events tell of the new one's first checkpoint."""
+    def commit_at_checkpoint(self, report: ReportEvent) -> ReportEvent:
+        """Wrap ``report`` so that the event of the new run's first checkpoint also removes the old run."""
         self._report = report
 
-        def heeded(event: dict[str, Any]) -> None:
+        def report_and_commit(event: dict[str, Any]) -> None:
             report(event)
-            if event.get("version", -1) > self._first and newest_version(self._folder) > self._first:
-                self.settle()
+            if event.get("version", -1) > self._start_version and newest_version(self._folder) > self._start_version:
+                self.commit()
 
-        return heeded
+        return report_and_commit
 
-    def settle(self) -> None:
-        """Remove the earlier run: the new one stands.  What cannot be removed is named, and is no error."""
-        with self._settling:
+    def commit(self) -> None:
+        """Remove the old run.  If that fails, a note names its folder; that is no error."""
+        with self._deciding:
             lock, self._lock = self._lock, None
         if lock is None:
             return
@@ -235,11 +238,11 @@ class Begun:
             try:
                 remove(aside_of(self._folder))
             except (OSError, ConfigError) as error:
-                self._note(f"the run that was replaced stays in {aside_of(self._folder)}: {error}")
+                self._note(f"the replaced run could not be removed from {aside_of(self._folder)}: {error}")
 
-    def restore(self) -> None:
-        """Put the earlier run back in the place of the new one, unless somebody put other files there."""
-        with self._settling:
+    def roll_back(self) -> None:
+        """Remove the new run and restore the old one.  If the folder contains user files, a note names both folders."""
+        with self._deciding:
             lock, self._lock = self._lock, None
         if lock is None:
             return
@@ -248,10 +251,10 @@ class Begun:
                 remove(self._folder)
                 aside_of(self._folder).rename(self._folder)
             except (OSError, ConfigError) as error:
-                self._note(f"the run that was in {self._folder} lies in {aside_of(self._folder)}: {error}")
+                self._note(f"the old run of {self._folder} is kept in {aside_of(self._folder)}: {error}")
             else:
-                self.restored = True
-                self._note(f"the run that was in {self._folder} before is there again")
+                self.rolled_back = True
+                self._note(f"the old run is restored in {self._folder}")
 
     def _note(self, text: str) -> None:
         self._report({"event": "note", "text": text})
@@ -260,25 +263,25 @@ class Begun:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if kind is None or newest_version(self._folder) > self._first:
-            self.settle()
+        if kind is None or newest_version(self._folder) > self._start_version:
+            self.commit()
         else:
-            self.restore()
+            self.roll_back()
 
 
-_MADE = ("dataset_digest", "weights_digest", "version", "trajectories")
+_PRODUCED = ("dataset_digest", "weights_digest", "version", "trajectories")
 
 
-def concluded(folder: Path, result: dict[str, Any], evaluated: dict[str, Any]) -> dict[str, Any]:
-    """What ``result.json`` is to hold: what the training made, and how it was evaluated.
+def final_result(folder: Path, result: dict[str, Any], evaluation: dict[str, Any]) -> dict[str, Any]:
+    """The content of ``result.json``: the result of the training and of the evaluation.
 
-    A run that had ended before and is resumed keeps the seconds that it took then; if nothing was
-    collected or fitted since, it keeps everything but the evaluation.
+    If a finished run was resumed, the seconds of its first end are kept; if nothing was collected or
+    fitted since then, everything but the evaluation is kept.
     """
     try:
         earlier: dict[str, Any] = json.loads((folder / "result.json").read_text())
     except (FileNotFoundError, ValueError):
-        return result | evaluated
-    if any(earlier.get(name) != result.get(name) for name in _MADE) or result.get("repaired"):
-        return result | {"seconds": earlier.get("seconds", result["seconds"])} | evaluated
-    return earlier | {"folder": result["folder"]} | evaluated
+        return result | evaluation
+    if any(earlier.get(name) != result.get(name) for name in _PRODUCED) or result.get("repaired"):
+        return result | {"seconds": earlier.get("seconds", result["seconds"])} | evaluation
+    return earlier | {"folder": result["folder"]} | evaluation

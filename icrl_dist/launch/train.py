@@ -1,7 +1,7 @@
-"""Running both programs for one run: the learner as a child process, the workers through Ray.
+"""Runs the learner and the workers of one run: the learner as a child process, the workers through Ray.
 
-``inline`` runs the same learner and worker in this process over a MemoryLink instead, with
-neither Ray nor Zenoh.
+``train_inline`` runs the same learner and one worker in this process over a MemoryLink, without Ray
+and Zenoh.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import ConfigError, Run, dumps, load
-from icrl_dist.diagnostics.doctor import need_ray_token
+from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
-from icrl_dist.launch.learner_process import Report, TrainFailed
+from icrl_dist.launch.learner_process import TrainFailed
+from icrl_dist.launch.run_folder import FolderTransaction, ReportEvent
 from icrl_dist.storage.files import atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
@@ -29,45 +30,48 @@ from icrl_dist.stream.link import Keys
 
 
 class TrainInterrupted(Exception):  # noqa: N818
-    """The run was interrupted; a checkpoint has been written."""
+    """The run was interrupted; its checkpoint is written."""
 
 
-def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> run_folder.Begun:
-    """Make the run folder: ``run.toml``, ``env.json``, and with ``source`` what another run's version stands on.
+def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> FolderTransaction:
+    """Create or check the run folder: ``run.toml``, ``env.json``, and for a fork the data and weights of ``source``.
 
-    The run goes on within the returned context, which decides what becomes of a run that is
-    overwritten.  Raises ConfigError if the folder cannot be a run's own, if it exists and is neither
-    to be resumed nor overwritten, if a run is on in it, or if it is to be resumed with other
-    numbers; where its learner listens and is reached may have changed.
+    Train within the returned context; it removes or restores a run that is overwritten.  Raises
+    ConfigError if the folder cannot be a run folder, if it exists and neither ``resume`` nor
+    ``overwrite`` is set, if a run is active in it, or if ``resume`` has other settings than the run.
+    Only the endpoints and certificates of the stream may differ, because a resumed run may have
+    another head node.
     """
     if resume and overwrite:
-        raise ConfigError(f"--resume --overwrite: one goes on with the run in {folder}, the other replaces it; leave one out")
+        raise ConfigError(f"--resume --overwrite: one continues the run in {folder}, the other replaces it; leave one out")
     run_folder.check_place(folder, source[0] if source else None)
     try:
         Keys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
     run_folder.recover(folder)
-    begun = run_folder.Begun(folder, source[1] if source and not resume else -1)
+    transaction = FolderTransaction(folder, source[1] if source and not resume else -1)
     if folder.exists() and not resume and any(folder.iterdir()):
         if not overwrite:
-            raise ConfigError(f"{folder} exists: use --resume to go on with it, --overwrite to begin anew, or another --out")
-        begun.set_aside()
+            raise ConfigError(f"{folder} exists: use --resume to continue the run, --overwrite to replace it, or another --out")
+        transaction.set_aside()
     try:
-        _make(run, folder, resume, source)
+        _create(run, folder, resume, source)
     except BaseException:
-        begun.restore()
+        transaction.roll_back()
         raise
-    return begun
+    return transaction
 
 
-def _make(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | None) -> None:
+def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | None) -> None:
     file = folder / "run.toml"
     if resume and not file.exists():
-        raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to begin one")
+        raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to start one")
     before = load(str(file)) if resume else None
-    if before is not None and _elsewhere(before, run) != run:
-        raise ConfigError(f"--resume: {file} has other numbers than asked for; resume with the run's own, or use another --out")
+    if before is not None and _with_endpoints_of(before, run) != run:
+        raise ConfigError(
+            f"--resume: {file} has other settings than this command; resume without overrides, or use another --out"
+        )
     if resume:
         run_folder.take(folder).close()
     try:
@@ -77,38 +81,38 @@ def _make(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | None)
         if before is None:
             file.write_text(dumps(run))
         elif before != run:
-            began = file.stat()
+            status = file.stat()
             atomic_write(file, lambda to: to.write(dumps(run).encode()))
-            os.utime(file, ns=(began.st_atime_ns, began.st_mtime_ns))  # when the run began
+            os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))  # its time is the start of the run
         atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
 
 
-def _elsewhere(run: Run, other: Run) -> Run:
-    """The run with the other's places, which are the head's and no part of a result: another head may go on."""
-    there = {name: getattr(other.stream, name) for name in ("endpoint", "connect", "certificates")}
-    return dataclasses.replace(run, stream=dataclasses.replace(run.stream, **there))
+def _with_endpoints_of(run: Run, other: Run) -> Run:
+    """``run`` with the endpoints and certificates of ``other``: they belong to the head node and change no result."""
+    fields = {name: getattr(other.stream, name) for name in ("endpoint", "connect", "certificates")}
+    return dataclasses.replace(run, stream=dataclasses.replace(run.stream, **fields))
 
 
-def _fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
+def _fork(source: Path, version: int, run: Run, folder: Path) -> None:
     try:
-        fork(theirs, version, run, folder)
+        fork(source, version, run, folder)
     except BaseException:
-        run_folder.remove(folder)  # it was made just now, and half a fork is no run
+        run_folder.remove(folder)  # an incomplete fork is no run
         raise
 
 
 def check_security(run: Run, address: str | None) -> None:
-    """Raises LinkError or ConfigError for certificates, or a token of Ray's, that would be missed later."""
+    """Raise LinkError or ConfigError if a certificate or Ray's token is missing that the run will need."""
     for role in ("learner",) if address else ("learner", "worker"):
         security.files(run.stream.certificates, role)
     if address and not endpoints.parse(run.stream.endpoint).loopback:
-        need_ray_token(address)
+        require_ray_token(address)
 
 
 def environment() -> dict[str, Any]:
-    """Versions and machine, as kept in every run folder."""
+    """Versions and machine of this process, the content of ``env.json``."""
     names = ("icrl-dist", "numpy", "torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "scipy")
     return {
         "python": platform.python_version(),
@@ -118,8 +122,8 @@ def environment() -> dict[str, Any]:
     }
 
 
-def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
-    """The whole run in this process, one worker on a thread; returns the learner's result."""
+def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
+    """Run the learner in this process with one worker on a thread.  Returns the learner's result."""
     import torch
 
     from actors.worker import Worker
@@ -127,12 +131,12 @@ def train_inline(run: Run, folder: Path, report: Report) -> dict[str, Any]:
     from learner.service import Interrupted, RunFailed, Service
 
     hub = MemoryHub()
-    with hub.link() as ours, hub.link() as theirs:
+    with hub.link() as learner_link, hub.link() as worker_link:
         try:
-            service = Service(run, folder, ours, report)
+            service = Service(run, folder, learner_link, report)
         except RunFailed as error:
             raise TrainFailed(str(error)) from None
-        worker = Worker(theirs, folder.name, "w0")
+        worker = Worker(worker_link, folder.name, "w0")
 
         def work() -> None:
             torch.set_num_threads(1)
@@ -163,30 +167,30 @@ def train_ray(
     folder: Path,
     actors: int | None,
     address: str | None,
-    report: Report,
+    report: ReportEvent,
     oversubscribe: bool = False,
     at_least: int | None = None,
 ) -> dict[str, Any]:
-    """The whole run with a learner process and Ray workers; returns the learner's result.
+    """Run a learner process and Ray workers.  Returns the learner's result and how often processes died.
 
-    Raises ConfigError, TrainFailed or TrainInterrupted; no process is left behind.
+    Raises ConfigError, TrainFailed or TrainInterrupted.  All processes have ended in every case.
     """
     from actors.fleet import Fleet, FleetFailed
 
-    certificates = security.folder(run.stream.certificates)  # in full: workers have a working directory of their own
+    certificates = security.folder(run.stream.certificates)  # an absolute path: workers have another working directory
     interrupted = threading.Event()
     with contextlib.ExitStack() as stack:
         stack.enter_context(_on_signals(interrupted.set))
-        if address is None:  # both start at once; on a cluster nothing does before its machines are known to fit
+        if address is None:  # without a cluster both start at once; on a cluster the nodes are checked first
             learner = stack.enter_context(learner_process.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
-        with _unmade_if_refused(folder) if address is not None else contextlib.nullcontext():
+        with _remove_if_refused(folder) if address is not None else contextlib.nullcontext():
             try:
                 fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
             except FleetFailed as error:
                 raise (TrainInterrupted if interrupted.is_set() else _failed(error)) from None
             stack.callback(fleet.close)
-            stack.enter_context(_on_signals(interrupted.set))  # once more: Ray puts its own in their place
+            stack.enter_context(_on_signals(interrupted.set))  # again, because Ray replaces the handlers
             fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
             if address is not None and interrupted.is_set():
                 raise TrainInterrupted
@@ -194,7 +198,7 @@ def train_ray(
             learner = stack.enter_context(learner_process.running(run, folder))
         result: dict[str, Any] | None = None
         started = False
-        stored = given_up = 0
+        stored = quarantined = 0
         while True:
             for event in learner.events():
                 report(event)
@@ -204,7 +208,7 @@ def train_ray(
                 elif event["event"] == "progress":
                     stored = event["trajectories"]
                 elif event["event"] in ("quarantine", "released"):
-                    given_up += 1 if event["event"] == "quarantine" else -1
+                    quarantined += 1 if event["event"] == "quarantine" else -1
                 elif event["event"] == "finished":
                     result = {name: value for name, value in event.items() if name != "event"}
             if interrupted.is_set():
@@ -215,24 +219,24 @@ def train_ray(
             learner.watch(report)
             if started:
                 try:
-                    working = fleet.watch(note, stored + given_up)
+                    working = fleet.watch(note, stored + quarantined)
                 except FleetFailed as error:
                     raise _failed(error) from None
                 learner.excuse(fleet.lost)
                 if not working:
-                    raise TrainFailed("every worker ended before the run did; see learner.log in the run folder")
-    if interrupted.is_set():  # while everything was closed
+                    raise TrainFailed("every worker ended before the run did; the cause is in learner.log in the run folder")
+    if interrupted.is_set():  # during the shutdown
         raise TrainInterrupted
     return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
 
 
 def _failed(error: Exception) -> TrainFailed:
-    return TrainFailed(f"{error}; the same command with --resume goes on from the last checkpoint")
+    return TrainFailed(f"{error}; the same command with --resume continues from the last checkpoint")
 
 
 @contextlib.contextmanager
-def _unmade_if_refused(folder: Path) -> Iterator[None]:
-    """Removes a run folder in which nothing has happened yet, so that the same command can be given again."""
+def _remove_if_refused(folder: Path) -> Iterator[None]:
+    """Remove the run folder if the run was refused before it started, so that the same command can be repeated."""
     try:
         yield
     except (ConfigError, TrainInterrupted):
@@ -242,7 +246,7 @@ def _unmade_if_refused(folder: Path) -> Iterator[None]:
 
 
 def interruptible() -> contextlib.AbstractContextManager[None]:
-    """Within it Ctrl-C or a polite kill raises TrainInterrupted: for work that can be done again."""
+    """A context in which SIGINT and SIGTERM raise TrainInterrupted, for work that can be repeated."""
 
     def interrupt() -> None:
         raise TrainInterrupted
@@ -252,14 +256,14 @@ def interruptible() -> contextlib.AbstractContextManager[None]:
 
 @contextlib.contextmanager
 def _on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` instead of dying on Ctrl-C or a polite kill."""
-    names = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(name, lambda *_: stop()) for name in names] if _in_main_thread() else []
+    """Call ``stop`` on SIGINT and SIGTERM."""
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop()) for number in signals] if _in_main_thread() else []
     try:
         yield
     finally:
-        for name, handler in zip(names, before, strict=False):
-            signal.signal(name, handler)
+        for number, handler in zip(signals, before, strict=False):
+            signal.signal(number, handler)
 
 
 def _in_main_thread() -> bool:

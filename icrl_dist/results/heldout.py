@@ -18,12 +18,13 @@ from icrl_dist.agent.loading import calibrated, checkpoint_file, outcomes_of, tr
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment, Run
-from icrl_dist.console.terminal import Display, experts_table, gap_table, kl_table, returns_table
+from icrl_dist.console.display import Display
 from icrl_dist.interfaces import Batch, MakePolicy, Method, Policy, Reference
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from icrl_dist.results import evaluate, plots
 from icrl_dist.results import posterior as posterior_suite
+from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.files import Checkpoint, atomic_write, load_checkpoint, save_checkpoint
 from icrl_dist.types import Variation
@@ -109,15 +110,19 @@ def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
     return {"median": round(float(np.median(values)), 2), "above_1": round(float((values > 1).mean()), 4)}
 
 
-def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
-    """Offline returns of the folder's models, given random and expert data.
-
-    Raises ConfigError for a problem without exact answers.
-    """
-    if registry.of(run).exact is None:
+def check_suite(run: Run, suite: str) -> None:
+    """Raises ConfigError if the run's problem or method lacks a part that the suite needs."""
+    problem, method = registry.of(run), methods.of(run)
+    if suite == "offline" and problem.exact is None:
         raise ConfigError(
-            f"--suite offline: {run.problem} has no exact answers to collect expert data with; use --suite online"
+            f"--suite offline: {run.problem} has no exact answers for expert data; use --suite online"
         )
+    if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
+        raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
+
+
+def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
+    """Offline returns of the folder's models, given random and expert data."""
     return evaluate.offline(run, models(what), deploy)
 
 
@@ -169,14 +174,9 @@ def show_experts(folder: Path, console: Console) -> dict[str, Any]:
 
 
 def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
-    """The newest model beside the exact posterior, on training and on held-out tasks.
-
-    Raises ConfigError for a problem or a method that has no such comparison.
-    """
+    """The newest model beside the exact posterior, on training and on held-out tasks."""
     model = trained(load_checkpoint(checkpoint_file(what)))
     suite = registry.of(run).posterior
-    if suite is None or type(model.method).distributions is Method.distributions:
-        raise ConfigError(f"--suite posterior: {run.problem} with method {run.method} has none; use --suite online")
     decide = functools.partial(model.method.distributions, model.model)
     act = evaluate.in_context(model, "paper")
     report: dict[str, Any] = {}

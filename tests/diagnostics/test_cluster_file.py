@@ -1,4 +1,4 @@
-"""Cluster files before `ray up`: what is shipped passes, and each slip is refused by name with a remedy."""
+"""Cluster files before `ray up`: the shipped files pass, and each mistake is refused by name with a remedy."""
 
 import copy
 import re
@@ -11,7 +11,8 @@ import yaml
 from icrl_dist import version
 from icrl_dist.cli import main
 from icrl_dist.diagnostics import cluster_file
-from icrl_dist.diagnostics.doctor import diagnose_file, table
+from icrl_dist.diagnostics.checks import table
+from icrl_dist.diagnostics.doctor import diagnose_file
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = ("onprem", "aws", "gcp")
@@ -20,7 +21,7 @@ WORKER = ("available_node_types", "worker", "node_config")
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A folder like a checkout from which `ray up` can be run: a token, certificates, and a wheel of this code."""
+    """A folder like a checkout in which `ray up` can be run: a token, certificates, and a wheel of this code."""
     home, root = tmp_path / "home", tmp_path / "checkout"
     for file in (home / ".ray" / "auth_token", home / ".icrl" / "certificates" / "ca.pem"):
         file.parent.mkdir(parents=True)
@@ -38,16 +39,16 @@ def checkout(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def asked(checkout, tmp_path):
-    """``asked(config)``: what the doctor finds that stops a run, and what it warns of, as lines."""
+def diagnosed(checkout, tmp_path):
+    """``diagnosed(config)``: the failed checks and the warnings of the doctor, as lines."""
 
-    def ask(config):
+    def diagnose(config):
         file = tmp_path / "cluster.yaml"
         file.write_text(yaml.safe_dump(config))
-        found = diagnose_file(file, checkout)
-        return [table([f]) for f in found if f.ok is False], [table([f]) for f in found if f.ok is None]
+        checks = diagnose_file(file, checkout)
+        return [table([c]) for c in checks if c.ok is False], [table([c]) for c in checks if c.ok is None]
 
-    return ask
+    return diagnose
 
 
 def shipped(name):
@@ -55,72 +56,74 @@ def shipped(name):
 
 
 def filled_in(value):
-    """The same without example values."""
+    """The same configuration without example values."""
     if isinstance(value, dict):
         return {key: filled_in(inner) for key, inner in value.items()}
     if isinstance(value, list):
         return [filled_in(inner) for inner in value]
-    return "10.0.0.1" if isinstance(value, str) and cluster_file._example(value) else value
+    return "10.0.0.1" if isinstance(value, str) and cluster_file._is_example(value) else value
 
 
 def with_value(config, path, value):
     changed = copy.deepcopy(config)
-    table = changed
+    inner = changed
     for key in path[:-1]:
-        table = table[key]
-    table[path[-1]] = value
+        inner = inner[key]
+    inner[path[-1]] = value
     return changed
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_what_is_shipped_passes_and_asks_to_be_filled_in(asked, name):
-    stops, warns = asked(shipped(name))
+def test_a_shipped_file_passes_once_its_example_values_are_replaced(diagnosed, name):
+    stops, warns = diagnosed(shipped(name))
     assert not warns
-    assert len(stops) == 1 and "still the example's" in stops[0], stops
-    assert asked(filled_in(shipped(name))) == ([], [])
+    assert len(stops) == 1 and "still example values" in stops[0], stops
+    assert diagnosed(filled_in(shipped(name))) == ([], [])
 
 
 @pytest.mark.parametrize(("name", "user"), [("aws", {"auth"}), ("gcp", set())])
-def test_two_places_are_to_be_edited(name, user):
-    """Everything marked lies under provider or available_node_types; AWS's images also say which user there is."""
+def test_only_two_sections_need_edits(name, user):
+    """All marks are in provider or available_node_types; for AWS also in auth, because the user depends on the image."""
     text = (ROOT / "deploy" / "clusters" / f"{name}.yaml").read_text()
-    marked = [m.start() for m in re.finditer(r"# .*<--|# <--", text)][1:]  # the first explains the mark
+    marked = [m.start() for m in re.finditer(r"# .*<--|# <--", text)][1:]  # the first one explains the mark
     sections = [re.findall(r"^(\w+):", text[:place], re.MULTILINE)[-1] for place in marked]
     assert len(marked) > 5 and set(sections) == {"provider", "available_node_types"} | user
 
 
 @pytest.mark.parametrize("name", ("aws", "gcp"))
-def test_the_container_that_is_commented_out_passes_too(asked, name):
+def test_the_commented_container_section_passes_too(diagnosed, name):
     text = (ROOT / "deploy" / "clusters" / f"{name}.yaml").read_text()
     container = re.search(r"^# docker:\n(#   .*\n)+", text, re.MULTILINE)[0]
     config = filled_in(yaml.safe_load(text.replace(container, re.sub(r"^# ", "", container, flags=re.MULTILINE))))
     assert config["docker"]["image"]
-    stops, warns = asked(config)
-    assert not stops and any("install once more what its image has" in line for line in warns)
+    stops, warns = diagnosed(config)
+    assert not stops and any("install again what the image contains" in line for line in warns)
     config["setup_commands"] = []
-    assert any("head_setup_commands call .venv/bin/pip, which is not in the image" in line for line in asked(config)[0])
+    assert any(
+        "head_setup_commands call .venv/bin/pip, which the image does not contain" in line for line in diagnosed(config)[0]
+    )
     config["head_setup_commands"] = []
-    assert asked(config) == ([], [])
+    assert diagnosed(config) == ([], [])
     config["docker"]["run_options"] = []
-    assert any("--shm-size" in line for line in asked(config)[1])
+    assert any("--shm-size" in line for line in diagnosed(config)[1])
 
 
-def test_the_image_has_what_the_head_would_install():
+def test_the_image_contains_what_the_head_would_install():
     image = (ROOT / "deploy" / "Dockerfile").read_text()
     for name in ("aws", "gcp"):
         (command,) = shipped(name)["head_setup_commands"]
         assert all(package in image for package in command.split("--quiet ")[1].split())
 
 
-SLIPS = [
+MISTAKES = [
     ("aws", (*WORKER, "InstanceTyp"), "c7i.4xlarge", r"worker.node_config.InstanceTyp: no such key.*InstanceType"),
-    ("aws", (*WORKER, "InstanceType"), 4, r"worker.node_config.InstanceType = 4 .*write text"),
+    ("aws", (*WORKER, "InstanceType"), 4, r"worker.node_config.InstanceType = 4 .*write a string"),
     ("aws", (*WORKER, "SubnetIds"), "subnet-1", r"SubnetIds = 'subnet-1' .*write a list"),
     ("aws", (*WORKER, "InstanceMarketOptions"), {"Market": "spot"}, r"InstanceMarketOptions.Market: no such key.*MarketType"),
     ("aws", (*WORKER, "EbsOptimized"), "yes", r"EbsOptimized = 'yes' .*true or false"),
     ("aws", WORKER, {"ImageId": "ami-1"}, "worker.node_config without InstanceType"),
     ("gcp", (*WORKER, "machinetype"), "n2-highcpu-16", r"machinetype: no such key.*machineType"),
-    ("gcp", (*WORKER, "machineType"), 16, r"worker.node_config.machineType = 16 .*write text"),
+    ("gcp", (*WORKER, "machineType"), 16, r"worker.node_config.machineType = 16 .*write a string"),
     ("gcp", (*WORKER, "scheduling"), [{"preemptible": True}], r"scheduling = .*write a table"),
     ("gcp", (*WORKER, "disks", 0, "initializeParams", "diskSizeGb"), "fifty", r"diskSizeGb = 'fifty' .*whole number"),
     ("gcp", (*WORKER, "disks", 0, "initializeParams", "diskSize"), 50, r"diskSize: no such key"),
@@ -136,7 +139,7 @@ SLIPS = [
     ("aws", ("provider", "availability_zone"), "eu-west-1a", "zone eu-west-1a is not in region us-west-2"),
     ("gcp", ("provider", "project_id"), "", "gcp without project_id"),
     ("aws", ("file_mounts", "~/icrl-dist/dist"), "wheels", r"no wheels in"),
-    ("aws", (*WORKER[:2], "min_workers"), 0, r"none; up to 4 if anything asked.*min_workers"),
+    ("aws", (*WORKER[:2], "min_workers"), 0, r"none; up to 4 if something requested.*min_workers"),
     ("aws", (*WORKER[:2], "max_workers"), "four", r"Ray's schema"),
     ("onprem", ("file_mounts",), {}, r"file_mounts has no ~/.ray/auth_token"),
     ("onprem", ("head_start_ray_commands",), ["ray stop"], "start no head"),
@@ -144,9 +147,9 @@ SLIPS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "path", "value", "message"), SLIPS)
-def test_a_slip_is_refused_by_name(asked, name, path, value, message):
-    stops, _ = asked(with_value(shipped(name), path, value))
+@pytest.mark.parametrize(("name", "path", "value", "message"), MISTAKES)
+def test_a_mistake_is_refused_by_name(diagnosed, name, path, value, message):
+    stops, _ = diagnosed(with_value(shipped(name), path, value))
     assert any(re.search(message, line) and "  -> " in line for line in stops), stops
 
 
@@ -154,7 +157,7 @@ def test_a_slip_is_refused_by_name(asked, name, path, value, message):
     ("name", "path", "value", "message"),
     [
         ("aws", ("available_node_types", "head", "node_config", "InstanceMarketOptions"), {"MarketType": "spot"}, "is a spot"),
-        ("gcp", (*WORKER[:2], "min_workers"), 3, "3 machines, and nothing asks for the 1 more that max_workers allows"),
+        ("gcp", (*WORKER[:2], "min_workers"), 3, "3 nodes; nothing requests the 1 more that max_workers allows"),
         ("aws", ("provider", "availability_zone"), "us-west-2a, us-west-2b", "name one"),
         ("onprem", ("worker_start_ray_commands",), ["ray start --address=$RAY_HEAD_IP:6379"], "ulimit"),
         (
@@ -165,30 +168,30 @@ def test_a_slip_is_refused_by_name(asked, name, path, value, message):
         ),
     ],
 )
-def test_what_starts_but_goes_short_is_a_warning(asked, name, path, value, message):
-    stops, warns = asked(with_value(filled_in(shipped(name)), path, value))
+def test_a_setting_that_starts_but_may_fail_later_is_a_warning(diagnosed, name, path, value, message):
+    stops, warns = diagnosed(with_value(filled_in(shipped(name)), path, value))
     assert not stops and any(message in line for line in warns), (stops, warns)
 
 
-def test_a_type_that_does_not_say_how_many_at_most_has_the_clusters_number(asked):
+def test_a_type_without_max_workers_has_the_cluster_default(diagnosed):
     config = filled_in(shipped("aws"))
     del config["available_node_types"]["worker"]["max_workers"]
-    assert asked(config) == ([], [])
+    assert diagnosed(config) == ([], [])
 
 
-def test_a_wheel_of_other_code_is_refused(asked, checkout):
+def test_a_wheel_of_other_code_is_refused(diagnosed, checkout):
     (wheel,) = (checkout / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel, "a") as archive:
         archive.writestr("actors/more.py", "")
-    assert any("holds code" in line and version.digest()[:8] in line for line in asked(shipped("aws"))[0])
+    assert any("holds code" in line and version.digest()[:8] in line for line in diagnosed(shipped("aws"))[0])
     wheel.write_text("no zip")
-    assert any("not a zip" in line for line in asked(shipped("aws"))[0])
+    assert any("not a zip" in line for line in diagnosed(shipped("aws"))[0])
     wheel.unlink()
-    assert any("0 wheels" in line for line in asked(shipped("aws"))[0])
+    assert any("0 wheels" in line for line in diagnosed(shipped("aws"))[0])
 
 
 @pytest.mark.parametrize(("text", "message"), [(None, "cannot be read"), ("[1", "not YAML"), ("a: 1", "no cluster file")])
-def test_what_is_no_cluster_file_is_bad_usage(tmp_path, capsys, text, message):
+def test_a_file_that_is_no_cluster_file_is_bad_usage(tmp_path, capsys, text, message):
     file = tmp_path / "file.yaml"
     if text is not None:
         file.write_text(text)
@@ -197,21 +200,21 @@ def test_what_is_no_cluster_file_is_bad_usage(tmp_path, capsys, text, message):
     assert message in line and str(file) in line
 
 
-def test_the_command_says_by_its_exit_code_whether_a_run_could_start(checkout, monkeypatch, capsys, tmp_path):
+def test_the_exit_code_shows_whether_a_run_could_start(checkout, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(checkout)
     assert main.main(["doctor", "--cluster", str(ROOT / "deploy/clusters/gcp.yaml")]) == main.FAILED
     file = tmp_path / "mine.yaml"
     file.write_text(yaml.safe_dump(filled_in(shipped("gcp"))))
     assert main.main(["doctor", "--cluster", str(file)]) == main.OK
     assert "n2-highcpu-16" in capsys.readouterr().out
-    file = tmp_path / "slip.yaml"
+    file = tmp_path / "mistake.yaml"
     file.write_text(yaml.safe_dump(with_value(shipped("gcp"), (*WORKER, "machineType"), 16)))
     assert main.main(["doctor", "--cluster", str(file)]) == main.FAILED
 
 
-def test_shapes_know_what_ray_adds_by_itself():
-    """Ray's example files use these; a table that refused them would be out of date."""
-    shape = cluster_file.json.loads((ROOT / "icrl_dist/diagnostics/clouds/aws.json").read_text())
+def test_schemas_accept_the_keys_of_rays_example_files():
+    """A schema that refused these keys would be out of date."""
+    schema = cluster_file.json.loads((ROOT / "icrl_dist/diagnostics/clouds/aws.json").read_text())
     node = {"InstanceType": "m5.large", "BlockDeviceMappings": [{"DeviceName": "/dev/sda1", "Ebs": {"VolumeSize": 256}}]}
     node |= {"InstanceMarketOptions": {"MarketType": "spot", "SpotOptions": {"MaxPrice": "0.1"}}, "SubnetIds": ["subnet-1"]}
-    assert list(cluster_file._misfits(node, shape, "")) == []
+    assert list(cluster_file._violations(node, schema, "")) == []

@@ -1,4 +1,4 @@
-"""The doctor's questions to a live cluster, against machines that answer badly."""
+"""The doctor's checks of a running cluster, with a fake Ray whose nodes have faults."""
 
 import re
 import socket
@@ -15,8 +15,8 @@ from icrl_dist.stream import endpoints
 HERE = node_facts.facts()
 
 
-class Answering:
-    """Two machines, a and b; what b says of itself is changed by ``answer``."""
+class FakeRay:
+    """Ray with two nodes, a and b; ``answer`` changes the facts of node b, or is the error that it raises."""
 
     util = SimpleNamespace(
         scheduling_strategies=SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, soft: (node, soft))
@@ -35,8 +35,8 @@ class Answering:
 
     def nodes(self):
         ports = {"NodeManagerPort": 1, "ObjectManagerPort": 2}
-        some = {"Alive": True, "Resources": {"CPU": 1}, **ports}
-        return [{**some, "NodeID": n, "NodeManagerAddress": f"10.0.0.{n}"} for n in "ab"] + [{"Alive": False}]
+        node = {"Alive": True, "Resources": {"CPU": 1}, **ports}
+        return [{**node, "NodeID": n, "NodeManagerAddress": f"10.0.0.{n}"} for n in "ab"] + [{"Alive": False}]
 
     def get_runtime_context(self):
         return SimpleNamespace(gcs_address="10.0.0.a:6379")
@@ -59,57 +59,59 @@ class Answering:
 
 
 @pytest.fixture
-def asked(monkeypatch):
-    """``asked(endpoint)``: what the doctor says of a healthy cluster, and the ports that machine b was to reach."""
-    ray = Answering({})
+def diagnosed(monkeypatch):
+    """``diagnosed(endpoint)``: the checks of a healthy cluster, and the ports that node b had to reach."""
+    ray = FakeRay({})
     monkeypatch.setitem(sys.modules, "ray", ray)
-    monkeypatch.setattr(doctor, "need_ray_token", lambda address: None)
+    monkeypatch.setattr(doctor, "require_ray_token", lambda address: None)
 
-    def ask(endpoint):
+    def diagnose(endpoint):
         return doctor.diagnose_cluster("auto", endpoint, ""), ray.asked.get("b")
 
-    return ask
+    return diagnose
 
 
 OTHERS = [("10.0.0.a", 6379), ("10.0.0.a", 1), ("10.0.0.a", 2)]
 
 
-def test_a_learner_that_only_the_head_reaches_is_not_looked_for_by_others(asked):
-    findings, ports = asked("tcp/127.0.0.1:0")
-    assert ports == OTHERS and all(finding.ok is not False for finding in findings)
-    assert re.search(r"warn +stream endpoint +tcp/127.0.0.1:0 is this machine's alone.*-> .*--endpoint tls/", table(findings))
-    assert len(findings) == 11 and "reaches Ray's and 2 of the other" in table(findings)
+def test_a_loopback_endpoint_is_not_tried_by_other_nodes(diagnosed):
+    checks, ports = diagnosed("tcp/127.0.0.1:0")
+    assert ports == OTHERS and all(check.ok is not False for check in checks)
+    assert re.search(
+        r"warn +stream endpoint +tcp/127.0.0.1:0 can be reached from this machine only.*-> .*--endpoint tls/", table(checks)
+    )
+    assert len(checks) == 11 and "reaches Ray's and 2 of the other" in table(checks)
 
 
-def test_every_machine_is_examined_although_a_run_has_the_port(asked, monkeypatch):
+def test_every_node_is_checked_while_a_run_uses_the_port(diagnosed, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         monkeypatch.setattr(endpoints.Endpoint, "loopback", False)
-        findings, ports = asked(f"tls/127.0.0.1:{port}")
-    assert ports == [("127.0.0.1", port), *OTHERS] and all(finding.ok is not False for finding in findings)
-    assert "Address already in use" in findings[0].value and len(findings) == 11
+        checks, ports = diagnosed(f"tls/127.0.0.1:{port}")
+    assert ports == [("127.0.0.1", port), *OTHERS] and all(check.ok is not False for check in checks)
+    assert "Address already in use" in checks[0].value and len(checks) == 11
 
 
-def test_an_address_that_is_not_the_heads_is_a_fault_and_every_machine_is_examined(asked):
-    findings, ports = asked("tls/192.0.2.1:7447")
-    assert ports == OTHERS and [f.name for f in findings if f.ok is False] == ["stream endpoint"] and len(findings) == 11
+def test_an_address_of_another_node_fails_and_every_node_is_checked(diagnosed):
+    checks, ports = diagnosed("tls/192.0.2.1:7447")
+    assert ports == OTHERS and [f.name for f in checks if f.ok is False] == ["stream endpoint"] and len(checks) == 11
 
 
-def test_an_endpoint_that_is_none_is_bad_usage(asked):
+def test_an_invalid_endpoint_is_bad_usage(diagnosed):
     with pytest.raises(ConfigError, match=r"--endpoint tcp://x:1: write it as"):
-        asked("tcp://x:1")
+        diagnosed("tcp://x:1")
 
 
-def found(answer, certificates="folder"):
-    ray = Answering(answer)
-    findings = cluster_nodes.examine(ray, ("10.0.0.a", 7447), certificates)
+def checked(answer, certificates="folder"):
+    ray = FakeRay(answer)
+    checks = cluster_nodes.check_nodes(ray, ("10.0.0.a", 7447), certificates)
     assert ray.asked["a"] == [("10.0.0.a", 7447), ("10.0.0.a", 6379), ("10.0.0.b", 1), ("10.0.0.b", 2)]
-    return findings
+    return checks
 
 
-def test_machines_that_are_fit_have_nothing_to_mend():
-    findings = found({})
-    assert len(findings) == 12 and all(finding.ok is not False and " (10.0.0." in finding.name for finding in findings)
+def test_healthy_nodes_pass_every_check():
+    checks = checked({})
+    assert len(checks) == 12 and all(check.ok is not False and " (10.0.0." in check.name for check in checks)
 
 
 @pytest.mark.parametrize(
@@ -129,8 +131,8 @@ def test_machines_that_are_fit_have_nothing_to_mend():
         (RuntimeError("one\nNo module named 'icrl_dist'"), False, "10.0.0.b +does not answer: No module named 'icrl_dist'"),
     ],
 )
-def test_what_ails_a_machine_is_one_line_with_its_remedy(answer, ok, message):
-    findings = found(answer)
-    (line, *_) = [table([f]) for f in findings if re.search(message, table([f]))]
-    assert "\n" not in line and any(f.ok is ok and table([f]) == line for f in findings)
-    assert all(f.ok is not False for f in findings if "10.0.0.a" in f.name)
+def test_each_fault_of_a_node_is_one_line_with_its_remedy(answer, ok, message):
+    checks = checked(answer)
+    (line, *_) = [table([f]) for f in checks if re.search(message, table([f]))]
+    assert "\n" not in line and any(f.ok is ok and table([f]) == line for f in checks)
+    assert all(f.ok is not False for f in checks if "10.0.0.a" in f.name)

@@ -1,4 +1,4 @@
-"""The plan's arithmetic against numbers worked out by hand, and its rates against a run's real time."""
+"""The estimate against numbers computed by hand, and its rates against a run's real time."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ ROUND = PhaseRates("adapt/0", 4, 400, 40_000, 0, 30.0, 1000.0, 900.0, 10, 0.5)
 RATES = Rates("made-up", "none", 2, (PRETRAIN, ROUND), 200.0, 10**6, 3 * 10**6, 6.0, 12.0)
 
 
-def test_one_machine_is_held_up_by_collecting():
+def test_collecting_is_the_bottleneck_of_one_node():
     plan = estimate(RATES, nodes=1, cores=2, gbit_per_s=10.0)
     # 4 turns of 10 s, against 8000 / 200 = 40 s of ingest and 6.4 s of network; 2 turns of 30 s
     assert [(row["collect_s"], row["limit"]) for row in plan["phases"]] == [(40.0, "collecting"), (60.0, "collecting")]
@@ -39,7 +39,7 @@ def test_one_machine_is_held_up_by_collecting():
     assert "2 workers on 1 nodes: 2.9 minutes" in describe(plan) and "first bottleneck: collecting" in describe(plan)
 
 
-def test_more_machines_meet_the_next_limit_and_then_none_helps():
+def test_more_nodes_reach_the_next_limit_until_no_node_helps():
     plan = estimate(RATES, nodes=4, cores=2, gbit_per_s=10.0)
     assert [(row["collect_s"], row["limit"]) for row in plan["phases"]] == [(40.0, "ingest"), (30.0, "jobs")]
     assert plan["bottleneck"] == "fit"
@@ -52,12 +52,12 @@ def test_more_machines_meet_the_next_limit_and_then_none_helps():
 @pytest.mark.parametrize(
     ("given", "message"), [((0, 2, 1.0), "--nodes 0"), ((1, 0, 1.0), "--cores 0"), ((1, 2, 0.0), "--gbit 0.0")]
 )
-def test_what_cannot_be_is_refused(given, message):
+def test_a_number_that_is_not_positive_is_refused(given, message):
     with pytest.raises(ConfigError, match=message):
         estimate(RATES, *given)
 
 
-def test_rates_of_another_machine_are_read_back(tmp_path, capsys):
+def test_rates_of_another_machine_are_read(tmp_path, capsys):
     file = tmp_path / "rates.json"
     demo = dataclasses.replace(RATES, run="demo")
     file.write_text("words\n" + json.dumps({"rates": demo.as_dict()}) + "\n")
@@ -65,17 +65,17 @@ def test_rates_of_another_machine_are_read_back(tmp_path, capsys):
     assert main.main(["plan", "demo", "--nodes", "4", "--gbit", "10", "--rates", str(file), "--json"]) == main.OK
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["bottleneck"] == "fit"
     assert main.main(["plan", "smoke", "--rates", str(file)]) == main.USAGE
-    assert "of 'demo', not of 'smoke'" in capsys.readouterr().err
+    assert "rates of 'demo', not of 'smoke'" in capsys.readouterr().err
     file.write_text("{}")
     assert main.main(["plan", "demo", "--rates", str(file)]) == main.USAGE
 
 
-def test_trials_that_were_not_timed_grow_like_those_that_were():
+def test_the_time_of_trials_that_were_not_measured_is_extrapolated():
     spent = measuring.np.array([1.0, 2.0, 3.0, 4.0])
     assert measuring._continued(spent, 4, 100) == 10
     assert measuring._continued(spent, 6, 100) == pytest.approx(10 + 5 + 6)
-    assert measuring._continued(spent[:1], 3, 100) == pytest.approx(3)  # one was all that there was time for
-    assert measuring._continued(spent, 8, 5) == pytest.approx(10 + 5 + 6 + 6 + 6)  # contexts are full
+    assert measuring._continued(spent[:1], 3, 100) == pytest.approx(3)  # only one trial was measured
+    assert measuring._continued(spent, 8, 5) == pytest.approx(10 + 5 + 6 + 6 + 6)  # the context is full after 5 trials
 
 
 SHORT = [
@@ -95,30 +95,31 @@ print(json.dumps(rates.measure(override(load("demo"), sys.argv[1:], "test"), "de
 """
 
 
-def test_the_demo_takes_what_its_plan_says(tmp_path):
-    """Within a factor of two.  The demo with its own room, model, tasks, adversaries and batches, but shorter everywhere.
+def test_the_demo_takes_the_estimated_time(tmp_path):
+    """Within a factor of two, with the demo's room, model, tasks, adversaries and batches, but fewer steps and trials.
 
-    Other tests run beside it, so if that fails the rates are measured once more, after the run, and all of it once more.
+    Other tests run at the same time.  So on failure the rates are measured again after the run, and
+    then the whole comparison is repeated once.
     """
     settings = [*SHORT, "learner.threads=1"]
     words = [word for setting in settings for word in ("--set", setting)]
 
-    def planned():
-        given = [sys.executable, "-c", MEASURE, *settings]  # not in this process, where every call's shapes are checked
+    def estimated():
+        given = [sys.executable, "-c", MEASURE, *settings]  # in another process, without the shape checks of the tests
         found = json.loads(subprocess.run(given, check=True, capture_output=True, text=True).stdout)
         assert len(found["phases"]) == 3 and found["phases"][1]["trajectories"] == 39 * 8 * 6
         rates = Rates(**{**found, "phases": tuple(PhaseRates(**phase) for phase in found["phases"])})
         return 3600 * estimate(rates, nodes=1, cores=1, gbit_per_s=1.0)["hours"]
 
     command = [sys.executable, "-m", "icrl_dist.cli", "train", "demo", "--engine", "inline", "--out", tmp_path / "demo"]
-    before, seen = planned(), []
+    before, seen = estimated(), []
     for _ in range(2):
         began = time.monotonic()
         subprocess.run([*command, "--overwrite", *words], check=True, stdout=subprocess.DEVNULL)
         real = time.monotonic() - began
-        after = before if before / 2 < real < 2 * before else planned()  # the machine may have changed its pace
+        after = before if before / 2 < real < 2 * before else estimated()  # the speed of the machine may have changed
         seen.append((before, real, after))
         if min(before, after) / 2 < real < 2 * max(before, after):
             return
         before = after
-    raise AssertionError(f"planned, taken, planned: {seen}")
+    raise AssertionError(f"estimated, taken, estimated again: {seen}")

@@ -1,4 +1,4 @@
-"""The README's Python is run as it stands."""
+"""The Python example of the README runs unchanged."""
 
 import contextlib
 import io

@@ -15,7 +15,7 @@ import pytest
 from icrl_dist.chaos import campaign, disk, proxy, schedule
 from icrl_dist.chaos.faults import FAULTS, Struck
 from icrl_dist.chaos.outcome import Outcome, verdict
-from icrl_dist.cli import arguments, main
+from icrl_dist.cli import doctor, main
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.launch.train import prepare
 from icrl_dist.storage.files import StoreError
@@ -166,7 +166,7 @@ def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device", "runs/smoke/report/adaptation.png")
 
-    monkeypatch.setitem(main.COMMANDS, "doctor", (arguments.Doctor, full))
+    monkeypatch.setitem(main.COMMANDS, "doctor", (doctor.DoctorArguments, full))
     assert main.main(["doctor"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "adaptation.png: could not be written" in line and "free space, then use --resume" in line

@@ -1,4 +1,4 @@
-"""Bad input: one line that names the value, the place and the remedy; exit code 2; nothing half-written."""
+"""Bad input: one line with the value, the place and the remedy; exit code 2; no partial output.  And the start-up time."""
 
 import json
 import os
@@ -14,13 +14,14 @@ from importlib import metadata
 import pytest
 
 from icrl_dist.agent import in_context_agent
-from icrl_dist.cli import commands, main
+from icrl_dist.cli import main
+from icrl_dist.cli.train import _resume_command
 from icrl_dist.launch import train
 from icrl_dist.results import heldout
 
 
 def refused(capsys, *arguments):
-    """The one line that the command printed, which must end with exit code 2."""
+    """The single error line of a command that must end with exit code 2."""
     assert main.main([str(a) for a in arguments]) == 2
     printed = capsys.readouterr()
     lines = printed.err.strip().splitlines()
@@ -50,12 +51,12 @@ def test_a_bad_run_file(capsys, tmp_path, text, expected):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_run_names_the_nearest(capsys, tmp_path):
+def test_an_unknown_run_is_refused_with_the_nearest_name(capsys, tmp_path):
     assert "did you mean 'demo'?" in refused(capsys, "train", "dmeo", "--out", tmp_path / "out")
     assert "no such file" in refused(capsys, "train", tmp_path / "none.toml")
 
 
-def test_an_impossible_override(capsys, tmp_path):
+def test_an_override_out_of_range(capsys, tmp_path):
     line = refused(capsys, "train", "smoke", "--adversary.p-max", "2", "--out", tmp_path / "out")
     assert "adversary.p_max = 2" in line
     assert not (tmp_path / "out").exists()
@@ -95,13 +96,13 @@ def test_a_port_in_use(capsys, tmp_path):
         ("stream.staleness=-1", "stream.staleness = -1: must not be negative"),
     ],
 )
-def test_an_impossible_setting(capsys, tmp_path, setting, expected):
+def test_an_invalid_setting(capsys, tmp_path, setting, expected):
     assert expected in refused(capsys, "train", "smoke", "--set", setting, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_folder_may_be_in_a_home(capsys, tmp_path, monkeypatch):
-    """`ray job submit` quotes every word, so no shell resolves it."""
+def test_a_home_in_the_run_folder_is_expanded(capsys, tmp_path, monkeypatch):
+    """`ray job submit` quotes every word, so no shell expands it."""
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "runs" / "mine").mkdir(parents=True)
     (tmp_path / "runs" / "mine" / "notes").touch()
@@ -109,22 +110,22 @@ def test_a_run_folder_may_be_in_a_home(capsys, tmp_path, monkeypatch):
     assert "--out ~nobody-here/mine" in refused(capsys, "train", "smoke", "--engine", "inline", "--out", "~nobody-here/mine")
 
 
-def test_what_to_train_must_be_said_and_what_to_go_on_from_must_be_there(capsys, tmp_path):
+def test_train_needs_a_run_and_from_needs_an_existing_run(capsys, tmp_path):
     assert "name a RUN" in refused(capsys, "train", "--out", tmp_path / "out")
     assert "holds no run" in refused(capsys, "train", "--from", f"{tmp_path}@0", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_to_explain(capsys, tmp_path):
+def test_explain_without_a_run_or_with_a_bad_identity(capsys, tmp_path):
     assert "no such run folder" in refused(capsys, "explain", tmp_path)
     assert "STAGE/ROUND/TASK/VARIATION/TRIAL" in refused(capsys, "explain", tmp_path, "adapt/0")
 
 
-def test_nothing_to_evaluate_or_to_listen_to(capsys, tmp_path, monkeypatch):
+def test_evaluate_without_a_checkpoint_and_tap_without_a_run(capsys, tmp_path, monkeypatch):
     assert "no such run folder" in refused(capsys, "evaluate", tmp_path / "none")
     assert "holds no checkpoint" in refused(capsys, "evaluate", tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert "no run is on" in refused(capsys, "tap")
+    assert "no run is active" in refused(capsys, "tap")
     line = refused(capsys, "tap", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.5")
     assert "tcp/127.0.0.1:1" in line
 
@@ -138,7 +139,7 @@ def test_an_unknown_command_and_an_unknown_flag(capsys):
 
 
 @pytest.mark.parametrize("command", sorted(main.COMMANDS))
-def test_help_teaches_and_does_nothing(capsys, command):
+def test_help_is_the_docstring_and_runs_nothing(capsys, command):
     with pytest.raises(SystemExit) as stopped:
         main.main([command, "--help"])
     assert stopped.value.code == 0
@@ -157,8 +158,8 @@ def test_bench_env_ends_with_one_json_object(capsys):
     assert main.main(["bench", "env", "--problem", "darkrom"]) == 2
 
 
-def test_nobody_waits_for_what_only_the_evaluation_needs(tmp_path):
-    """Until both programs have ended, ``train`` has imported no torch."""
+def test_train_imports_no_module_of_the_evaluation_before_the_training_ends(tmp_path):
+    """The learner and the workers would wait for these imports."""
     script = """
 import sys
 from icrl_dist.cli import main as cli
@@ -175,18 +176,33 @@ sys.exit(cli.main(["train", "smoke", "--actors", "1", "--out", sys.argv[1]]))
     assert ran.returncode == 130 and ran.stdout.splitlines()[0] == "", ran.stdout + ran.stderr
 
 
+def test_help_imports_no_heavy_module():
+    script = """
+import sys
+from icrl_dist.cli import main
+
+main.main(["--help"])
+print([name for name in ("torch", "scipy", "matplotlib", "mujoco", "ray") if name in sys.modules])
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "[]"
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_an_evaluation_that_is_stopped_says_how_to_go_on(monkeypatch, tmp_path, capsys, name):
+def test_a_stopped_evaluation_prints_the_command_that_resumes(monkeypatch, tmp_path, capsys, name):
     def stopped(*_):
         signal.raise_signal(getattr(signal, name))
-        pytest.fail("it went on")
+        pytest.fail("the signal was ignored")
 
     monkeypatch.setattr(train, "train_inline", lambda *_: {})
     monkeypatch.setattr(in_context_agent, "checkpoint_file", lambda folder: folder / "none")
     monkeypatch.setattr(heldout, "calibrate", stopped)
     assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
-    assert f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` goes on" in printed
+    assert (
+        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the checkpoint"
+        in printed
+    )
     assert (tmp_path / "run" / "run.toml").exists()
 
 
@@ -199,11 +215,11 @@ def test_an_evaluation_that_is_stopped_says_how_to_go_on(monkeypatch, tmp_path, 
         ("--from runs/demo@0 --out '~/my runs/x'", "--from runs/demo@0 --out '~/my runs/x' --resume"),
     ],
 )
-def test_the_command_that_goes_on_is_the_one_that_was_given(given, printed):
-    assert commands._resuming(shlex.split(given)) == f"icrl-dist train {printed}"
+def test_the_resume_command_is_the_given_command_with_resume(given, printed):
+    assert _resume_command(shlex.split(given)) == f"icrl-dist train {printed}"
 
 
-def test_a_run_stopped_before_it_began_promises_no_checkpoint(monkeypatch, tmp_path, capsys):
+def test_a_run_stopped_before_it_started_mentions_no_checkpoint(monkeypatch, tmp_path, capsys):
     def stopped(run, folder, *_):
         shutil.rmtree(folder)
         raise train.TrainInterrupted

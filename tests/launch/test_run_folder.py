@@ -1,4 +1,4 @@
-"""Run folders: the user's files are never removed, and a run that is replaced comes back unless its successor stands."""
+"""Run folders: user files are never removed, and a replaced run is restored unless the new run has a checkpoint."""
 
 import contextlib
 import fcntl
@@ -25,7 +25,7 @@ OURS = (
     *("crashes/w0-1.json", "crashes/w0.stacks", "tensorboard/events.out.tfevents.1.host.2.0"),
     *("report/online-T2-0a1b2c3d-paper-unseen-p0_0.2-3episodes-2seeds.json", "report/adaptation.png", "report/online.json"),
 )
-"""A file of every kind that this program writes into a run folder."""
+"""One file of every kind that this program writes into a run folder."""
 FOREIGN = (
     *("notes.md", ".git/config", "src/main.py", "run.toml.bak", "run.toml~", "report/notes.md", "report/mine.png"),
     *("dataset/segment-1.frames.bak", "checkpoints/best.npz", "crashes/why.txt", "tensorboard/x", "dataset/raw/a.csv"),
@@ -41,7 +41,7 @@ def write(folder, names):
 
 
 def files(folder):
-    """Every file and link below a folder, and what it holds."""
+    """Every file and link below a folder, with its content or target."""
     below = sorted(folder.rglob("*"))
     return {str(p.relative_to(folder)): p.readlink() if p.is_symlink() else p.read_bytes() for p in below if not p.is_dir()}
 
@@ -54,24 +54,24 @@ def no_wait(monkeypatch):
 @settings(max_examples=40, deadline=None)
 @given(
     ours=st.sets(st.sampled_from(OURS)),
-    theirs=st.sets(st.sampled_from(FOREIGN) | st.from_regex(r"[a-z]{1,6}(/[a-z.]{0,5}[a-z])?", fullmatch=True), min_size=1),
+    users=st.sets(st.sampled_from(FOREIGN) | st.from_regex(r"[a-z]{1,6}(/[a-z.]{0,5}[a-z])?", fullmatch=True), min_size=1),
 )
-def test_a_folder_with_any_file_of_the_users_is_refused_by_its_name_and_keeps_every_file(module_run, ours, theirs):
-    theirs = {name for name in theirs if not any((name + "/").startswith(o + "/") or o.startswith(name + "/") for o in OURS)}
-    theirs = {name for name in theirs if not any(other.startswith(name + "/") for other in theirs)} or {"notes.md"}
-    with tempfile.TemporaryDirectory() as made:
-        folder = write(Path(made) / "run", {"run.toml", "env.json", *ours, *theirs})
-        before = files(Path(made))
+def test_a_folder_with_a_user_file_is_refused_by_name_and_keeps_every_file(module_run, ours, users):
+    users = {name for name in users if not any((name + "/").startswith(o + "/") or o.startswith(name + "/") for o in OURS)}
+    users = {name for name in users if not any(other.startswith(name + "/") for other in users)} or {"notes.md"}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = write(Path(temporary) / "run", {"run.toml", "env.json", *ours, *users})
+        before = files(Path(temporary))
         with pytest.raises(ConfigError) as refused:
             launch.prepare(module_run, folder, resume=False, overwrite=True)
-        assert any(name.split("/")[0] in str(refused.value) for name in theirs) and "--out" in str(refused.value)
+        assert any(name.split("/")[0] in str(refused.value) for name in users) and "--out" in str(refused.value)
         with pytest.raises(ConfigError):
             run_folder.remove(folder)
-        assert files(Path(made)) == before
+        assert files(Path(temporary)) == before
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_every_foreign_name_alone_is_refused(tmp_path, name):
+def test_each_foreign_name_alone_is_refused(tmp_path, name):
     folder = write(tmp_path / "run", [*OURS, name])
     assert run_folder.foreign(folder)
     with pytest.raises(ConfigError, match=r"not written by icrl-dist: move that away"):
@@ -79,7 +79,7 @@ def test_every_foreign_name_alone_is_refused(tmp_path, name):
     assert (folder / name).read_text() == name
 
 
-def test_a_folder_of_our_files_alone_is_removed_whole(tmp_path):
+def test_a_folder_with_our_files_only_is_removed(tmp_path):
     folder = write(tmp_path / "run", OURS)
     assert run_folder.foreign(folder) == []
     run_folder.remove(folder)
@@ -98,38 +98,38 @@ def test_links_are_not_followed(tmp_path, module_run, place):
     with pytest.raises(ConfigError, match=place):
         launch.prepare(module_run, folder, resume=False, overwrite=True)
     (tmp_path / "link").symlink_to(outside)
-    with pytest.raises(ConfigError, match="is a link"):
+    with pytest.raises(ConfigError, match="is a symbolic link"):
         run_folder.remove(tmp_path / "link")
     (tmp_path / "link").unlink()
     assert files(tmp_path) == before
 
 
-def test_a_run_file_of_the_users_is_no_run(tmp_path, module_run):
+def test_a_run_file_alone_is_no_run(tmp_path, module_run):
     folder = write(tmp_path / "run", ["run.toml"])
     with pytest.raises(ConfigError, match="holds no run"):
         launch.prepare(module_run, folder, resume=False, overwrite=True)
     assert files(folder) == {"run.toml": b"run.toml"}
 
 
-def test_places_that_are_no_runs_own_are_refused(tmp_path, module_run, monkeypatch):
-    home, here = tmp_path / "home", tmp_path / "work" / "here"
+def test_folders_that_cannot_be_run_folders_are_refused(tmp_path, module_run, monkeypatch):
+    home, current = tmp_path / "home", tmp_path / "work" / "current"
     home.mkdir()
-    write(here, ["run.toml", "env.json"])
+    write(current, ["run.toml", "env.json"])
     monkeypatch.setenv("HOME", str(home))
-    monkeypatch.chdir(here)
+    monkeypatch.chdir(current)
     write(tmp_path, ["file"])
-    (tmp_path / "link").symlink_to(here)
+    (tmp_path / "link").symlink_to(current)
     (tmp_path / "dangling").symlink_to(tmp_path / "none")
     before = files(tmp_path)
     refused = {
-        "/": "is the current folder",
-        str(home): "is the home folder",
-        str(here): "an empty --out",
-        str(here.parent): "current folder",
-        str(here / "x" / ".."): "ends in ..",
+        "/": "contains the current folder",
+        str(home): "is or contains the home folder",
+        str(current): "an empty --out",
+        str(current.parent): "current folder",
+        str(current / "x" / ".."): "ends in ..",
         str(tmp_path / "file"): "is a file",
-        str(tmp_path / "link"): f"is a link; name the folder itself, {here}",
-        str(tmp_path / "dangling"): "is a link",
+        str(tmp_path / "link"): f"is a symbolic link; name the folder itself, {current}",
+        str(tmp_path / "dangling"): "is a symbolic link",
     }
     for out, why in refused.items():
         for options in ({"overwrite": True, "resume": False}, {"overwrite": False, "resume": False}):
@@ -140,7 +140,7 @@ def test_places_that_are_no_runs_own_are_refused(tmp_path, module_run, monkeypat
 
 
 @pytest.mark.parametrize("spelling", ["parent", "parent/../parent", "other/parent", "parent/inside", "."])
-def test_a_fork_stays_out_of_its_parents_folder(tmp_path, module_run, spelling):
+def test_the_folder_of_a_fork_must_not_overlap_with_its_source(tmp_path, module_run, spelling):
     parent = write(tmp_path / "runs" / "parent", ["run.toml", "env.json", "checkpoints/version-0000.npz"])
     (tmp_path / "runs" / "other").symlink_to(tmp_path / "runs")
     before = files(tmp_path)
@@ -149,8 +149,8 @@ def test_a_fork_stays_out_of_its_parents_folder(tmp_path, module_run, spelling):
     assert files(tmp_path) == before
 
 
-def began(tmp_path, run):
-    """A run with a checkpoint, its folder and what is in it."""
+def started(tmp_path, run):
+    """The folder of a run with a checkpoint, and its files."""
     folder = tmp_path / "run"
     launch.prepare(run, folder, resume=False, overwrite=False)
     write(folder, ["checkpoints/version-0000.npz", "dataset/segment-000000.frames", ".lock"])
@@ -158,53 +158,53 @@ def began(tmp_path, run):
 
 
 def test_resume_and_overwrite_contradict_each_other(tmp_path, module_run):
-    folder, before = began(tmp_path, module_run)
+    folder, before = started(tmp_path, module_run)
     with pytest.raises(ConfigError, match="leave one out"):
         launch.prepare(module_run, folder, resume=True, overwrite=True)
     assert files(folder) == before
 
 
 @pytest.mark.parametrize("options", [{"resume": False, "overwrite": True}, {"resume": True, "overwrite": False}])
-def test_a_folder_in_which_a_run_is_on_is_left_alone(tmp_path, module_run, options):
-    folder, before = began(tmp_path, module_run)
+def test_the_folder_of_an_active_run_is_not_changed(tmp_path, module_run, options):
+    folder, before = started(tmp_path, module_run)
     stamp = (folder / "env.json").stat().st_mtime_ns
-    with hold(folder), pytest.raises(ConfigError, match=r"run: a run is on in this folder; end it, or use another --out"):
+    with hold(folder), pytest.raises(ConfigError, match=r"run: a run is active in this folder; end it, or use another --out"):
         launch.prepare(module_run, folder, **options)
     assert files(folder) == before and (folder / "env.json").stat().st_mtime_ns == stamp
     with launch.prepare(module_run, folder, **options):
         pass
 
 
-def test_the_earlier_run_goes_with_the_first_checkpoint_and_no_sooner(tmp_path, module_run):
-    folder, before = began(tmp_path, module_run)
-    heard = []
-    with launch.prepare(module_run, folder, resume=False, overwrite=True) as begun:
-        report, aside = begun.heed(heard.append), run_folder.aside_of(folder)
+def test_the_old_run_is_removed_at_the_first_checkpoint_and_not_before(tmp_path, module_run):
+    folder, before = started(tmp_path, module_run)
+    events = []
+    with launch.prepare(module_run, folder, resume=False, overwrite=True) as transaction:
+        report, aside = transaction.commit_at_checkpoint(events.append), run_folder.aside_of(folder)
         report({"event": "progress", "version": -1})
         assert files(aside) == before
         report({"event": "progress", "version": 0})
-        assert files(aside) == before, "an event is no checkpoint"
-        with pytest.raises(ConfigError, match="a run is on"):
+        assert files(aside) == before, "the event alone is not enough"
+        with pytest.raises(ConfigError, match="a run is active"):
             launch.prepare(module_run, folder, resume=False, overwrite=True)
         write(folder, ["checkpoints/version-0000.npz"])
         report({"event": "progress", "version": 0})
-        assert not aside.exists() and len(heard) == 3
-    assert folder.is_dir() and not begun.restored
+        assert not aside.exists() and len(events) == 3
+    assert folder.is_dir() and not transaction.rolled_back
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, launch.TrainInterrupted, ConfigError])
-def test_the_earlier_run_comes_back_if_the_new_one_ends_before_its_first_checkpoint(tmp_path, module_run, error):
-    folder, before = began(tmp_path, module_run)
-    begun = launch.prepare(module_run, folder, resume=False, overwrite=True)
-    with pytest.raises(error), begun:
+def test_the_old_run_is_restored_if_the_new_run_ends_before_its_first_checkpoint(tmp_path, module_run, error):
+    folder, before = started(tmp_path, module_run)
+    transaction = launch.prepare(module_run, folder, resume=False, overwrite=True)
+    with pytest.raises(error), transaction:
         write(folder, ["dataset/segment-000000.frames", "learner.log", "crashes/w0-1.json"])
         raise error
-    assert begun.restored and files(tmp_path) == {f"run/{name}": content for name, content in before.items()}
+    assert transaction.rolled_back and files(tmp_path) == {f"run/{name}": content for name, content in before.items()}
 
 
-def test_after_the_first_checkpoint_or_a_good_end_the_new_run_stays(tmp_path, module_run):
+def test_the_new_run_stays_after_its_first_checkpoint_or_a_successful_end(tmp_path, module_run):
     for checkpoint in (True, False):
-        folder, _ = began(tmp_path / str(checkpoint), module_run)
+        folder, _ = started(tmp_path / str(checkpoint), module_run)
         with pytest.raises(ConfigError) if checkpoint else contextlib.nullcontext():  # noqa: SIM117
             with launch.prepare(module_run, folder, resume=False, overwrite=True):
                 write(folder, ["learner.log"])
@@ -215,31 +215,31 @@ def test_after_the_first_checkpoint_or_a_good_end_the_new_run_stays(tmp_path, mo
         assert (folder / "checkpoints").exists() == checkpoint
 
 
-def test_neither_is_removed_if_the_new_folder_got_a_file_of_the_users(tmp_path, module_run):
-    folder, before = began(tmp_path, module_run)
-    heard = []
-    with pytest.raises(ConfigError), launch.prepare(module_run, folder, resume=False, overwrite=True) as begun:
-        begun.heed(heard.append)
+def test_no_run_is_removed_if_the_new_folder_contains_a_user_file(tmp_path, module_run):
+    folder, before = started(tmp_path, module_run)
+    events = []
+    with pytest.raises(ConfigError), launch.prepare(module_run, folder, resume=False, overwrite=True) as transaction:
+        transaction.commit_at_checkpoint(events.append)
         write(folder, ["notes.md"])
         raise ConfigError("it failed")
-    assert not begun.restored and (folder / "notes.md").exists() and files(run_folder.aside_of(folder)) == before
-    assert str(run_folder.aside_of(folder)) in heard[0]["text"] and "notes.md" in heard[0]["text"]
+    assert not transaction.rolled_back and (folder / "notes.md").exists() and files(run_folder.aside_of(folder)) == before
+    assert str(run_folder.aside_of(folder)) in events[0]["text"] and "notes.md" in events[0]["text"]
 
 
 def killed(tmp_path, run):
-    """What a command leaves that was killed while it replaced a run."""
-    folder, before = began(tmp_path, run)
+    """The folders that a command leaves if it is killed while it replaces a run."""
+    folder, before = started(tmp_path, run)
     launch.prepare(run, folder, resume=False, overwrite=True)._lock.close()
     return folder, run_folder.aside_of(folder), before
 
 
 @pytest.mark.parametrize("options", [(False, False), (True, False), (False, True)])
-def test_after_a_kill_both_runs_are_named_with_the_remedy_and_kept(tmp_path, module_run, options):
+def test_after_a_kill_both_runs_are_kept_and_named_with_the_remedy(tmp_path, module_run, options):
     folder, aside, old = killed(tmp_path, module_run)
     before = files(tmp_path)
     with pytest.raises(ConfigError) as refused:
         launch.prepare(module_run, folder, *options)
-    assert f"delete {folder} to have that one back, or {aside} to keep the new one" in str(refused.value)
+    assert f"delete {folder} to restore the old run, or {aside} to keep the new run" in str(refused.value)
     assert files(tmp_path) == before
     run_folder.remove(folder)  # the remedy
     launch.prepare(module_run, folder, resume=True, overwrite=False)
@@ -253,7 +253,7 @@ def test_after_a_kill_between_checkpoint_and_removal_the_new_run_stays(tmp_path,
     assert not aside.exists() and (folder / "checkpoints").exists()
 
 
-def test_after_a_kill_during_the_removal_what_is_left_is_no_run_that_comes_back(tmp_path, module_run):
+def test_after_a_kill_during_the_removal_the_old_run_is_not_restored(tmp_path, module_run):
     folder, aside, _ = killed(tmp_path, module_run)
     (aside / "run.toml").unlink()
     run_folder.remove(folder)
@@ -261,7 +261,7 @@ def test_after_a_kill_during_the_removal_what_is_left_is_no_run_that_comes_back(
     assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
 
 
-def test_a_campaign_of_faults_clears_only_its_own_files(tmp_path, module_run):
+def test_a_chaos_campaign_removes_only_its_own_files(tmp_path, module_run):
     folder = write(tmp_path / "undisturbed", [*OURS, "notes.md"])
     training = Training("smoke", module_run, (), folder, 1, 1.0)
     training.log.touch()
@@ -275,19 +275,19 @@ def test_a_campaign_of_faults_clears_only_its_own_files(tmp_path, module_run):
 
 
 def forked(folder, version):
-    """The folder's run as a fork that began with another's versions up to this one."""
+    """Make the run in the folder a fork of another run, with the versions up to this one."""
     write(folder, [f"checkpoints/version-{n:04d}.npz" for n in range(version + 1)])
     (folder / "fork.json").write_text(json.dumps({"version": version}))
 
 
-def test_the_versions_that_a_fork_begins_with_are_no_first_checkpoint(tmp_path, module_run, monkeypatch):
-    folder, before = began(tmp_path, module_run)
-    monkeypatch.setattr(launch, "fork", lambda theirs, version, run, folder: forked(folder, version))
+def test_the_versions_that_a_fork_starts_from_are_no_checkpoint_of_its_own(tmp_path, module_run, monkeypatch):
+    folder, before = started(tmp_path, module_run)
+    monkeypatch.setattr(launch, "fork", lambda source, version, run, folder: forked(folder, version))
     given = {"resume": False, "overwrite": True, "source": (tmp_path / "parent", 1)}
-    with pytest.raises(KeyboardInterrupt), launch.prepare(module_run, folder, **given) as begun:
-        begun.heed(lambda event: None)({"event": "progress", "version": 1})
+    with pytest.raises(KeyboardInterrupt), launch.prepare(module_run, folder, **given) as transaction:
+        transaction.commit_at_checkpoint(lambda event: None)({"event": "progress", "version": 1})
         raise KeyboardInterrupt
-    assert begun.restored and files(folder) == before
+    assert transaction.rolled_back and files(folder) == before
     launch.prepare(module_run, folder, **given)._lock.close()  # killed
     with pytest.raises(ConfigError, match="was killed"):
         launch.prepare(module_run, folder, resume=True, overwrite=False)
@@ -297,24 +297,24 @@ def test_the_versions_that_a_fork_begins_with_are_no_first_checkpoint(tmp_path, 
     assert not run_folder.aside_of(folder).exists()
 
 
-def test_a_removal_that_is_cut_short_leaves_no_run(tmp_path, monkeypatch):
+def test_an_interrupted_removal_leaves_no_run(tmp_path, monkeypatch):
     folder = write(tmp_path / "run", OURS)
-    unlink, cut = Path.unlink, []
+    unlink, removed = Path.unlink, []
 
     def once(path, missing_ok=False):
-        if cut:
-            raise OSError("cut short")
-        cut.append(path)
+        if removed:
+            raise OSError("interrupted")
+        removed.append(path)
         unlink(path, missing_ok)
 
     monkeypatch.setattr(Path, "unlink", once)
-    with pytest.raises(OSError, match="cut short"):
+    with pytest.raises(OSError, match="interrupted"):
         run_folder.remove(folder)
-    assert cut == [folder / "run.toml"] and not cut[0].exists()
+    assert removed == [folder / "run.toml"] and not removed[0].exists()
 
 
-def test_the_lock_that_counts_is_the_one_in_the_folder_now(tmp_path, monkeypatch):
-    """A folder may be replaced between the opening of its lock and the locking."""
+def test_the_lock_is_taken_on_the_file_that_is_in_the_folder_now(tmp_path, monkeypatch):
+    """Another process may replace the folder between opening and locking its lock file."""
     folder = write(tmp_path / "run", ["run.toml"])
     flock, replaced = fcntl.flock, []
 

@@ -68,7 +68,7 @@ def test_an_empty_out_is_the_current_folder_and_refused(run, capsys, monkeypatch
     before = files(run.parent)
     for out in ("", ".", ".."):
         line = refused(capsys, 2, run.parent / "small.toml", "--engine", "inline", "--overwrite", "--out", out)
-        assert "is the current folder" in line or "ends in .." in line
+        assert "the current folder" in line or "ends in .." in line
     assert files(run.parent) == before
 
 
@@ -106,7 +106,7 @@ def test_a_fork_never_replaces_its_parent(run, capsys):
 def test_a_run_that_is_on_is_not_replaced(run, capsys):
     before = files(run.parent)
     with hold(run):
-        assert "a run is on in this folder" in refused(capsys, 2, *words(run, "--overwrite"))
+        assert "a run is active in this folder" in refused(capsys, 2, *words(run, "--overwrite"))
     assert files(run.parent) == before
 
 
@@ -215,7 +215,7 @@ def test_an_export_replaces_only_an_export(run, capsys):
     before = files(run.parent)
     for out in (run.parent / "notes.txt", version_file(run, 2)):
         assert cli.main(["export", str(run), "--out", str(out)]) == 2
-        assert f"--out {out}: exists, and is no agent that was exported" in capsys.readouterr().err
+        assert f"--out {out}: exists and is not an exported agent" in capsys.readouterr().err
     assert files(run.parent) == before
     for _ in range(2):
         assert cli.main(["export", str(run)]) == 0

@@ -162,7 +162,7 @@ def test_explain_checks_everything_that_is_left(parent):
     assert answer["learned_by"] == ["T^2"] and answer["spawn_key"] == [1, 1, 3, 2, 1] and answer["seed"] == run.seed
     early = explain.explain(folder, Identity("pretrain", 0, 3, 0, 1), rerun=True)
     assert early["learned_by"] == ["T^0", "T^1", "T^2"] and early["label_origin"] == "optimal" and early["rerun_equal"]
-    assert "made again  the same bytes" in explain.describe(early)
+    assert "rerun        the same bytes" in explain.describe(early)
     lines = list(explain.ledger(folder))
     assert len(lines) == result["trajectories"] and lines[0]["identity"] == "pretrain/0/0/0/0"
     with pytest.raises(ConfigError, match="has no trajectory adapt/9/0/0/0"):
@@ -178,7 +178,7 @@ def test_a_rerun_that_comes_out_otherwise_is_said(parent, monkeypatch):
 
     monkeypatch.setattr(jobs, "adapt", other)
     answer = explain.explain(parent[0], Identity("adapt", 1, 3, 2, 1), rerun=True)
-    assert answer["rerun_equal"] is False and "OTHER bytes" in explain.describe(answer)
+    assert answer["rerun_equal"] is False and "DIFFERENT bytes" in explain.describe(answer)
 
 
 def test_a_variation_that_cannot_be_run_is_left_out_and_listed(parent, tmp_path, monkeypatch):

@@ -5,7 +5,6 @@ from threading import Event, Thread
 
 import numpy as np
 import pytest
-from icrl_dist.monitor.play import HELD_S, PlayGame
 
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.loading import load_agent
@@ -14,6 +13,7 @@ from icrl_dist.config.run import dumps, load, parse
 from icrl_dist.monitor import player
 from icrl_dist.monitor.player import Player
 from icrl_dist.monitor.serve import EventStream
+from icrl_dist.problems.darkroom.game import HELD_S, PlayGame
 from icrl_dist.problems.darkroom.room import MOVES, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 

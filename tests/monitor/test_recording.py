@@ -169,7 +169,7 @@ def test_a_folder_is_watched_while_its_learner_holds_it_and_played_when_it_is_go
     ((kind, name),) = feeds
     assert kind is (LiveFeed if there else ReplayFeed)
     assert name in (("" if link else "night") if there else ("", "latest", "night"))
-    assert ("its learner is gone" in capsys.readouterr().out) == (endpoint and not there)
+    assert ("no learner is running here" in capsys.readouterr().out) == (endpoint and not there)
 
 
 def test_without_a_folder_the_newest_run_is_meant_whose_learner_lives(hub, tmp_path, monkeypatch):

@@ -14,7 +14,6 @@ from icrl_dist.agent.loading import load_agent
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, EvaluateConfig
-from icrl_dist.console.terminal import returns_table
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import splits
@@ -24,6 +23,7 @@ from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft
 from icrl_dist.problems.registry import spec
 from icrl_dist.results import evaluate
 from icrl_dist.results.statistics import mean_and_error
+from icrl_dist.results.tables import returns_table
 from icrl_dist.storage.files import Checkpoint, StoreError, save_checkpoint, version_file
 from icrl_dist.types import Variation
 from learner import checkpoints

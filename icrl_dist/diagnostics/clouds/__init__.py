@@ -1,7 +1,7 @@
-"""What a node of a cloud may be asked for: keys and types, as the clouds publish them.
+"""Schemas of ``node_config``: the keys and types that each cloud accepts for a node.
 
-``aws.json``: the members of EC2's RunInstances, from botocore 1.44.8's service description, with
-``SubnetIds`` in place of what Ray fills in itself; ``gcp.json``: Compute Engine's Instance, from
-google-api-python-client 2.202.0's discovery document, without what only the service writes.
-Three levels deep; ``map`` is looked into no further.
+``aws.json``: the members of EC2's RunInstances, from the service description of botocore 1.44.8, with
+``SubnetIds`` in place of the members that Ray sets itself.  ``gcp.json``: Compute Engine's Instance,
+from the discovery document of google-api-python-client 2.202.0, without the fields that only the
+service writes.  Both are three levels deep; the content of a ``map`` is not checked.
 """

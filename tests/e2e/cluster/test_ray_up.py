@@ -123,7 +123,7 @@ class TestJobs:
             with jobs.held():
                 subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=250)
                 process.wait(timeout=200)
-            assert re.search(r"interrupted; `icrl-dist train smoke --resume .*` goes on", printed()), printed()
+            assert re.search(r"interrupted; `icrl-dist train smoke --resume .*` continues", printed()), printed()
             assert "was stopped" in printed(), printed()
         assert not jobs.head.processes("learner") and not jobs.head.processes("icrl-dist train")
         with underway(tmp_path, jobs.exec(jobs.train("stopped", "--resume"))) as (process, printed):

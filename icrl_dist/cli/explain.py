@@ -1,0 +1,51 @@
+"""``icrl-dist explain``: the origin of a training example."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from icrl_dist.cli.exit_codes import FAILED, OK
+from icrl_dist.config.run import ConfigError
+from icrl_dist.types import Identity
+
+
+@dataclass(frozen=True)
+class ExplainArguments:
+    """Show the origin of a training example: task, adversary, weights, seed, worker, labels, bytes.
+
+    Without IDENTITY: print the whole ledger, one JSON line per trajectory.
+    """
+
+    what: tyro.conf.Positional[Path]
+    """Run folder."""
+    identity: tyro.conf.Positional[str | None] = None
+    """STAGE/ROUND/TASK/VARIATION/TRIAL, such as adapt/0/3/1/7."""
+    rerun: bool = False
+    """Repeat the rollout on this machine and compare every byte."""
+    json: bool = False
+    """Print one JSON object on the last line."""
+
+
+def explain(arguments: ExplainArguments, console: Console) -> int:
+    """Print the origin of one trajectory, or the whole ledger.  Returns FAILED if a stored byte has changed."""
+    from icrl_dist.diagnostics import explain as origin
+
+    if arguments.identity is None:
+        for line in origin.ledger(arguments.what):
+            print(json.dumps(line))
+        return OK
+    try:
+        identity = Identity.parse(arguments.identity)
+    except ValueError as error:
+        raise ConfigError(f"explain: {error}") from None
+    answer = origin.explain(arguments.what, identity, arguments.rerun)
+    console.print(origin.describe(answer), highlight=False, markup=False)
+    if arguments.json:
+        print(json.dumps(answer))
+    unchanged = answer["intact"] and answer.get("weights_intact", True) and answer.get("rerun_equal", True)
+    return OK if unchanged else FAILED
