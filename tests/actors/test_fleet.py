@@ -101,7 +101,7 @@ def join(monkeypatch):
         nonlocal promised
         promised = missing.Expected(*options.pop("promised", ((), 0)))
         monkeypatch.setitem(sys.modules, "ray", ray)
-        monkeypatch.setattr(cluster.nodes, "reach", ray.reach)
+        monkeypatch.setattr(cluster.node_facts, "reach", ray.reach)
         return fleet.Fleet(actors, restarts, address, **options)
 
     return joined

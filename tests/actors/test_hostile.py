@@ -18,8 +18,8 @@ from icrl_dist.methods.recipes import METHODS
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
-from learner.scheduler import Board
-from learner.worker_api import Desk
+from learner.scheduler import LeaseScheduler
+from learner.worker_api import WorkerAPI
 from tests.e2e.training import wait_for
 
 KEYS = Keys("test")
@@ -38,18 +38,18 @@ with ZenohLink.connect(endpoint, timeout_s=30.0) as link:
 
 
 class Learner:
-    """A Board and a Desk on a real link; what arrives is kept by identity."""
+    """A LeaseScheduler and a WorkerAPI on a real link; what arrives is kept by identity."""
 
     def __init__(self, run, folder, lease_s):
         self.run, self.folder, self.stored, self.events, self.failures = run, folder, {}, [], []
         self.jobs = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])[:2]
         self.everything = {i for job in self.jobs for i in job.identities()}
         self.lock = threading.Lock()
-        self.board = Board(lease_s, floor_s=lease_s)
-        self.board.open(self.jobs, lambda job: ())
+        self.scheduler = LeaseScheduler(lease_s, floor_s=lease_s)
+        self.scheduler.open(self.jobs, lambda job: ())
         self.link = ZenohLink.listen("tcp/127.0.0.1:0")
-        arguments = self.link, KEYS, self.board, self.lock, self.events.append, self.failures.append
-        self.desk = Desk(run, folder, *arguments)
+        arguments = self.link, KEYS, self.scheduler, self.lock, self.events.append, self.failures.append
+        self.worker_api = WorkerAPI(run, folder, *arguments)
         self.link.serve(KEYS.data, self.take)
 
     @property
@@ -60,23 +60,23 @@ class Learner:
         for one in batching.split(query, 1 << 20):
             identity = wire.decode_trajectory(one.payload, 1 << 20).identity
             with self.lock:
-                if self.board.wants(identity):
+                if self.scheduler.pending_job(identity):
                     assert identity not in self.stored
                     self.stored[identity] = one.payload
-                    self.board.received(identity, time.monotonic())
-                    done = self.board.done("pretrain", 0)
+                    self.scheduler.received(identity, time.monotonic())
+                    done = self.scheduler.done("pretrain", 0)
                 else:
-                    self.board.repeated(identity, time.monotonic())
+                    self.scheduler.repeated(identity, time.monotonic())
                     done = False
             one.reply(b"stored")
             if done:
-                self.desk.finish()
+                self.worker_api.finish()
 
     def done(self):
         with self.lock:
-            done = self.board.done("pretrain", 0)
+            done = self.scheduler.done("pretrain", 0)
         if done:
-            self.desk.finish()
+            self.worker_api.finish()
         return done
 
     def events_of(self, kind):
@@ -86,7 +86,7 @@ class Learner:
         return [json.loads(path.read_text()) for path in sorted((self.folder / "crashes").glob("*.json"))]
 
     def close(self):
-        self.desk.close()
+        self.worker_api.close()
         self.link.close()
 
 
@@ -145,7 +145,7 @@ def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(lea
     assert {i for i in learner.everything if i not in learner.stored} == {
         i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")
     }
-    ((name, cause),) = learner.board.blamed()
+    ((name, cause),) = learner.scheduler.quarantine_causes()
     assert name == CULPRIT and cause.startswith("ZeroDivisionError: the room broke (sitecustomize.py:")
     assert [event["identity"] for event in learner.events_of("quarantine")] == [CULPRIT]
     assert [record["job"] for record in learner.records()] == ["pretrain/0/0"] * 2 + [CULPRIT]
@@ -175,7 +175,7 @@ def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, ho
     wait_for(learner.done, "the phase")
     _, log = process.communicate(timeout=100)
     assert process.returncode == 0, log
-    assert set(learner.stored) == learner.everything and not learner.board.quarantined
+    assert set(learner.stored) == learner.everything and not learner.scheduler.quarantined
     assert not (learner.folder / "crashes" / "w0-1.stacks").exists(), "nothing stood in it"
 
 
@@ -233,7 +233,7 @@ def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_ot
     assert (fleet.deaths, len(notes)) == (3, 3) and all("starting it again" in note for note in notes)
     missing = learner.everything - set(learner.stored)
     assert missing == {i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")}
-    ((name, cause),) = learner.board.blamed()
+    ((name, cause),) = learner.scheduler.quarantine_causes()
     assert (name, cause) == (CULPRIT, "worker w0-2 died")
     assert [event["identity"] for event in learner.events_of("quarantine")] == [CULPRIT]
     wait_for(lambda: len(learner.events_of("crash")) == 3, "the records")

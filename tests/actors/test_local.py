@@ -52,7 +52,7 @@ def reluctant():
 def test_it_is_started_again_and_what_a_failed_start_left_is_ended_and_nothing_else(reluctant):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         ray, notes = reluctant(2), []
-        local.begin(ray, notes.append, num_cpus=2)
+        local.start_ray(ray, notes.append, num_cpus=2)
         assert other.poll() is None
         other.communicate(b"\n")
     assert [len(family) for family in ray.alive()] == [0, 0, 2] and ray.shut == 2
@@ -64,5 +64,5 @@ def test_it_is_started_again_and_what_a_failed_start_left_is_ended_and_nothing_e
 def test_it_is_given_up_after_three_times_or_when_nobody_wants_it(reluctant, stopped, tries):
     ray = reluctant(3)
     with pytest.raises(RuntimeError, match=rf"The current node timed out\.\), tried {tries} times"):
-        local.begin(ray, lambda text: None, lambda: stopped, num_cpus=2)
+        local.start_ray(ray, lambda text: None, lambda: stopped, num_cpus=2)
     assert ray.alive() == [[]] * tries

@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from actors import publisher
-from actors.publisher import Samples, Showing
+from actors.publisher import Samples, TrajectoryPublisher
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.types import Identity
@@ -36,7 +36,7 @@ def heard(monkeypatch):
 
 
 def test_the_first_at_once_the_next_together_the_last_when_flushed(heard):
-    shown = Showing(heard, KEYS, "w0")
+    shown = TrajectoryPublisher(heard, KEYS, "w0")
     for trial in range(25):
         heard.now = 0.01 * trial
         shown.show(trajectory(f"adapt/0/3/1/{trial}"))
@@ -48,7 +48,7 @@ def test_the_first_at_once_the_next_together_the_last_when_flushed(heard):
 
 
 def test_whoever_ends_few_episodes_tells_of_each_at_once(heard):
-    shown = Showing(heard, KEYS, "w0")
+    shown = TrajectoryPublisher(heard, KEYS, "w0")
     for trial in range(3):
         heard.now = 0.2 * trial
         shown.show(trajectory(f"adapt/0/3/1/{trial}"))
@@ -56,14 +56,14 @@ def test_whoever_ends_few_episodes_tells_of_each_at_once(heard):
 
 
 def test_a_message_holds_only_so_many(heard):
-    shown = Showing(heard, KEYS, "w0")
+    shown = TrajectoryPublisher(heard, KEYS, "w0")
     for trial in range(600):
         shown.show(trajectory(f"adapt/0/3/1/{trial}"))
     assert [len(one) for one in heard.messages] == [1, 256, 256]
 
 
 def test_two_threads_lose_and_repeat_nothing(heard):
-    shown = Showing(heard, KEYS, "w0")
+    shown = TrajectoryPublisher(heard, KEYS, "w0")
     ended = threading.Event()
 
     def beat():

@@ -76,7 +76,7 @@ def test_kill_9_of_the_whole_tree_twice_then_of_the_command_alone_changes_nothin
         wait_for(lambda: len(workers_of(process)) == 2, "both workers")
         family = psutil.Process(process.pid).children(recursive=True)
         # Ray's two agents notice by themselves, within a minute.
-        ours.extend(p for p in family if re.search("learner|_Host", " ".join(p.cmdline())))
+        ours.extend(p for p in family if re.search("learner|WorkerActor", " ".join(p.cmdline())))
         os.kill(process.pid, signal.SIGKILL)
         finish(process)
 

@@ -9,7 +9,7 @@ import pytest
 from actors import fleet
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.launch import learner_process, train
-from learner.__main__ import _listen
+from learner.__main__ import _read_lost_workers
 
 
 @pytest.fixture
@@ -43,11 +43,11 @@ def test_a_learner_is_told_who_went_with_a_machine_and_the_next_one_of_all(learn
     until(lambda: told.read_text().endswith('\n["w0", "w1", "w2", "w3"]\n'))
 
 
-def test_what_it_is_told_goes_to_the_desk():
+def test_workers_lost_with_nodes_reach_the_worker_api():
     heard, (read, write) = [], os.pipe()
     os.write(write, b'["w0"]\n["w1", "w2"]\n')
     os.close(write)
-    _listen(SimpleNamespace(desk=SimpleNamespace(excuse=heard.append)), read)
+    _read_lost_workers(SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=heard.append)), read)
     os.close(read)
     assert heard == [["w0"], ["w1", "w2"]]
 

@@ -29,7 +29,7 @@ def said(small_run, tmp_path, monkeypatch):
 
         monkeypatch.setattr(MemoryLink, "publish", listen)
         monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
-        monkeypatch.setattr(reporter, "_ABOUT_S", 0.0)
+        monkeypatch.setattr(reporter, "_DESCRIPTION_S", 0.0)
         monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
         run = dataclasses.replace(small_run, alerts=AlertsConfig(**thresholds))
         launch.prepare(run, tmp_path / "said", resume=False, overwrite=False)

@@ -137,6 +137,6 @@ def test_a_job_that_always_fails_ends_the_run_with_its_cause(small_run, tmp_path
 
     monkeypatch.setattr(jobs, "random_context", broken)
     with pytest.raises(
-        train.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"
+        train.TrainFailed, match=r"no trajectory was stored, and .* ZeroDivisionError: the environment broke"
     ):
         run_inline(small_run, tmp_path / "broken")

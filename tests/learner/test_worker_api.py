@@ -1,4 +1,4 @@
-"""The Desk over a MemoryLink: what workers are told, and what is known of those that went wrong."""
+"""The WorkerAPI over a MemoryLink: what workers are told, and what is known of those that went wrong."""
 
 import dataclasses
 import json
@@ -14,9 +14,9 @@ from icrl_dist.methods.recipes import METHODS
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Keys, Refused
 from icrl_dist.telemetry import crash_reports
-from learner import worker_api as desk_module
-from learner.scheduler import Board
-from learner.worker_api import Desk
+from learner import worker_api as worker_api_module
+from learner.scheduler import LeaseScheduler
+from learner.worker_api import WorkerAPI
 
 KEYS = Keys("test")
 COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "waited_s": 0.0}
@@ -24,19 +24,21 @@ RECORD = {"what": "raised", "job": "pretrain/0/0", "exception": "ValueError: no 
 
 
 class Office:
-    """A Desk with a Board of three jobs, what it reports, and workers to send there."""
+    """A WorkerAPI with a LeaseScheduler of three jobs, what it reports, and workers to send there."""
 
     def __init__(self, run, folder, hub, monkeypatch):
-        monkeypatch.setattr(desk_module, "_MOMENT_S", 0.0)
+        monkeypatch.setattr(worker_api_module, "_STACKS_DELAY_S", 0.0)
         self.run, self.folder, self.events, self.failures = run, folder, [], []
         self.jobs = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])[:3]
-        self.board = Board(60.0)
-        self.board.open(self.jobs, lambda job: ())
+        self.scheduler = LeaseScheduler(60.0)
+        self.scheduler.open(self.jobs, lambda job: ())
         self.acting = None
         link = hub()
         lock = threading.Lock()
         act = lambda job: self.acting if self.acting is not None else job.policy_version  # noqa: E731
-        self.desk = Desk(run, folder, link, KEYS, self.board, lock, self.events.append, self.failures.append, act)
+        self.worker_api = WorkerAPI(
+            run, folder, link, KEYS, self.scheduler, lock, self.events.append, self.failures.append, act
+        )
         self.link = hub()
 
     def say(self, kind, worker, link=None, **fields):
@@ -62,7 +64,7 @@ class Office:
 def office(small_run, tmp_path, hub, monkeypatch):
     office = Office(small_run, tmp_path, hub, monkeypatch)
     yield office
-    office.desk.close()
+    office.worker_api.close()
 
 
 @pytest.fixture
@@ -105,14 +107,14 @@ def test_who_asks_gets_a_job_with_its_deadline_then_wait_then_stop(office):
         kind, fields = office.ask(f"w{i}")
         assert (kind, wire.decode_job(fields["job"]), fields["deadline_s"]) == ("job", job, 60.0)
     assert office.ask("w3") == ("wait", {"seconds": 0.1})
-    office.desk.finish()
+    office.worker_api.finish()
     assert office.ask("w3") == ("stop", {})
 
 
 def test_the_service_says_which_weights_a_job_acts_with(office):
     office.acting = 5
     assert wire.decode_job(office.ask("w0")[1]["job"]).policy_version == 5
-    assert office.board.wants(next(iter(office.jobs[0].identities()))).policy_version == 5
+    assert office.scheduler.pending_job(next(iter(office.jobs[0].identities()))).policy_version == 5
 
 
 def test_counters_are_the_newest_of_every_worker_and_never_fall(office, hub):
@@ -122,12 +124,12 @@ def test_counters_are_the_newest_of_every_worker_and_never_fall(office, hub):
     beating = hub()
     beating.publish(KEYS.monitor("worker/w0"), wire.encode_message("worker", worker="w0", **heartbeat), droppable=True)
     deadline = time.monotonic() + 30
-    while "memory_mb" not in office.desk.counters["w0"]:
+    while "memory_mb" not in office.worker_api.counters["w0"]:
         assert time.monotonic() < deadline, "the heartbeat was not heard"
         time.sleep(0.01)
-    said = office.desk.counters["w0"]
+    said = office.worker_api.counters["w0"]
     assert [said[name] for name in COUNTS] == [3, 24, 2, 3, 1.5] and said["memory_mb"] == 80.5
-    assert office.desk.resent == 3 and office.desk.told["waited_s"] == 1.5
+    assert office.worker_api.resent == 3 and office.worker_api.totals["waited_s"] == 1.5
 
 
 def test_nobody_waits_for_a_worker_whose_next_life_has_come(office, worker):
@@ -135,9 +137,9 @@ def test_nobody_waits_for_a_worker_whose_next_life_has_come(office, worker):
     office.ask("w0")
     link.close()
     office.wait("worker", 2)
-    assert "w0" in office.desk.told["silent"]
+    assert "w0" in office.worker_api.totals["silent"]
     worker("w0-1")
-    assert "w0" not in office.desk.told["silent"]
+    assert "w0" not in office.worker_api.totals["silent"]
 
 
 def test_a_worker_that_vanishes_leaves_a_record_of_what_it_did_last(office, worker):
@@ -145,12 +147,12 @@ def test_a_worker_that_vanishes_leaves_a_record_of_what_it_did_last(office, work
     office.ask("w0", episodes=7)
     link.close()
     (event,) = office.wait("crash")
-    assert event["text"] == f"worker w0 vanished (without a word); {office.folder / 'crashes' / 'w0-1.json'}"
+    assert event["text"] == f"worker w0 ended without a report (no stacks were written: it was killed or disconnected); {office.folder / 'crashes' / 'w0-1.json'}"
     (record,) = records(office).values()
     assert (record["what"], record["job"], record["seed"]) == ("vanished", office.jobs[0].label, office.run.seed)
     assert record["last_said"]["episodes"] == 7 and record["stacks"] == []
     joined, gone = (event["text"] for event in office.wait("worker", 2))
-    assert joined == "worker w0 joined" and gone == "worker w0 is gone; its job goes to another: pretrain/0/0"
+    assert joined == "worker w0 joined" and gone == "worker w0 is gone; its job will be leased again: pretrain/0/0"
     assert wire.decode_job(office.ask("w1")[1]["job"]) == office.jobs[0]
 
 
@@ -162,7 +164,7 @@ def test_the_record_of_a_stuck_worker_holds_its_stacks(office, worker):
     stacks.write_text("Timeout (0:00:05)!\n  File x in step\n" + "deep\n" * 100)
     link.close()
     (event,) = office.wait("crash")
-    assert "vanished (Timeout (0:00:05)!)" in event["text"]
+    assert "ended without a report (Timeout (0:00:05)!)" in event["text"]
     (record,) = records(office).values()
     assert record["stacks"][:2] == ["Timeout (0:00:05)!", "  File x in step"] and len(record["stacks"]) == 60
 
@@ -173,12 +175,12 @@ def test_a_worker_that_ends_with_the_run_leaves_nothing(office, worker):
     office.wait("crash")
     for name, text in (("w0", "Timeout (0:00:05)!"), ("w1", ""), ("w2", "")):
         crash_reports.stacks_of(office.folder, name).write_text(text)
-    office.desk.finish()
+    office.worker_api.finish()
     office.ask("w1")
     first.close()
     second.close()
-    office.desk.dismiss(timeout_s=30.0)
-    assert office.desk.workers == {"w0": False, "w1": False, "w2": False}
+    office.worker_api.wait_until_gone(timeout_s=30.0)
+    assert office.worker_api.workers == {"w0": False, "w1": False, "w2": False}
     assert sorted(path.name for path in (office.folder / "crashes").iterdir()) == ["w0-1.json", "w0.stacks"]
 
 
@@ -220,18 +222,18 @@ def test_a_quarantine_is_told_once_and_the_run_goes_on(office):
             office.fail("w0", job)
         else:
             for identity in job.identities():
-                office.board.received(identity, 0.0)
+                office.scheduler.received(identity, 0.0)
     (event,) = office.wait("quarantine")
     assert (event["identity"], event["cause"]) == ("pretrain/0/1/1", "ValueError: no (room.py:3)")
-    assert event["text"] == "variation pretrain/0/1/1 is quarantined, the run goes on without it: ValueError: no (room.py:3)"
+    assert event["text"] == "variation pretrain/0/1/1 is quarantined, the run continues without it: ValueError: no (room.py:3)"
     assert len(office.wait("crash", 3)) == 3 and not office.failures
-    assert office.board.done("pretrain", 0) and office.board.progress("pretrain", 0) == (34, 34)
-    assert office.board.blamed() == [("pretrain/0/1/1", "ValueError: no (room.py:3)")]
+    assert office.scheduler.done("pretrain", 0) and office.scheduler.progress("pretrain", 0) == (34, 34)
+    assert office.scheduler.quarantine_causes() == [("pretrain/0/1/1", "ValueError: no (room.py:3)")]
 
 
 def test_the_cause_of_a_quarantine_by_death_says_who_and_where(office, worker):
     alone = dataclasses.replace(office.jobs[0], variations=office.jobs[0].variations[:1], tasks=1)
-    office.board.open([alone], lambda job: ())
+    office.scheduler.open([alone], lambda job: ())
     for life in range(3):
         link = worker(f"w{life}")
         office.ask(f"w{life}")
@@ -245,19 +247,19 @@ def test_the_cause_of_a_quarantine_by_death_says_who_and_where(office, worker):
 
 def test_workers_that_went_with_their_machines_quarantine_nothing(office, worker):
     alone = dataclasses.replace(office.jobs[0], variations=office.jobs[0].variations[:1], tasks=1)
-    office.board.open([alone], lambda job: ())
+    office.scheduler.open([alone], lambda job: ())
     keep = office.jobs[1]
-    office.board.open([dataclasses.replace(keep, stage="adapt")], lambda job: ())
-    office.desk.excuse(["w0"])
+    office.scheduler.open([dataclasses.replace(keep, stage="adapt")], lambda job: ())
+    office.worker_api.lost_with_node(["w0"])
     for life in range(4):
         link = worker(f"w{life}")
         assert wire.decode_job(office.ask(f"w{life}")[1]["job"]) == alone
         link.close()
         office.wait("crash", life + 1)
     office.wait("quarantine")
-    office.desk.excuse(["w1", "w2", "w3"])
-    assert office.wait("released")[0]["text"].startswith("variation pretrain/0/0/0 is tried again")
-    assert wire.decode_job(office.ask("w4")[1]["job"]) == alone and not office.board.quarantined
+    office.worker_api.lost_with_node(["w1", "w2", "w3"])
+    assert office.wait("released")[0]["text"].startswith("variation pretrain/0/0/0 is leased again")
+    assert wire.decode_job(office.ask("w4")[1]["job"]) == alone and not office.scheduler.quarantined
 
 
 def test_a_run_in_which_everything_fails_ends_with_the_cause(office):
@@ -266,39 +268,42 @@ def test_a_run_in_which_everything_fails_ends_with_the_cause(office):
         assert kind == "job"
         office.fail("w0", wire.decode_job(fields["job"]))
     (line,) = office.failures
-    assert line.startswith("pretrain/0: not one trajectory was stored, and 8 of its variations are quarantined")
+    assert line.startswith("pretrain/0: no trajectory was stored, and 8 of its variations are quarantined")
     assert line.endswith("first: ValueError: no (room.py:3)")
 
 
 def test_a_phase_in_which_nothing_is_left_ends_the_run(office):
     alone = dataclasses.replace(office.jobs[0], variations=office.jobs[0].variations[:1], tasks=1)
-    office.board.open([alone], lambda job: ())
+    office.scheduler.open([alone], lambda job: ())
     for _ in range(3):
         assert not office.failures
         office.ask("w0")
         office.fail("w0", alone)
-    assert office.failures[0].startswith("pretrain/0: not one trajectory was stored, and 1 of")
+    assert office.failures[0].startswith("pretrain/0: no trajectory was stored, and 1 of")
 
 
 def test_a_record_that_cannot_be_written_is_said_too(office):
     (office.folder / "crashes").write_text("a file is in the way")
     office.ask("w0")
     office.fail("w0", office.jobs[0])
-    assert "its record cannot be written" in office.wait("crash")[0]["text"]
+    assert "its crash record cannot be written" in office.wait("crash")[0]["text"]
 
 
 def test_what_takes_long_is_shown_while_its_worker_is_here_and_a_note_at_once(office, worker):
-    assert office.desk.doing == []
+    assert office.worker_api.long_work == []
     links = {name: worker(name) for name in ("w1", "w0")}
     for name, text in (("w0", "4 experts at 1,000 of 12,000 steps"), ("w1", "")):
         office.ask(name, doing=text)
-    assert office.desk.doing == ["w0: 4 experts at 1,000 of 12,000 steps"]
+    assert office.worker_api.long_work == ["w0: 4 experts at 1,000 of 12,000 steps"]
     office.ask("w1", doing="x" * 1000)
-    assert [len(text) for text in office.desk.doing] == [len("w0: 4 experts at 1,000 of 12,000 steps"), len("w1: ") + 100]
+    assert [len(text) for text in office.worker_api.long_work] == [
+        len("w0: 4 experts at 1,000 of 12,000 steps"),
+        len("w1: ") + 100,
+    ]
     links["w0"].close()
     office.wait("worker", 3)
-    assert [text[:3] for text in office.desk.doing] == ["w1:"]
+    assert [text[:3] for text in office.worker_api.long_work] == ["w1:"]
     assert office.say("note", "w1", text="2 experts from the cache")[0] == "noted"
     assert office.wait("note")[0]["text"] == "worker w1: 2 experts from the cache"
-    with pytest.raises(Refused, match="expected hello, ask, failed or note"):
+    with pytest.raises(Refused, match="use hello, ask, failed or note"):
         office.say("gossip", "w1")

@@ -76,7 +76,7 @@ class Cluster:
     @contextlib.contextmanager
     def held(self):
         """Every worker stands still: no run gets on, however busy this machine is."""
-        held = [process for machine in self.workers for process in machine.processes("_Host.work")]
+        held = [process for machine in self.workers for process in machine.processes("WorkerActor.work")]
         for process in held:
             process.suspend()
         try:

@@ -77,8 +77,8 @@ class TestJobs:
 
     def test_a_run_submitted_from_outside_equals_one_in_one_process_and_says_where_everything_is(self, jobs, inline, tmp_path):
         with underway(tmp_path, jobs.job("submit", "--", *jobs.train("smoke").split())) as (process, printed):
-            wait_until(lambda: jobs.running("_Host.work") == [1, 1] or process.poll() is not None, "a worker on each machine")
-            assert process.poll() is None and not jobs.head.processes("_Host.work"), printed()
+            wait_until(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "a worker on each machine")
+            assert process.poll() is None and not jobs.head.processes("WorkerActor.work"), printed()
             wait_until(lambda: "round 0" in printed() or process.poll() is not None, "what the run prints")
             assert process.poll() is None, "nothing was printed before the end"
             assert process.wait(timeout=400) == 0, printed()
@@ -119,7 +119,7 @@ class TestJobs:
         """Both workers are cut off in the middle of a round, so that the run cannot go on without them."""
         words = jobs.job("submit", "--submission-id", "stopped", "--", *jobs.train("stopped").split())
         with underway(tmp_path, words) as (process, printed):
-            wait_until(lambda: jobs.running("_Host.work") == [1, 1] or process.poll() is not None, "workers")
+            wait_until(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "workers")
             with jobs.held():
                 subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=250)
                 process.wait(timeout=200)
