@@ -44,7 +44,7 @@ class Broadcast:
             return self._digests[version]
 
     def _answer(self, query: Query) -> None:
-        """An empty request asks for the newest version, a request with ``version`` for that one."""
+        """Answer an empty request with the newest version, a request with ``version`` with that one."""
         version = -1
         if query.payload:
             try:

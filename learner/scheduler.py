@@ -219,7 +219,7 @@ class LeaseScheduler:
         """Record that a worker is gone: its unfinished job has failed once more and is free; returns it if so.
 
         The failure counts even if the lease had expired and another worker has the job now.  If the job
-        got further than ever before, its earlier failures are forgotten: it goes on from a checkpoint,
+        got further than ever before, its earlier failures are forgotten: it continues from a checkpoint,
         and several workers in turn may be killed from outside.
         """
         state = self._held.get(worker)

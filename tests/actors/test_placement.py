@@ -85,9 +85,9 @@ def test_a_node_that_the_file_lists_by_name_is_found_by_its_address(logs, monkey
         return [(2, 1, 6, "", (addresses[name], 0))]
 
     monkeypatch.setattr(missing.socket, "getaddrinfo", resolve)
-    expected = missing.ExpectedNodes(("one", "10.0.0.3", "nobody"), 3)
+    expected = missing.ExpectedNodes(("one", "10.0.0.3", "unknown"), 3)
     (line,) = missing.report(expected, {"10.0.0.2", "10.0.0.3"}, logs)
-    assert line.startswith("nobody has not joined")
+    assert line.startswith("unknown has not joined")
 
 
 def test_cloud_nodes_have_no_addresses_so_they_are_counted(logs):

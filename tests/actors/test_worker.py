@@ -41,14 +41,14 @@ class ScriptedLearner:
     """Answers requests for jobs from a list, and keeps the requests and trajectories."""
 
     def __init__(self, link, run, answers):
-        self.run, self.answers, self.asked, self.stored = run, list(answers), [], []
+        self.run, self.answers, self.requests, self.stored = run, list(answers), [], []
         self.refused = set()
         link.serve(KEYS.work, self.work)
         link.serve(KEYS.data, self.data)
 
     def work(self, query):
         kind, fields = wire.decode_message(query.payload)
-        self.asked.append((kind, fields))
+        self.requests.append((kind, fields))
         if kind == "hello":
             query.reply(wire.encode_message("hello", run=dumps(self.run)))
         elif kind == "failed":
@@ -82,8 +82,8 @@ def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
     Worker(hub(), "test", "w7").run()
     assert [t.identity for t in learner.stored] == list(job.identities())
     assert {t.worker for t in learner.stored} == {"w7"}
-    assert learner.asked[0][1]["version"] == icrl_dist.__version__
-    assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
+    assert learner.requests[0][1]["version"] == icrl_dist.__version__
+    assert [kind for kind, _ in learner.requests] == ["hello", "ask", "ask", "ask"]
     published = lambda: [  # noqa: E731
         row["identity"] for kind, fields in list(seen) if kind == "trajectories" for row in monitor_messages.rows(fields)
     ]
@@ -96,7 +96,7 @@ def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
     bad = dataclasses.replace(other, settings=())
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     Worker(hub(), "test", "w0").run()
-    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert report["job"] == list(bad.name) and report["file"] == ""
     record = report["record"]
     assert "KeyError" in record["exception"] and ".py:" in record["exception"]
@@ -123,7 +123,7 @@ def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, smal
     monkeypatch.setattr(worker_module, "Watchdog", lambda run, name: Watchdog(None, name))  # pytest's process has one
     monkeypatch.setattr(worker_module._log, "exception", lambda *texts: None)  # a log file may not accept this text
     Worker(hub(), "test", "w3", folder=tmp_path).run()
-    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert [t.identity for t in learner.stored] == list(job.identities())[:2]
     assert report["record"]["identity"] == str(list(job.identities())[2])
     assert report["file"] == "w3-1.json"
@@ -135,7 +135,7 @@ def test_a_refused_trajectory_fails_its_own_job_only(hub, small_run):
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     learner.refused = set(list(bad.identities())[:5])
     Worker(hub(), "test", "w0").run()
-    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert report["job"] == list(bad.name)
     assert "Refused: not-finite: pretrain/0/0/0/0" in report["record"]["exception"] and report["record"]["identity"] == ""
     assert {t.identity for t in learner.stored} >= set(good.identities())
@@ -163,7 +163,7 @@ def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, sm
     monkeypatch.setattr(jobs, "do", stuck_for_three_beats)
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     Worker(hub(), "test", "w0").run()
-    asks = [fields for kind, fields in learner.asked if kind == "ask"]
+    asks = [fields for kind, fields in learner.requests if kind == "ask"]
     count = len(list(job.identities()))
     counters = [{name: ask[name] for name in ("episodes", "steps", "trajectories", "resent")} for ask in asks]
     assert counters[0] == dict.fromkeys(counters[0], 0)
@@ -209,29 +209,29 @@ def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monke
         learner = ScriptedLearner(network(), committed_run, [job_message(job), STOP])
         latest = wire.encode_weights(weights(committed_run, 0))
         network().serve(KEYS.weights_latest, lambda query: query.reply(latest))
-        heard = []
-        network().subscribe(KEYS.monitor(topic), lambda key, payload: heard.append(wire.decode_message(payload)))
+        messages = []
+        network().subscribe(KEYS.monitor(topic), lambda key, payload: messages.append(wire.decode_message(payload)))
         read = []
         real = Room.read
         with monkeypatch.context() as patched:
-            patched.setattr(Room, "read", lambda *asked: read.append(real(*asked)) or read[-1])
+            patched.setattr(Room, "read", lambda *arguments: read.append(real(*arguments)) or read[-1])
             Worker(network(), "test", "w0").run()
-        return [wire.trajectory_digest(t) for t in learner.stored], heard, read
+        return [wire.trajectory_digest(t) for t in learner.stored], messages, read
 
-    watched, heard, read = work("belief/w0")
+    watched, messages, read = work("belief/w0")
     unwatched, _, unread = work("belief/w1")
     assert watched == unwatched and len(watched) == len(list(job.identities()))
     decisions = job.trials * committed_run.darkroom.horizon
     assert len(read) == decisions and not unread
     shown = [identity for identity in job.identities() if (identity.task, identity.variation) == job.rows()[-1]]
-    assert [fields["identity"] for _, fields in heard][:: committed_run.darkroom.horizon] == [str(one) for one in shown]
-    kind, fields = heard[-1]
+    assert [fields["identity"] for _, fields in messages][:: committed_run.darkroom.horizon] == [str(one) for one in shown]
+    kind, fields = messages[-1]
     variation = job.variation(shown[-1])
     assert (kind, fields["worker"], fields["size"]) == ("belief", "w0", 3)
     assert tuple(fields["goal"]) == variation.task.vector("goal")
     assert sum(fields["implied"]) == pytest.approx(1, abs=1e-4) and sum(fields["exact"]) == pytest.approx(1, abs=1e-4)
     assert fields["exact"] == pytest.approx(read[-1].exact, abs=1e-5)
-    kept = [fields["transitions"] for _, fields in heard]
+    kept = [fields["transitions"] for _, fields in messages]
     assert kept[0] == 0 and max(kept) <= 20 + committed_run.darkroom.horizon and fields["time"] > 1e9
     assert (kept[1] == 1) == (deploy == "committed"), "Algorithm 1 adds an episode to the context at its end"
 
@@ -244,7 +244,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
     publish_belief = Beliefs(link, KEYS.monitor("belief/w0"), "w0", small_run)
     read = []
 
-    def message(*asked):
+    def message(*arguments):
         read.append(clock[0])
         clock[1] += cost
         return b""
@@ -268,7 +268,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
 
 def test_an_error_in_a_belief_does_not_fail_the_job(hub, small_run, monkeypatch, caplog):
     always(monkeypatch)
-    monkeypatch.setattr(Room, "read", lambda *asked: 1 / 0)
+    monkeypatch.setattr(Room, "read", lambda *arguments: 1 / 0)
     job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     hub().serve(KEYS.weights_latest, lambda query: query.reply(wire.encode_weights(weights(small_run, 0))))
@@ -300,17 +300,17 @@ def test_the_policy_waits_for_exactly_the_requested_version(hub, small_run):
 def test_the_policy_requests_an_older_version_by_number_and_drops_the_oldest(hub, small_run):
     learner = hub()
     versions = [weights(small_run, v) for v in range(7)]
-    asked = []
+    requested = []
 
     def answer(query):
-        asked.append(wire.decode_message(query.payload)[1]["version"])
-        query.reply(wire.encode_weights(versions[asked[-1]]))
+        requested.append(wire.decode_message(query.payload)[1]["version"])
+        query.reply(wire.encode_weights(versions[requested[-1]]))
 
     learner.serve(KEYS.weights_latest, answer)
     policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20)
     for version in (6, 2, 6, 0, 1, 3, 2, 6):
         assert policy.at(version)[1] == versions[version].digest
-    assert asked == [6, 2, 0, 1, 3, 6]
+    assert requested == [6, 2, 0, 1, 3, 6]
 
 
 def test_the_policy_waits_a_limited_time(hub, small_run):

@@ -1,4 +1,4 @@
-"""Untrusted bytes on the data key: counted by reason, refused, and harmless."""
+"""The ingest: invalid messages are refused and counted by reason, valid trajectories are stored before the reply."""
 
 import dataclasses
 import threading
@@ -17,8 +17,8 @@ from icrl_dist.types import Identity, Spec
 from learner.ingest import REASONS, Ingest, Rejected, check
 
 
-class Asked:
-    """A query that remembers its answer."""
+class FakeQuery:
+    """A query that keeps its answer."""
 
     key = "data"
 
@@ -53,7 +53,7 @@ def ingest(tmp_path, small_run, job):
     store = Store(tmp_path)
     wanted = set(job.identities())
     failures = []
-    made = Ingest(
+    opened = Ingest(
         store,
         registry.spec(job.variations[0].task),
         1 << 20,
@@ -62,27 +62,27 @@ def ingest(tmp_path, small_run, job):
         lambda t: wanted.discard(t.identity),
         failures.append,
     )
-    made.store, made.failures = store, failures
-    yield made
-    made.close()
+    opened.store, opened.failures = store, failures
+    yield opened
+    opened.close()
     store.close()
 
 
 def put(ingest, *payloads):
-    """What became of the trajectories of one request: empty where stored, else why not."""
-    query = Asked(batching.join(payloads))
+    """Send one request; returns for each trajectory an empty text, or the reason for which it was not stored."""
+    query = FakeQuery(batching.join(payloads))
     ingest.put(query)
     assert query.answered.wait(60)
     answers = batching.reasons(query.answer, len(payloads))
     return answers if len(answers) > 1 else answers[0]
 
 
-def test_a_good_trajectory_is_on_disk_before_the_answer(ingest, trajectories, monkeypatch):
+def test_a_trajectory_is_stored_before_the_answer(ingest, trajectories, monkeypatch):
     order = []
     append = ingest.store.append
     monkeypatch.setattr(ingest.store, "append", lambda items: (append(items), order.append("stored")))
-    reply = Asked.reply
-    monkeypatch.setattr(Asked, "reply", lambda self, payload: (order.append("answered"), reply(self, payload)))
+    reply = FakeQuery.reply
+    monkeypatch.setattr(FakeQuery, "reply", lambda self, payload: (order.append("answered"), reply(self, payload)))
     put(ingest, wire.encode_trajectory(trajectories[0]))
     assert order == ["stored", "answered"]
     assert trajectories[0].identity in ingest.store
@@ -92,13 +92,13 @@ def test_a_duplicate_is_acknowledged_and_stored_once(ingest, trajectories):
     payload = wire.encode_trajectory(trajectories[0])
     assert put(ingest, payload) == put(ingest, payload) == ""
     assert len(ingest.store) == 1 and ingest.drops == {"duplicate": 1}
-    pair = [Asked(wire.encode_trajectory(trajectories[1])) for _ in range(2)]
+    pair = [FakeQuery(wire.encode_trajectory(trajectories[1])) for _ in range(2)]
     ingest.take(pair)
     assert len(ingest.store) == 2 and [q.answer for q in pair] == [b"stored"] * 2
 
 
-def broken(trajectory):
-    """Every way to be wrong, and the reason it must be counted under."""
+def invalid(trajectory):
+    """Invalid messages of every kind, each with the reason under which it is counted."""
     good = wire.encode_trajectory(trajectory)
     nan = trajectory.rewards.copy()
     nan[0] = np.nan
@@ -133,8 +133,8 @@ def broken(trajectory):
     ]
 
 
-def test_bad_messages_are_counted_by_reason_refused_and_harm_nothing(ingest, trajectories):
-    cases = broken(trajectories[0])
+def test_invalid_messages_are_refused_and_counted_by_reason(ingest, trajectories):
+    cases = invalid(trajectories[0])
     for reason, payload in cases:
         before = ingest.drops[reason]
         answer = put(ingest, payload)
@@ -144,7 +144,7 @@ def test_bad_messages_are_counted_by_reason_refused_and_harm_nothing(ingest, tra
     assert put(ingest, wire.encode_trajectory(trajectories[0])) == ""
 
 
-def test_vectors_of_actions_are_held_to_the_spec(trajectories, job):
+def test_continuous_actions_are_checked_against_the_spec(trajectories, job):
     spec = Spec((0.0, 0.0), (2.0, 2.0), 3, len(trajectories[0].actions), discrete=False)
     one, rng = trajectories[0], np.random.default_rng(0)
     shapes = {"actions": (len(one.actions), 3), "labels": (len(one.queries), 3), "taken": (len(one.taken), 3)}
@@ -163,11 +163,11 @@ def test_vectors_of_actions_are_held_to_the_spec(trajectories, job):
     with pytest.raises(Rejected, match=r"spec.*labels"):
         check(good, job, dataclasses.replace(spec, actions=4), "")
     for odd, other in ((one, dataclasses.replace(spec, actions=5)), (good, dataclasses.replace(spec, discrete=True))):
-        with pytest.raises(Rejected, match="this run has (discrete|continuous) actions"):
+        with pytest.raises(Rejected, match=r"this run has (discrete|continuous) actions"):
             check(odd, job, other, "")
 
 
-def test_each_trajectory_of_a_request_is_answered_for_itself(ingest, trajectories):
+def test_each_trajectory_of_a_request_has_its_own_answer(ingest, trajectories):
     good = [wire.encode_trajectory(t) for t in trajectories[:3]]
     answers = put(ingest, good[0], b"\xc1garbage", good[1], good[0], good[2])
     assert [bool(a) for a in answers] == [False, True, False, False, False]
@@ -185,8 +185,8 @@ def test_each_trajectory_of_a_request_is_answered_for_itself(ingest, trajectorie
         ("version", msgpack.packb({"v": 2, "kind": "batch", "items": []})),
     ],
 )
-def test_a_request_that_is_no_batch_is_refused_whole(ingest, reason, payload):
-    query = Asked(payload)
+def test_a_request_that_is_not_a_batch_is_refused(ingest, reason, payload):
+    query = FakeQuery(payload)
     ingest.put(query)
     assert query.answer.startswith(reason) and ingest.drops == {reason: 1}
 
@@ -205,7 +205,7 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
         capacity=2,
     )
     payload = wire.encode_trajectory(trajectories[0])
-    queries = [Asked(batching.join([payload])) for _ in range(8)]
+    queries = [FakeQuery(batching.join([payload])) for _ in range(8)]
     for query in queries:
         ingest.put(query)
     busy = [q for q in queries if q.answer and batching.reasons(q.answer, 1) == ["busy"]]
@@ -216,29 +216,29 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
     store.close()
 
 
-def test_the_queue_is_bounded_in_bytes_and_lets_one_in_however_large(tmp_path, small_run, job, trajectories):
+def test_the_queue_is_bounded_in_bytes_and_accepts_one_message_of_any_size(tmp_path, small_run, job, trajectories):
     gate = threading.Event()
     store = Store(tmp_path / "gated")
     spec = registry.spec(job.variations[0].task)
     payloads = [wire.encode_trajectory(t) for t in trajectories[:4]]
     size = len(payloads[0])
-    for room, expected in ((2 * size + size // 2, 2), (size // 2, 1)):
+    for capacity, expected in ((2 * size + size // 2, 2), (size // 2, 1)):
         gate.clear()
         ingest = Ingest(
-            store, spec, 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity_bytes=room
+            store, spec, 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity_bytes=capacity
         )
-        query = Asked(batching.join(payloads))
+        query = FakeQuery(batching.join(payloads))
         ingest.put(query)
         assert ingest.drops == {"busy": 4 - expected}
         gate.set()
         assert query.answered.wait(60)
         assert batching.reasons(query.answer, 4) == [""] * expected + ["busy"] * (4 - expected)
-        ingest.close()  # what was taken in is done with, so there is room again
+        ingest.close()  # waits until the queued messages are answered
         assert ingest._load._count == ingest._load._size == 0
     store.close()
 
 
-def test_numbers_that_the_ledger_cannot_hold_are_refused_and_harm_nothing(ingest, trajectories):
+def test_numbers_too_large_for_the_ledger_are_refused(ingest, trajectories):
     message = msgpack.unpackb(wire.encode_trajectory(trajectories[0]))
     for number in (1 << 31, (1 << 64) - 1):
         message["identity"][4] = number
@@ -246,24 +246,24 @@ def test_numbers_that_the_ledger_cannot_hold_are_refused_and_harm_nothing(ingest
     assert put(ingest, wire.encode_trajectory(trajectories[0])) == "" and ingest.failures == []
 
 
-def test_large_numbers_are_finite(ingest, trajectories):
+def test_the_largest_float32_values_count_as_finite(ingest, trajectories):
     rewards = np.full_like(trajectories[0].rewards, 3e38)
     assert put(ingest, wire.encode_trajectory(dataclasses.replace(trajectories[0], rewards=rewards))) == ""
     assert ingest.commits == 1
 
 
-def test_a_full_disk_acknowledges_nothing_and_is_reported(ingest, trajectories, monkeypatch):
+def test_on_a_full_disk_nothing_is_acknowledged_and_the_error_is_reported(ingest, trajectories, monkeypatch):
     def full(items):
         raise StoreError("segment: could not be written (No space left on device)")
 
     monkeypatch.setattr(ingest.store, "append", full)
-    query = Asked(batching.join([wire.encode_trajectory(trajectories[0])]))
+    query = FakeQuery(batching.join([wire.encode_trajectory(trajectories[0])]))
     ingest.put(query)
     ingest._thread.join(60)
     assert query.answer is None and "No space left" in str(ingest.failures[0])
 
 
-def test_a_failed_inbox_closes_even_with_a_full_queue(tmp_path, small_run, job, trajectories):
+def test_a_failed_ingest_can_be_closed_with_a_full_queue(tmp_path, small_run, job, trajectories):
     failures = []
 
     def bug(identity):
@@ -274,7 +274,7 @@ def test_a_failed_inbox_closes_even_with_a_full_queue(tmp_path, small_run, job, 
     ingest = Ingest(store, spec, 1 << 20, bug, lambda v: "", lambda t: None, failures.append, capacity=2)
     payload = wire.encode_trajectory(trajectories[0])
     for _ in range(20):
-        ingest.put(Asked(batching.join([payload])))
+        ingest.put(FakeQuery(batching.join([payload])))
     ingest.close()
     assert [type(f) for f in failures] == [ZeroDivisionError]
     store.close()
