@@ -1,1 +1,1 @@
-"""A hand: ask for work, do it with functions of ``icrl_dist``, send what happened."""
+"""Rollout workers: ask for a job, do it with functions of ``icrl_dist``, and send its trajectories."""

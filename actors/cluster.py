@@ -1,6 +1,6 @@
-"""The machines of a Ray cluster: which are here, whether each is fit, and which have gone.
+"""The nodes of a Ray cluster: which have joined, which can run workers, and which have left.
 
-Ray comes as an argument: only ``fleet`` imports it.
+Ray is an argument: only ``fleet`` imports it.
 """
 
 from __future__ import annotations
@@ -12,61 +12,61 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors import missing
-from actors.placement import Machine, Placement
+from actors.placement import Node, Placement
 from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import node_facts
 from icrl_dist.stream import endpoints
 
-LOOK_S = 1.0
-"""Ray is asked for its machines so often."""
+REFRESH_S = 1.0
+"""Seconds between two requests to Ray for its list of nodes."""
 ANSWER_S = 60.0
-"""A machine that has not answered after so long does not fit: a process of Ray's takes seconds to start."""
-AGAIN_S = 2.0
-"""A machine that does not fit is asked again after so long, then twice as long, and so on up to ``_SELDOM_S``."""
-_SELDOM_S = 60.0
+"""Seconds after which a node that has not answered is refused; Ray needs seconds to start a process."""
+RETRY_S = 2.0
+"""Seconds before the first repeated check of a node that was refused; they double up to ``_MAX_RETRY_S``."""
+_MAX_RETRY_S = 60.0
 TRIES = 3
-"""A machine on which Ray fails so often before a run begins, though it answers, does not fit."""
-SILENT_S = 5.0
-"""A machine that did not answer is not tried again for so long."""
-_AS_IN = "--stream.endpoint tls/HEAD_IP:7447 --stream.certificates FOLDER"
+"""A node on which Ray fails this often before a run starts, although it can be reached, is refused."""
+UNREACHED_S = 5.0
+"""Seconds before a node that could not be reached is tried again."""
+_EXAMPLE = "--stream.endpoint tls/HEAD_IP:7447 --stream.certificates FOLDER"
 
 
 @dataclass(eq=False)
 class _Candidate:
-    """A machine that may become one of ours."""
+    """A node that has joined the cluster and has not passed the check yet."""
 
-    machine: Machine
+    node: Node
     due: float = 0.0
-    """When it is to be asked."""
+    """Time of the next check."""
     since: float = 0.0
-    """When it was asked last."""
+    """Time of the last check."""
     tries: int = 0
-    told: str = ""
-    """Why it does not fit, as it was said last."""
+    reported: str = ""
+    """The last reported reason for which the node is refused."""
 
 
 class Cluster:
-    """Keeps a Placement true to what Ray says of its machines."""
+    """Checks the nodes of a Ray cluster and keeps a Placement up to date with those that pass."""
 
     def __init__(self, ray: Any, placement: Placement) -> None:
         self._ray, self._placement = ray, placement
-        self._promised = missing.expected()
+        self._expected = missing.expected()
         self._candidates: dict[str, _Candidate] = {}
-        """Machines that are here and have not yet said that they are fit."""
-        self._asked: dict[Any, _Candidate] = {}
-        self._known: set[str] = set()
-        """Machines that are or were candidates, whatever came of it."""
-        self._silent: dict[str, float] = {}
-        """When a machine did not answer, the last time."""
-        self._gathering = False
-        self._looked = -LOOK_S
+        """Nodes that have joined and have not passed the check yet, by Ray's identifier."""
+        self._running_checks: dict[Any, _Candidate] = {}
+        self._seen: set[str] = set()
+        """Nodes that are or were candidates, whatever the result."""
+        self._unreached: dict[str, float] = {}
+        """When a node could not be reached, the last time."""
+        self._before_run = False
+        self._refreshed = -REFRESH_S
         self._certificates = ""
         self._ports: list[tuple[str, int]] = []
-        self._here = node_facts.facts()
+        self._own_facts = node_facts.facts()
         self._loopback = ""
 
-    def look_for(self, endpoint: str, connect: str, certificates: str) -> None:
-        """What machines must have and reach: the learner at ``connect`` or ``endpoint``, and certificates."""
+    def require(self, endpoint: str, connect: str, certificates: str) -> None:
+        """Set what a node must reach and have: the learner at ``connect`` or else ``endpoint``, and the certificates."""
         self._certificates = certificates
         where = endpoints.parse(connect or endpoint)
         self._loopback = connect or endpoint if where.loopback else ""
@@ -74,16 +74,16 @@ class Cluster:
 
     @contextlib.contextmanager
     def listening(self, endpoint: str, connect: str) -> Iterator[None]:
-        """Somebody stands where the learner will listen, so that machines can try to reach it.
+        """Listen at the learner's endpoint before the learner starts, so that nodes can check the connection.
 
-        Raises ConfigError if nobody can.
+        Raises ConfigError if that is impossible.
         """
         where = endpoints.parse(endpoint)
         try:
             with node_facts.listening(where.host, where.port) as port:
                 if not connect:
                     self._ports = [(where.host, port)]
-                self._gathering = True
+                self._before_run = True
                 yield
         except OSError as error:
             raise ConfigError(
@@ -91,152 +91,159 @@ class Cluster:
                 "name an address of this machine and a free port"
             ) from None
         finally:
-            self._gathering = False
+            self._before_run = False
 
-    def listens(self, endpoint: str) -> None:
-        """The learner does now; machines that join later must reach it there."""
+    def learner_listens(self, endpoint: str) -> None:
+        """Set the endpoint of the running learner, which nodes that join later must reach."""
         where = endpoints.parse(endpoint)
         self._ports = [(where.host, where.port)]
 
     @property
     def undecided(self) -> bool:
-        """Whether a machine that is here has yet to say that it is fit."""
+        """Whether a node that has joined has not passed the check yet."""
         return bool(self._candidates)
 
     def refresh(self, note: Callable[[str], None]) -> list[str]:
-        """Take in what changed since the last call; returns why each machine that does not fit does not, once.
+        """Update the placement; returns a new line for each node that is refused.
 
-        Raises ConfigError within ``listening`` if there are machines that cannot reach this one.
+        Raises ConfigError within ``listening`` if there are nodes that cannot reach this one.
         """
-        unfit = self._look(note) if time.monotonic() - self._looked >= LOOK_S else []
-        for one in self._candidates.values():
-            if one not in self._asked.values() and time.monotonic() >= one.due:
-                self._ask(one)
-        return [*unfit, *self._answers()]
+        refused = self._refresh_nodes(note) if time.monotonic() - self._refreshed >= REFRESH_S else []
+        for candidate in self._candidates.values():
+            if candidate not in self._running_checks.values() and time.monotonic() >= candidate.due:
+                self._start_check(candidate)
+        return [*refused, *self._finish_checks()]
 
     def _alive(self) -> dict[str, dict[str, Any]]:
-        """Ray's machines, by name, as far as Ray knows."""
+        """The nodes that Ray lists as alive, by identifier."""
         return {str(node["NodeID"]): node for node in self._ray.nodes() if node["Alive"]}
 
-    def _look(self, note: Callable[[str], None]) -> list[str]:
-        """Who is here; returns what is to be said of those that have come in vain."""
-        self._looked = time.monotonic()
+    def _refresh_nodes(self, note: Callable[[str], None]) -> list[str]:
+        """Add and remove nodes as Ray lists them; returns a line for each new node that cannot be used."""
+        self._refreshed = time.monotonic()
         alive = self._alive()
-        for gone in set(self._placement.machines) - set(alive):
-            self._gone(gone, note)
-        self._known &= set(alive)
-        self._candidates = {name: one for name, one in self._candidates.items() if name in alive}
-        self._asked = {answer: one for answer, one in self._asked.items() if one.machine.node in alive}
+        for node_id in set(self._placement.nodes) - set(alive):
+            self._remove(node_id, note)
+        self._seen &= set(alive)
+        self._candidates = {node_id: one for node_id, one in self._candidates.items() if node_id in alive}
+        self._running_checks = {check: one for check, one in self._running_checks.items() if one.node.node_id in alive}
         remedy = (
-            f"stream.endpoint = {self._loopback!r}: other machines cannot reach it; name an address of this one, as in {_AS_IN}"
+            f"stream.endpoint = {self._loopback!r}: other nodes cannot reach it; "
+            f"name an address of this machine, as in {_EXAMPLE}"
         )
-        if self._loopback and self._gathering and len(alive) > 1:
+        if self._loopback and self._before_run and len(alive) > 1:
             raise ConfigError(remedy)
-        new = {n: node for n, node in alive.items() if n not in self._known and node.get("Resources", {}).get("CPU", 0) >= 1}
-        self._known |= set(new)
-        made = [Machine(n, str(node["NodeManagerAddress"]), "", int(node["Resources"]["CPU"])) for n, node in new.items()]
-        if self._loopback and not self._gathering:
-            return [f"{machine}: {remedy}" for machine in made]
-        self._candidates.update({machine.node: _Candidate(machine) for machine in made})
+        new = {n: ray_node for n, ray_node in alive.items() if n not in self._seen and _cores(ray_node) >= 1}
+        self._seen |= set(new)
+        nodes = [Node(n, str(ray_node["NodeManagerAddress"]), "", _cores(ray_node)) for n, ray_node in new.items()]
+        if self._loopback and not self._before_run:
+            return [f"{node}: {remedy}" for node in nodes]
+        self._candidates.update({node.node_id: _Candidate(node) for node in nodes})
         return []
 
-    def _ask(self, one: _Candidate) -> None:
-        where = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(one.machine.node, soft=False)
-        task = self._ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=where)(node_facts.facts)
-        one.since, one.tries = time.monotonic(), one.tries + 1
-        self._asked[task.remote(self._certificates, self._ports)] = one
+    def _start_check(self, candidate: _Candidate) -> None:
+        strategy = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(candidate.node.node_id, soft=False)
+        task = self._ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=strategy)(node_facts.facts)
+        candidate.since, candidate.tries = time.monotonic(), candidate.tries + 1
+        self._running_checks[task.remote(self._certificates, self._ports)] = candidate
 
-    def _answers(self) -> list[str]:
-        unfit: list[str] = []
-        ready, _ = self._ray.wait(list(self._asked), num_returns=len(self._asked), timeout=0) if self._asked else ([], [])
-        for answer in ready:
-            one = self._asked.pop(answer)
-            machine = one.machine
+    def _finish_checks(self) -> list[str]:
+        refused: list[str] = []
+        checks = list(self._running_checks)
+        ready, _ = self._ray.wait(checks, num_returns=len(checks), timeout=0) if checks else ([], [])
+        for check in ready:
+            candidate = self._running_checks.pop(check)
+            node = candidate.node
             try:
-                facts = self._ray.get(answer)
+                facts = self._ray.get(check)
             except Exception as error:
-                said = f"{machine}: {brief(error)}; run `ray up` again, so that it has this version of icrl-dist"
-                # What its own code raised is its word; anything else may be Ray's, of a process or a machine that ended.
+                text = f"{node}: {brief(error)}; run `ray up` again, so that it has this version of icrl-dist"
+                # A RayTaskError was raised by the node's own code; other errors may come from a process or node that ended.
                 final = isinstance(error, self._ray.exceptions.RayTaskError)
-                unfit += self._unfit(one, said, asked_again=not final, refused=final or self._tried_enough(one))
+                refused += self._refuse(candidate, text, retry=not final, certain=final or self._tried_enough(candidate))
                 continue
-            machine.host = facts["host"]
-            if differing := node_facts.differences(self._here, facts):
-                remedy = "run `ray up` again, so that all machines have the same"
-                unfit += self._unfit(one, f"{machine}: {', '.join(differing)}: {remedy}", asked_again=False)
-            elif wrong := objections(facts):
-                unfit += self._unfit(one, f"{machine}: {wrong}")
+            node.hostname = facts["host"]
+            if differing := node_facts.differences(self._own_facts, facts):
+                remedy = "run `ray up` again, so that all nodes have the same"
+                refused += self._refuse(candidate, f"{node}: {', '.join(differing)}: {remedy}", retry=False)
+            elif problem := connection_problems(facts):
+                refused += self._refuse(candidate, f"{node}: {problem}")
             else:
-                del self._candidates[machine.node]
-                self._placement.join(machine)
-        for answer, one in list(self._asked.items()):
-            if time.monotonic() - one.since > ANSWER_S:
-                del self._asked[answer]
-                silent = f"{one.machine}: has not answered for {ANSWER_S:.0f} s; look at /tmp/ray/session_latest/logs there"
-                unfit += self._unfit(one, silent, refused=self.answers(one.machine.node))
-        return unfit
+                del self._candidates[node.node_id]
+                self._placement.join(node)
+        for check, candidate in list(self._running_checks.items()):
+            if time.monotonic() - candidate.since > ANSWER_S:
+                del self._running_checks[check]
+                text = f"{candidate.node}: has not answered for {ANSWER_S:.0f} s; look at /tmp/ray/session_latest/logs there"
+                refused += self._refuse(candidate, text, certain=self.reachable(candidate.node.node_id))
+        return refused
 
-    def _unfit(self, one: _Candidate, why: str, asked_again: bool = True, refused: bool = True) -> list[str]:
-        """A machine cannot work as it is; returns what there is to say of it now.
+    def _refuse(self, candidate: _Candidate, why: str, retry: bool = True, certain: bool = True) -> list[str]:
+        """Record that a node cannot run workers now; returns the lines to report.
 
-        ``refused``: whether that is a reason not to begin; later it is said once, and nothing that may pass by itself.
+        ``retry``: whether to check it again.  ``certain``: whether this prevents the start of a run.  While a run is on,
+        a reason is reported once, and one that may disappear by itself only after ``TRIES`` checks.
         """
-        if asked_again:
-            one.due = time.monotonic() + min(AGAIN_S * 2.0 ** (one.tries - 1), _SELDOM_S)
+        if retry:
+            candidate.due = time.monotonic() + min(RETRY_S * 2.0 ** (candidate.tries - 1), _MAX_RETRY_S)
         else:
-            del self._candidates[one.machine.node]
-        if self._gathering:
-            return [why] if refused else []
-        if why == one.told or (asked_again and one.tries < TRIES):  # the learner may be just starting
+            del self._candidates[candidate.node.node_id]
+        if self._before_run:
+            return [why] if certain else []
+        if why == candidate.reported or (retry and candidate.tries < TRIES):  # the learner may be about to start
             return []
-        one.told = why
+        candidate.reported = why
         return [why]
 
-    def _tried_enough(self, one: _Candidate) -> bool:
-        return one.tries >= TRIES and self.answers(one.machine.node)
+    def _tried_enough(self, candidate: _Candidate) -> bool:
+        return candidate.tries >= TRIES and self.reachable(candidate.node.node_id)
 
-    def answers(self, node: str) -> bool:
-        """Whether Ray's own process on a machine can be reached now; Ray itself takes up to a minute to say so.
+    def reachable(self, node_id: str) -> bool:
+        """Whether Ray's node process can be reached now; Ray itself needs up to a minute to report that it cannot.
 
-        A machine that did not answer is not tried again for a while.
+        A node that was not reached is not tried again for ``UNREACHED_S``.
         """
-        if time.monotonic() - self._silent.get(node, -SILENT_S) < SILENT_S:
+        if time.monotonic() - self._unreached.get(node_id, -UNREACHED_S) < UNREACHED_S:
             return False
-        there = self._alive().get(node)
-        if there and not node_facts.reach(str(there["NodeManagerAddress"]), int(there["NodeManagerPort"]), timeout_s=1.0):
+        node = self._alive().get(node_id)
+        if node and not node_facts.reach(str(node["NodeManagerAddress"]), int(node["NodeManagerPort"]), timeout_s=1.0):
             return True
-        self._silent[node] = time.monotonic()
+        self._unreached[node_id] = time.monotonic()
         return False
 
-    def lost(self, node: str, note: Callable[[str], None]) -> bool:
-        """Whether a worker ended because its machine did; its place is given up then."""
-        if node in self._alive():
+    def node_lost(self, node_id: str, note: Callable[[str], None]) -> bool:
+        """Whether a node has left the cluster; if so it is removed from the placement."""
+        if node_id in self._alive():
             return False
-        self._gone(node, note)
+        self._remove(node_id, note)
         return True
 
-    def _gone(self, node: str, note: Callable[[str], None]) -> None:
-        machine = self._placement.machines.get(node)
-        lost = self._placement.leave(node)
-        if machine is not None:
-            note(f"machine {machine} is gone; its {len(lost)} workers go where there is room, or wait until it is back")
+    def _remove(self, node_id: str, note: Callable[[str], None]) -> None:
+        node = self._placement.nodes.get(node_id)
+        lost = self._placement.leave(node_id)
+        if node is not None:
+            note(f"node {node} has left; its {len(lost)} workers start on other nodes with free cores, or wait for one")
 
-    def absent(self) -> list[str]:
-        """A line for each machine that the cluster file promises and that is not here."""
-        return missing.report(self._promised, {machine.address for machine in self._placement.machines.values()})
+    def missing_nodes(self) -> list[str]:
+        """One line per node that the cluster file promises and that has not joined."""
+        return missing.report(self._expected, {node.address for node in self._placement.nodes.values()})
 
 
-def objections(there: dict[str, Any]) -> str:
-    """What a machine lacks to reach the learner, with the remedy; empty if nothing."""
-    unfit = [str(there["certificates"])] if there["certificates"] else []
-    if there["unreached"]:
-        unfit.append(
-            f"cannot reach the learner's port, {there['unreached'][0]}: open it in the firewall, or see stream.connect"
+def _cores(ray_node: dict[str, Any]) -> int:
+    return int(ray_node.get("Resources", {}).get("CPU") or 0)
+
+
+def connection_problems(facts: dict[str, Any]) -> str:
+    """What prevents a node from reaching the learner, with the remedy; empty if nothing does."""
+    found = [str(facts["certificates"])] if facts["certificates"] else []
+    if facts["unreached"]:
+        found.append(
+            f"cannot reach the learner's port, {facts['unreached'][0]}: open it in the firewall, or see stream.connect"
         )
-    return "; ".join(unfit)
+    return "; ".join(found)
 
 
 def brief(error: BaseException) -> str:
-    """The last line of what Ray says of an error."""
+    """The last line of an error's message."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     return lines[-1].strip()[:200] if lines else type(error).__name__

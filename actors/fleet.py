@@ -1,6 +1,6 @@
-"""The workers' lives: start them with Ray, watch them, start them again.  The only Ray import.
+"""Fleet: starts the workers with Ray, supervises them, and restarts them.  The only import of Ray.
 
-Ray places and restarts workers and carries no arrays; every byte of data goes over the link.
+Ray places and restarts workers and carries no arrays; all data goes over the link.
 """
 
 from __future__ import annotations
@@ -16,46 +16,46 @@ from typing import Any
 
 from actors import local
 from actors.cluster import Cluster, brief
-from actors.placement import Machine, Placement
-from actors.ray_actor import _Host
+from actors.placement import Node, Placement
+from actors.ray_actor import WorkerActor
 from icrl_dist.config.run import ConfigError
 
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_worker_niceness": "0",  # Ray's 15 starves the workers as soon as anything else runs
+    "RAY_worker_niceness": "0",  # with Ray's default of 15, any other process starves the workers
 }
 JOIN_S = 600.0
-"""Seconds that the machines of a cluster have to join it; the first time they install everything."""
-SHORT_S = 45.0
-"""Seconds after which a run says which machines are missing, and why."""
-PROBES_S = 10.0
-"""Seconds that a run, when it has enough machines, waits for those that have not said yet whether they are fit."""
+"""Seconds that the nodes of a cluster have to join; they install everything when they start for the first time."""
+REPORT_MISSING_S = 45.0
+"""Seconds after which a run reports which nodes are missing, and why."""
+CHECKS_S = 10.0
+"""Seconds that a run with enough nodes waits for the checks of further nodes."""
 NOTE_S = 5.0
-"""Seconds after which a run says that it waits."""
-DOUBT_S = 6.0
-"""How a worker ended that was on a machine which does not answer is looked at again so often."""
-SOON_S = 60.0
-"""A worker that died so shortly before its machine did not die by itself."""
+"""Seconds after which a run reports that it waits."""
+RECHECK_S = 6.0
+"""Seconds between two attempts to find out how a worker ended whose node cannot be reached."""
+NODE_FAILURE_S = 60.0
+"""A death of a worker this many seconds or less before its node left was caused by the node."""
 _PAUSE_S = 0.25
 
 
 class FleetFailed(RuntimeError):  # noqa: N818
-    """Workers keep dying, or Ray does not start; the message names the last cause."""
+    """Workers die repeatedly, or Ray does not start; the message contains the last cause."""
 
 
 def check_cores(actors: int) -> None:
-    """Raises ConfigError if this machine has fewer cores than ``actors``: they would wait for ever."""
+    """Raises ConfigError if this machine has fewer than ``actors`` cores: Ray would never start the remaining workers."""
     cores = len(os.sched_getaffinity(0))
     if actors > cores:
         raise ConfigError(f"--actors {actors}: this machine has {cores} cores; ask for at most {cores}")
 
 
 class Fleet:
-    """Ray workers spread over the machines, each restarted at most ``restarts`` times in a row.
+    """Ray workers spread over the nodes, each restarted at most ``restarts`` times in a row.
 
-    On a cluster machines may join and leave at any time: workers are placed where there is room, and
-    those of a machine that left go elsewhere, or wait for one.
+    Nodes of a cluster may join and leave at any time: workers are placed where cores are free, and the
+    workers of a node that left move to other nodes or wait for one.
     """
 
     def __init__(
@@ -68,13 +68,14 @@ class Fleet:
         note: Callable[[str], None] = lambda text: None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Starts Ray here, or joins the cluster at ``address``.
+        """Start Ray on this machine, or connect to the cluster at ``address``.
 
-        ``actors``: how many workers, on a cluster as many as it has cores if None.  ``at_least``: so
-        many are enough to begin with, when others have not joined for ``SHORT_S``; ``actors`` of
-        them, or one, if None.  Raises ConfigError if this machine has fewer cores than workers, unless
-        they may share them (``oversubscribe``): they would wait for ever; FleetFailed if Ray does not
-        start here, of which ``note`` is told each time, or did not and ``stopped``.
+        ``actors``: the number of workers; None on a cluster: one per core.  ``at_least``: the number of
+        workers with which a run starts if nodes are missing after ``REPORT_MISSING_S``; by default
+        ``actors``, or 1.  Raises ConfigError if this machine has fewer cores than workers and not
+        ``oversubscribe``: the remaining workers would never start.  Raises FleetFailed if Ray does not
+        start here in several attempts, or in one after which ``stopped()`` is true; ``note`` is called
+        before each new attempt.
         """
         os.environ.update(_SETTINGS)
         import ray
@@ -86,228 +87,231 @@ class Fleet:
             actors = actors or 1
             if not oversubscribe:
                 check_cores(actors)
+            options = {"num_cpus": actors, "object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
             try:
-                local.begin(ray, note, stopped, num_cpus=actors, object_store_memory=100 << 20, _node_ip_address="127.0.0.1")
+                local.start_ray(ray, note, stopped, **options)
             except RuntimeError as error:
                 raise FleetFailed(str(error)) from error
         else:
             try:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             except (ConnectionError, ray.exceptions.AuthenticationError) as error:
-                raise ConfigError(f"--address {address}: {error}; `ray status` there says whether a cluster is up") from None
+                raise ConfigError(f"--address {address}: {error}; `ray status` there shows whether a cluster is up") from None
         self.deaths = 0
-        """Workers that died, however it happened; those that went with their machine are not among them."""
+        """Number of workers that died, except those that were lost with their node."""
         self._placement = Placement(actors)
         self._cluster = Cluster(ray, self._placement) if address is not None else None
         if address is None:
-            self._placement.join(Machine("", "127.0.0.1", "", actors or 1))
+            self._placement.join(Node("", "127.0.0.1", "", actors or 1))
         self._budget: dict[int, int] = {}
-        self._at_death: dict[int, int] = {}
+        self._progress_at_death: dict[int, int] = {}
         self.lost: list[str] = []
-        """Names of those, in the order in which it became known: nothing that they did is to blame."""
+        """Names of the workers that were lost with their nodes, in the order of detection; they caused no failure."""
         self._running: dict[Any, tuple[int, Any, str]] = {}
-        self._doubtful: list[_Doubt] = []
-        self._recent: list[tuple[float, int, str, str]] = []
-        """Deaths that counted: when, whose, on which machine, and under which name."""
+        self._undecided: list[_EndedWorker] = []
+        self._recent_deaths: list[tuple[float, int, str, str]] = []
+        """Counted deaths: time, worker number, node identifier, worker name."""
         self._spare: Any = None
         self._lives: dict[int, int] = {}
         self._endpoint = self._run_name = self._certificates = ""
         self._folder: str | None = None
-        self._alone_since: float | None = None
+        self._without_nodes_since: float | None = None
 
     def gather(
         self, endpoint: str, connect: str, certificates: str, note: Callable[[str], None], stopped: Callable[[], bool]
     ) -> None:
-        """Wait until the cluster's machines are here, each fit and able to reach the learner-to-be; nothing to do without one.
+        """Wait until the cluster's nodes have joined and can reach the learner's endpoint; without a cluster do nothing.
 
-        ``endpoint`` and ``connect`` as in ``config.StreamConfig``.  Returns early once ``stopped``.  After
-        ``SHORT_S`` it names what is missing and begins with what there is, if that is enough.
-        Raises ConfigError for a machine that does not fit, or if there are too few after ``JOIN_S``.
+        ``endpoint`` and ``connect`` as in ``config.StreamConfig``.  Returns early once ``stopped()``.  After
+        ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others are enough.
+        Raises ConfigError for a node that fails the check, or if there are too few after ``JOIN_S``.
         """
         if self._cluster is None:
             return
-        self._cluster.look_for(endpoint, connect, certificates)
-        began, noted, told = time.monotonic(), False, False
-        since: float | None = None
+        self._cluster.require(endpoint, connect, certificates)
+        began, noted, reported = time.monotonic(), False, False
+        enough_since: float | None = None
         with self._cluster.listening(endpoint, connect):
             while not stopped():
-                unfit = self._cluster.refresh(note)
-                if unfit:
-                    raise ConfigError("; ".join(unfit))
-                waited, room, wanted = time.monotonic() - began, self._placement.room, self._placement.wanted
-                enough = room >= self._at_least and (wanted is not None or not self._cluster.absent()) and room >= (wanted or 1)
-                since = None if not enough else since or time.monotonic()
-                # Nobody listens for some seconds after this: who was asked should have tried by then.
-                if since and (not self._cluster.undecided or time.monotonic() - since >= PROBES_S):
+                refused = self._cluster.refresh(note)
+                if refused:
+                    raise ConfigError("; ".join(refused))
+                waited, cores, wanted = time.monotonic() - began, self._placement.capacity, self._placement.wanted
+                all_joined = wanted is not None or not self._cluster.missing_nodes()
+                enough = cores >= self._at_least and all_joined and cores >= (wanted or 1)
+                enough_since = None if not enough else enough_since or time.monotonic()
+                # The port is closed for some seconds after this: running checks should connect before.
+                if enough_since and (not self._cluster.undecided or time.monotonic() - enough_since >= CHECKS_S):
                     return
-                text = f"the cluster at {self._address} has {room} cores for {wanted or 'its'} workers"
+                text = f"the cluster at {self._address} has {cores} cores for {wanted or 'its'} workers"
                 if waited >= NOTE_S and not noted:
                     noted = True
-                    note(f"{text} so far: waiting for more machines to join")
-                if waited >= SHORT_S and not told:
-                    told = True
-                    for line in self._cluster.absent() or [f"{text}: no machine is missing by its cluster file"]:
+                    note(f"{text} so far: waiting for more nodes to join")
+                if waited >= REPORT_MISSING_S and not reported:
+                    reported = True
+                    for line in self._cluster.missing_nodes() or [f"{text}: all nodes of its cluster file have joined"]:
                         note(line)
-                if waited >= SHORT_S and room >= self._at_least:
-                    note(f"beginning with {room} workers; others join when their machines do")
+                if waited >= REPORT_MISSING_S and cores >= self._at_least:
+                    note(f"starting with {cores} workers; others start when their nodes join")
                     return
                 if waited >= JOIN_S:
                     raise ConfigError(
                         f"{text} after {JOIN_S:.0f} s: ask for fewer with --actors or --min-actors; "
-                        "`ray status` says which machines are there"
+                        "`ray status` lists the nodes"
                     )
                 time.sleep(_PAUSE_S)
 
     def start(self, endpoint: str, run_name: str, folder: Path | None = None, certificates: str = "") -> None:
-        """Take up the run whose learner is reached at ``endpoint``; ``watch`` launches its workers.
+        """Set the run whose learner listens at ``endpoint``; ``watch`` then launches its workers.
 
-        ``folder``: the run's, for crash records and stacks where a worker's machine has it too.
-        ``certificates``: their folder on the workers' machines, empty without TLS.
+        ``folder``: the run folder, for crash records and stacks if a worker's node has it too.
+        ``certificates``: their folder on the workers' nodes, empty without TLS.
         """
         self._endpoint, self._run_name, self._certificates = endpoint, run_name, certificates
         self._folder = str(folder.absolute()) if folder is not None else None
         if self._cluster is not None:
-            self._cluster.listens(endpoint)
+            self._cluster.learner_listens(endpoint)
 
-    def _host(self, cpus: int, node: str = "") -> Any:
+    def _new_actor(self, cpus: int, node_id: str = "") -> Any:
         where: Any = "SPREAD"
-        if node:
-            where = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node, soft=False)
-        return self._ray.remote(num_cpus=cpus, max_restarts=0, scheduling_strategy=where)(_Host).remote()
+        if node_id:
+            where = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node_id, soft=False)
+        return self._ray.remote(num_cpus=cpus, max_restarts=0, scheduling_strategy=where)(WorkerActor).remote()
 
     def _name(self, index: int) -> str:
         lives = self._lives.get(index, 0)
         return f"w{index}-{lives}" if lives else f"w{index}"
 
-    def _launch(self, index: int, node: str) -> None:
-        host, self._spare = self._spare or self._host(1, node), None
-        work = host.work.remote(self._endpoint, self._run_name, self._name(index), self._folder, self._certificates)
-        self._running[work] = (index, host, node)
+    def _launch(self, index: int, node_id: str) -> None:
+        actor, self._spare = self._spare or self._new_actor(1, node_id), None
+        work = actor.work.remote(self._endpoint, self._run_name, self._name(index), self._folder, self._certificates)
+        self._running[work] = (index, actor, node_id)
 
     def watch(self, note: Callable[[str], None], progress: int) -> int:
-        """Look after the workers once: restart those that died; returns how many are at work or to come.
+        """Check the workers once and restart those that died; returns how many are running or will run.
 
-        ``progress`` is any number that grows while the run gets on, such as trajectories stored:
-        when it has grown since a worker's last death, that worker's budget is whole again.
+        ``progress`` is any number that grows with the run, such as trajectories stored: if it has grown
+        since a worker's last death, that worker has its full budget of restarts again.
         Raises FleetFailed when a worker has died more often than its budget allows, or when there
-        has been no machine for ``JOIN_S``.
+        has been no node for ``JOIN_S``.
         """
         if self._cluster is not None:
             for line in self._cluster.refresh(note):
                 note(f"{line}; no worker is placed there")
         elif progress and self._restarts and self._spare is None:
-            self._spare = self._host(0)  # a cluster has no place that costs nothing
+            self._spare = self._new_actor(0)  # only without a cluster: there every process needs a core
         ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0) if self._running else ([], [])
-        due = [doubt for doubt in self._doubtful if time.monotonic() >= doubt.due]
-        self._doubtful = [doubt for doubt in self._doubtful if doubt not in due]
-        for done in ready:
-            index, host, node = self._running.pop(done)
+        due = [ended for ended in self._undecided if time.monotonic() >= ended.due]
+        self._undecided = [ended for ended in self._undecided if ended not in due]
+        for work in ready:
+            index, actor, node_id = self._running.pop(work)
             try:
-                self._ray.get(done)
+                self._ray.get(work)
             except Exception as error:
-                due.append(_Doubt(index, host, node, error))
+                due.append(_EndedWorker(index, actor, node_id, error))
             else:
-                self._leaves_its_place(index)
-        for doubt in due:
-            self._ended(doubt, note, progress)
-        if self._cluster is not None:  # before anyone is launched anew: names are of one life
-            self._forget_those_that_went_with_their_machine()
-        settled = self._placement.settle()
-        for index, machine in settled:
-            self._launch(index, machine.node)
-        if settled and self._cluster is not None:
-            note(f"workers: {self._placement.landed(self._name)}")
-        self._not_alone()
-        return len(self._running) + len(self._doubtful) + len(self._placement.waiting)
+                self._remove_stopped(index)
+        for ended in due:
+            self._handle_end(ended, note, progress)
+        if self._cluster is not None:  # before any launch: every life of a worker has its own name
+            self._remove_workers_of_lost_nodes()
+        assigned = self._placement.assign()
+        for index, node in assigned:
+            self._launch(index, node.node_id)
+        if assigned and self._cluster is not None:
+            note(f"workers: {self._placement.summary(self._name)}")
+        self._check_nodes()
+        return len(self._running) + len(self._undecided) + len(self._placement.waiting)
 
-    def _forget_those_that_went_with_their_machine(self) -> None:
-        gone = {work: one for work, one in self._running.items() if one[2] not in self._placement.machines}
-        for work, (index, host, _) in gone.items():
+    def _remove_workers_of_lost_nodes(self) -> None:
+        lost = {work: one for work, one in self._running.items() if one[2] not in self._placement.nodes}
+        for work, (index, actor, _) in lost.items():
             del self._running[work]
-            self._went(index, host)
-        for doubt in [doubt for doubt in self._doubtful if doubt.node not in self._placement.machines]:
-            self._doubtful.remove(doubt)
-            self._went(doubt.index, doubt.host)
-        self._recent = [one for one in self._recent if time.monotonic() - one[0] < SOON_S]
-        for death in list(self._recent):
-            _, index, node, name = death
-            if node not in self._placement.machines:
-                self._recent.remove(death)  # a machine that is shut down ends its workers before Ray's own process
+            self._lost_with_node(index, actor)
+        for ended in [ended for ended in self._undecided if ended.node_id not in self._placement.nodes]:
+            self._undecided.remove(ended)
+            self._lost_with_node(ended.index, ended.actor)
+        self._recent_deaths = [one for one in self._recent_deaths if time.monotonic() - one[0] < NODE_FAILURE_S]
+        for death in list(self._recent_deaths):
+            _, index, node_id, name = death
+            if node_id not in self._placement.nodes:
+                self._recent_deaths.remove(death)  # a node that shuts down ends its workers before Ray's own process
                 self.lost.append(name)
                 self.deaths -= 1
                 self._budget[index] = min(self._restarts, self._budget[index] + 1)
 
-    def _went(self, index: int, host: Any) -> None:
-        """A worker is lost with its machine: that is no fault of its own."""
+    def _lost_with_node(self, index: int, actor: Any) -> None:
+        """Record a worker that was lost with its node; this costs it no restart."""
         self.lost.append(self._name(index))
         self._lives[index] = self._lives.get(index, 0) + 1
-        self._kill(host)  # it may be alive, cut off for good
+        self._kill(actor)  # it may still run, disconnected
 
-    def _kill(self, host: Any) -> None:
+    def _kill(self, actor: Any) -> None:
         with contextlib.suppress(Exception):
-            self._ray.kill(host)
+            self._ray.kill(actor)
 
-    def _leaves_its_place(self, index: int) -> None:
-        """It was told to stop: nobody stands where it stood, and nobody comes."""
-        if (machine := self._placement.where(index)) is not None:
-            machine.workers.discard(index)
-            machine.cores -= 1
+    def _remove_stopped(self, index: int) -> None:
+        """Remove a worker that the learner stopped, together with its core: no other worker is to start there."""
+        if (node := self._placement.node_of(index)) is not None:
+            node.workers.discard(index)
+            node.cores -= 1
 
-    def _ended(self, doubt: _Doubt, note: Callable[[str], None], progress: int) -> None:
-        """A worker died: with its machine, or by itself, which counts.
+    def _handle_end(self, ended: _EndedWorker, note: Callable[[str], None], progress: int) -> None:
+        """Find out whether a worker died by itself, which costs a restart, or with its node, and restart it.
 
-        Ray calls a machine alive for a quarter of a minute and more after its end, but knows of a
-        broken connection at once: while a machine does not answer, nothing is decided.
+        Ray lists a node as alive for 15 s and longer after its end, but reports a broken connection at
+        once: while the node cannot be reached, the decision is postponed.
         """
-        index, host, node, error = doubt.index, doubt.host, doubt.node, doubt.error
+        index, actor, node_id, error = ended.index, ended.actor, ended.node_id, ended.error
         if self._cluster is not None:
-            if self._cluster.lost(node, note):
-                self._went(index, host)
+            if self._cluster.node_lost(node_id, note):
+                self._lost_with_node(index, actor)
                 return
-            if isinstance(error, self._ray.exceptions.RayActorError) and not self._cluster.answers(node):
-                self._doubtful.append(_Doubt(index, host, node, error, time.monotonic() + DOUBT_S))
+            if isinstance(error, self._ray.exceptions.RayActorError) and not self._cluster.reachable(node_id):
+                self._undecided.append(_EndedWorker(index, actor, node_id, error, time.monotonic() + RECHECK_S))
                 return
-            self._kill(host)  # it may be alive, and nobody would see its end
-            self._recent.append((time.monotonic(), index, node, self._name(index)))
+            self._kill(actor)  # it may still run, and nothing would detect its end
+            self._recent_deaths.append((time.monotonic(), index, node_id, self._name(index)))
         self._lives[index] = self._lives.get(index, 0) + 1
         self.deaths += 1
         cause = brief(error)
-        if progress > self._at_death.get(index, -1):
+        if progress > self._progress_at_death.get(index, -1):
             self._budget[index] = self._restarts
-        self._at_death[index] = progress
+        self._progress_at_death[index] = progress
         if self._budget.setdefault(index, self._restarts) == 0:
             times = self._restarts + 1
             raise FleetFailed(f"worker w{index} died {times} times without progress; last: {cause}") from None
         self._budget[index] -= 1
         note(f"worker w{index} died ({cause}); starting it again")
-        if self._placement.where(index) is not None:
-            self._launch(index, node)
+        if self._placement.node_of(index) is not None:
+            self._launch(index, node_id)
         else:
             self._placement.waiting.append(index)
 
-    def _not_alone(self) -> None:
-        """Raises FleetFailed if the last machine went long ago."""
-        if self._cluster is None or self._placement.machines:
-            self._alone_since = None
-        elif self._alone_since is None:
-            self._alone_since = time.monotonic()
-        elif time.monotonic() - self._alone_since > JOIN_S:
-            raise FleetFailed(f"no machine has been there to work for {JOIN_S:.0f} s; `ray status` says why")
+    def _check_nodes(self) -> None:
+        """Raises FleetFailed if there has been no node for ``JOIN_S``."""
+        if self._cluster is None or self._placement.nodes:
+            self._without_nodes_since = None
+        elif self._without_nodes_since is None:
+            self._without_nodes_since = time.monotonic()
+        elif time.monotonic() - self._without_nodes_since > JOIN_S:
+            raise FleetFailed(f"no node has been available for {JOIN_S:.0f} s; `ray status` shows why")
 
     def close(self) -> None:
-        """End every worker, and Ray if it was started here."""
-        for host in [host for _, host, _ in self._running.values()] + [self._spare] * (self._spare is not None):
-            self._kill(host)
+        """End all workers, and Ray if it was started here."""
+        for actor in [actor for _, actor, _ in self._running.values()] + [self._spare] * (self._spare is not None):
+            self._kill(actor)
         self._running.clear()
         self._ray.shutdown()
 
 
 @dataclass(frozen=True, eq=False)
-class _Doubt:
-    """A worker that has ended, by itself or with its machine."""
+class _EndedWorker:
+    """A worker that has ended, by itself or with its node."""
 
     index: int
-    host: Any
-    node: str
+    actor: Any
+    node_id: str
     error: Exception
     due: float = 0.0
+    """Time at which to find out how it ended."""

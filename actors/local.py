@@ -1,4 +1,4 @@
-"""Ray on this machine alone.  Ray comes as an argument: only ``fleet`` imports it."""
+"""Ray on one computer.  Ray is an argument: only ``fleet`` imports it."""
 
 from __future__ import annotations
 
@@ -10,30 +10,29 @@ from typing import Any
 import psutil
 
 TRIES = 3
-"""Ray is started so often before a run gives up."""
+"""Attempts to start Ray before a run fails."""
 
 
-def begin(ray: Any, note: Callable[[str], None], stopped: Callable[[], bool] = lambda: False, **options: Any) -> None:
-    """Start Ray with these options of ``ray.init``, and again if it did not come up.
+def start_ray(ray: Any, note: Callable[[str], None], stopped: Callable[[], bool] = lambda: False, **options: Any) -> None:
+    """Start Ray with these options of ``ray.init``; try again if it does not start.
 
-    Ray's node ends itself, for good, when one of the processes that it starts takes more than 30 s,
-    as may happen on a machine that is busy; only a new Ray helps.  Raises RuntimeError after ``TRIES``,
-    or if it did not come up and ``stopped``.
+    Ray's node process ends for good when one of the processes that it starts takes more than 30 s, which
+    happens on a busy computer; only a new Ray helps.  ``note`` is called with a line before each new
+    attempt.  Raises RuntimeError after ``TRIES`` attempts, or after a failed one if ``stopped()`` is true.
     """
     for number in range(1, TRIES + 1):
         before = psutil.Process().children()
         try:
             ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR, **options)
             return
-        except Exception as error:  # of no kind that Ray would give a name
+        except Exception as error:  # Ray raises no specific type
             ray.shutdown()
-            _end(set(psutil.Process().children()) - set(before))  # it does not end what it had started by then
-            said = f"Ray did not start on this machine ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
+            _end(set(psutil.Process().children()) - set(before))  # Ray leaves what it had already started
+            cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+            text = f"Ray did not start on this machine ({cause})"
             if stopped() or number == TRIES:
-                raise RuntimeError(
-                    f"{said}, tried {number} times; its own words are in /tmp/ray/session_latest/logs"
-                ) from error
-            note(f"{said}: starting it again, {number + 1} of {TRIES}")
+                raise RuntimeError(f"{text}, tried {number} times; its logs are in /tmp/ray/session_latest/logs") from error
+            note(f"{text}: starting it again, {number + 1} of {TRIES}")
 
 
 def _end(processes: set[psutil.Process]) -> None:

@@ -1,4 +1,4 @@
-"""Which worker stands on which machine: bookkeeping only, so that machines may come and go."""
+"""Placement: which worker runs on which node, while nodes join and leave.  Bookkeeping only."""
 
 from __future__ import annotations
 
@@ -7,80 +7,81 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Machine:
-    """A machine with room for as many workers as it has cores to give."""
+class Node:
+    """A cluster node with room for one worker per core."""
 
-    node: str
-    """Ray's name for it."""
+    node_id: str
+    """Ray's identifier."""
     address: str
-    host: str
+    hostname: str
     cores: int
     workers: set[int] = field(default_factory=set)
-    """Numbers of the workers that stand here."""
+    """Numbers of the workers on this node."""
 
     @property
     def free(self) -> int:
         return self.cores - len(self.workers)
 
     def __str__(self) -> str:
-        return f"{self.host} ({self.address})" if self.host else self.address
+        return f"{self.hostname} ({self.address})" if self.hostname else self.address
 
 
 class Placement:
-    """Workers 0, 1, ... on machines: ``wanted`` of them, or as many as there is room for if that is None."""
+    """Assigns workers 0, 1, ... to nodes: ``wanted`` of them, or one per core of all nodes if that is None."""
 
     def __init__(self, wanted: int | None) -> None:
         self.wanted = wanted
-        self.machines: dict[str, Machine] = {}
+        self.nodes: dict[str, Node] = {}
+        """Nodes by their Ray identifier."""
         self.waiting: list[int] = list(range(wanted or 0))
-        """Workers without a place, lowest number first."""
+        """Workers without a node, lowest number first."""
         self._count = wanted or 0
 
     @property
-    def room(self) -> int:
-        """Workers that all machines together have room for."""
-        return sum(machine.cores for machine in self.machines.values())
+    def capacity(self) -> int:
+        """Number of workers that fit on all nodes together."""
+        return sum(node.cores for node in self.nodes.values())
 
-    def join(self, machine: Machine) -> None:
-        """A machine is here."""
-        self.machines[machine.node] = machine
+    def join(self, node: Node) -> None:
+        """Add a node."""
+        self.nodes[node.node_id] = node
 
-    def leave(self, node: str) -> set[int]:
-        """A machine is gone; the workers that stood there wait for another place."""
-        gone = self.machines.pop(node, None)
-        lost = gone.workers if gone else set()
+    def leave(self, node_id: str) -> set[int]:
+        """Remove a node; its workers wait for another one.  Returns their numbers."""
+        node = self.nodes.pop(node_id, None)
+        lost = node.workers if node else set()
         self.waiting = sorted({*self.waiting, *lost})
         return lost
 
-    def where(self, worker: int) -> Machine | None:
-        """The machine on which the worker stands."""
-        return next((machine for machine in self.machines.values() if worker in machine.workers), None)
+    def node_of(self, worker: int) -> Node | None:
+        """The node of a worker; None if it waits for one."""
+        return next((node for node in self.nodes.values() if worker in node.workers), None)
 
-    def settle(self) -> list[tuple[int, Machine]]:
-        """Give every waiting worker a place as long as there is one, spread evenly; who stands where now."""
-        settled = []
-        while (machine := self._emptiest()) is not None:
+    def assign(self) -> list[tuple[int, Node]]:
+        """Assign waiting workers to nodes, evenly, while there is room; returns the new (worker, node) pairs."""
+        assigned = []
+        while (node := self._most_free()) is not None:
             if self.waiting:
                 worker = self.waiting.pop(0)
             elif self.wanted is None:
                 worker, self._count = self._count, self._count + 1
             else:
                 break
-            machine.workers.add(worker)
-            settled.append((worker, machine))
-        return settled
+            node.workers.add(worker)
+            assigned.append((worker, node))
+        return assigned
 
-    def _emptiest(self) -> Machine | None:
-        """The machine with the largest share of its cores free."""
-        free = [machine for machine in self.machines.values() if machine.free > 0]
-        return max(free, key=lambda m: m.free / m.cores, default=None)
+    def _most_free(self) -> Node | None:
+        """The node with the largest share of free cores; None if all are occupied."""
+        free = [node for node in self.nodes.values() if node.free > 0]
+        return max(free, key=lambda n: n.free / n.cores, default=None)
 
-    def landed(self, name: Callable[[int], str]) -> str:
-        """Who stands where, for people; ``name`` of each worker."""
-        parts = [f"{m}: {_run_of(m.workers, name)}" for m in self.machines.values() if m.workers]
+    def summary(self, name: Callable[[int], str]) -> str:
+        """One line for the user: the workers of each node.  ``name`` returns the name of a worker."""
+        parts = [f"{n}: {_list(n.workers, name)}" for n in self.nodes.values() if n.workers]
         return "; ".join(parts) or "none"
 
 
-def _run_of(workers: Iterable[int], name: Callable[[int], str]) -> str:
+def _list(workers: Iterable[int], name: Callable[[int], str]) -> str:
     names = [name(worker) for worker in sorted(workers)]
     return " ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]}, {len(names)} workers"

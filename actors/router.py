@@ -1,7 +1,8 @@
-"""A router for one machine's workers: ``python -m actors.router``.  They connect to it, it alone to the learner.
+"""A router for the workers of one node: ``python -m actors.router``.
 
-For clusters of hundreds of workers: the learner then holds a connection a machine, not one a
-worker.  ``ICRL_ROUTER`` in the environment of Ray's worker processes names it to them.
+The workers connect to the router, and only the router connects to the learner.  In clusters of hundreds
+of workers the learner then has one connection per node, not one per worker.  The environment variable
+``ICRL_ROUTER`` of Ray's worker processes contains the address of the router.
 """
 
 from __future__ import annotations
@@ -18,56 +19,57 @@ from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
 
 VARIABLE = "ICRL_ROUTER"
-"""Environment variable: where the router of this machine listens, such as tcp/127.0.0.1:7448."""
+"""Environment variable: the address on which the router of this node listens, such as tcp/127.0.0.1:7448."""
 
 
-def reached(endpoint: str, certificates: str) -> tuple[str, Mapping[str, object]]:
-    """Where a worker here reaches the learner at ``endpoint``, and with which settings: through the router, if any.
+def connection(endpoint: str, certificates: str) -> tuple[str, Mapping[str, object]]:
+    """Address and settings with which a worker connects to the learner at ``endpoint``: those of the router, if there is one.
 
-    Raises LinkError for a router on another machine, which nothing would guard, or for certificates that are none.
+    Raises LinkError for a router on another node, because that connection has no TLS, or for invalid certificates.
     """
     router = os.environ.get(VARIABLE, "")
     if not router:
         return endpoint, security.client(certificates, "worker")
-    _only_here(router, VARIABLE)
+    _check_loopback(router, VARIABLE)
     return router, {}
 
 
 def run(listen: str, connect: str, certificates: str, timeout_s: float = 60.0) -> ZenohLink:
-    """The router, until it is closed.  It finds the learner again by itself.
+    """Start a router; it runs until the returned link is closed, and reconnects to the learner by itself.
 
-    Raises LinkError if nobody answers at ``connect`` within ``timeout_s``, or if ``listen`` is not on this machine.
+    Raises LinkError if the learner does not answer at ``connect`` within ``timeout_s``, or if ``listen`` is not a
+    loopback address.
     """
-    _only_here(listen, "--listen")
-    # A peer routes for its clients as a router does; Zenoh's mode "router" would also have the learner's
-    # rules let out declarations that no worker needs (who watches liveliness).
+    _check_loopback(listen, "--listen")
+    # A peer routes for its clients like a router.  In Zenoh's mode "router" the learner's access rules would
+    # also have to allow declarations that no worker needs (subscriptions to liveliness).
     settings = {"mode": "peer", "listen/endpoints": [listen], **security.client(certificates, "worker")}
     return ZenohLink.connect(connect, timeout_s, settings)
 
 
-def _only_here(endpoint: str, what: str) -> None:
+def _check_loopback(endpoint: str, name: str) -> None:
     try:
-        here = endpoints.parse(endpoint).loopback
+        loopback = endpoints.parse(endpoint).loopback
     except ValueError as error:
-        raise LinkError(f"{what} = {endpoint!r}: {error}") from None
-    if not here:
-        raise LinkError(f"{what} = {endpoint!r}: nothing guards a router off this machine; write it as tcp/127.0.0.1:7448")
+        raise LinkError(f"{name} = {endpoint!r}: {error}") from None
+    if not loopback:
+        raise LinkError(f"{name} = {endpoint!r}: a router must listen on a loopback address, such as tcp/127.0.0.1:7448")
 
 
 def main() -> int:
-    """Run a router until it is told to end; exit code 2 with one line if it cannot."""
+    """Run a router until SIGINT or SIGTERM; returns exit code 2 and prints one line if it cannot start."""
     parser = argparse.ArgumentParser(prog="python -m actors.router", description=__doc__)
-    parser.add_argument("--connect", required=True, help="the learner, as tls/HEAD:7447")
-    parser.add_argument("--listen", default="tcp/127.0.0.1:7448", help="where this machine's workers find the router")
+    parser.add_argument("--connect", required=True, help="address of the learner, such as tls/HEAD:7447")
+    parser.add_argument("--listen", default="tcp/127.0.0.1:7448", help="loopback address on which the router listens")
     parser.add_argument("--certificates", default="", help="folder with ca.pem, worker.pem and worker.key")
     parser.add_argument("--timeout", type=float, default=1e6, help="seconds to wait for the learner")
-    given = parser.parse_args()
-    over = threading.Event()
+    arguments = parser.parse_args()
+    ended = threading.Event()
     for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, lambda *_: over.set())
+        signal.signal(name, lambda *_: ended.set())
     try:
-        with run(given.listen, given.connect, given.certificates, given.timeout):
-            over.wait()
+        with run(arguments.listen, arguments.connect, arguments.certificates, arguments.timeout):
+            ended.wait()
     except LinkError as error:
         print(f"router: {error}", file=sys.stderr)
         return 2

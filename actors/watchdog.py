@@ -1,9 +1,9 @@
-"""The watchdog: a worker stuck in an environment says where, and ends, although the learner is away.
+"""Watchdog: ends a worker that is stuck in an environment and writes its stacks, without the learner.
 
-There are two.  A thread of Python's barks first: it holds the interpreter's lock meanwhile, so that
-the stacks that it writes stand still.  Where that lock is held for ever, a thread of C barks
-(``faulthandler``) ``GRACE_S`` later: then no other thread can run, and the stacks stand still too.
-While others run, the thread of C might read a stack that is just changing, and crash.
+Two timers watch a deadline.  A Python thread acts first: it holds the interpreter lock, so no stack
+changes while it writes them.  If another thread never releases that lock, a C thread (``faulthandler``)
+acts ``GRACE_S`` later: then no other Python thread runs, so no stack changes either.  The C thread is not
+the first because it may read a stack while its thread changes it, and crash.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from typing import IO
 from icrl_dist.telemetry import crash_reports
 
 GRACE_S = 2.0
-"""Seconds that the thread of Python's has to get the interpreter's lock and to write."""
+"""Seconds that the Python thread has to get the interpreter lock and to write the stacks."""
 
 
 class Watchdog:
-    """Ends this process, its stacks written to a file, when work outlasts its deadline.
+    """Writes the stacks of this process to a file and ends it when work takes longer than its deadline.
 
-    Also keeps the stacks of a crash in C, such as a segmentation fault.  There is one a process:
-    ``faulthandler`` knows no other.
+    Also writes the stacks of a crash in C, such as a segmentation fault.  A process can have only one
+    watchdog, because ``faulthandler`` has one state per process.
     """
 
     def __init__(self, run: Path | None, worker: str) -> None:
-        """The stacks go into the run folder where it exists on this machine, else to a temporary file.
+        """The stacks go into the run folder ``run`` if this node has it, else into a temporary file.
 
-        Without ``run`` there is no watchdog: a worker that is a thread among others must not end
-        their process.
+        If ``run`` is None the watchdog does nothing: a worker that is one thread of a process must not
+        end that process.
         """
         self._file: IO[str] | None = None
         self._deadline_s = 0.0
         self._changed = threading.Condition()
         self._due: float | None = None
-        """When it barks, by ``time.monotonic``; None while nothing is to be watched."""
-        self._over = False
+        """Time of the deadline (``time.monotonic``); None while no work is watched."""
+        self._closed = False
         if run is not None:
             self._file = _open(run, worker)
             faulthandler.enable(self._file)
             threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     @contextlib.contextmanager
-    def over(self, deadline_s: float) -> Iterator[None]:
-        """Work for at most so many seconds."""
+    def deadline(self, deadline_s: float) -> Iterator[None]:
+        """Allow the enclosed work ``deadline_s`` seconds."""
         with self._changed:
             if not 0 < self._deadline_s <= deadline_s:
                 self._changed.notify()
@@ -64,7 +64,7 @@ class Watchdog:
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Within ``over``: wait for others, however long; then the time runs anew."""
+        """Within ``deadline``: the enclosed waiting has no limit; afterwards the time starts again."""
         self._disarm()
         try:
             yield
@@ -72,17 +72,17 @@ class Watchdog:
             self._arm()
 
     def close(self) -> None:
-        """Let go of the file, and leave none behind in which nothing stands."""
+        """Close the file; remove it if it is empty."""
         if self._file is None:
             return
         with self._changed:
-            self._over = True
+            self._closed = True
             self._changed.notify()
         faulthandler.disable()
         empty = not os.fstat(self._file.fileno()).st_size
         self._file.close()
         if empty:
-            Path(self._file.name).unlink(missing_ok=True)  # the learner may have been quicker
+            Path(self._file.name).unlink(missing_ok=True)  # the learner may have removed it already
 
     def _arm(self) -> None:
         if self._file is not None:
@@ -97,16 +97,16 @@ class Watchdog:
                 self._due = None
 
     def _watch(self) -> None:
-        """Sleeps as long as nothing can be due, and is woken only for a deadline shorter than those before."""
+        """Sleep until the next possible deadline; a shorter deadline than before wakes this thread earlier."""
         with self._changed:
-            while not self._over:
+            while not self._closed:
                 left = self._deadline_s or None if self._due is None else self._due - time.monotonic()
                 if left is None or left > 0:
                     self._changed.wait(left)
                 else:
-                    self._bark()
+                    self._dump_and_exit()
 
-    def _bark(self) -> None:
+    def _dump_and_exit(self) -> None:
         assert self._file is not None
         self._file.write(f"Timeout ({datetime.timedelta(seconds=self._deadline_s)})!\n")
         self._file.flush()
@@ -115,7 +115,7 @@ class Watchdog:
 
 
 def _open(run: Path, worker: str) -> IO[str]:
-    with contextlib.suppress(OSError):  # then it goes to a temporary file
+    with contextlib.suppress(OSError):  # then a temporary file is used
         if run.is_dir():
             path = crash_reports.stacks_of(run, worker)
             path.parent.mkdir(exist_ok=True)

@@ -16,7 +16,7 @@ from torch import nn
 
 import icrl_dist
 from actors.beliefs import BeliefPublisher
-from actors.publisher import Showing
+from actors.publisher import TrajectoryPublisher
 from actors.watchdog import Watchdog
 from actors.weight_cache import WeightCache
 from icrl_dist import version as code
@@ -51,7 +51,7 @@ class Worker:
         self._episodes = self._steps = 0
         self._job = self._doing = ""
         self._weights, self._reached = -1, 0
-        self._showing = Showing(link, self._keys, name)
+        self._publisher = TrajectoryPublisher(link, self._keys, name)
 
     def stop(self) -> None:
         """End after the job at hand."""
@@ -103,8 +103,8 @@ class Worker:
                 self._episodes += 1
                 self._steps += len(trajectory.actions)
                 sender.send(wire.encode_trajectory(trajectory))
-                self._showing.show(trajectory)
-            self._showing.flush()
+                self._publisher.publish(trajectory)
+            self._publisher.flush()
             sender.drain(timeout_s=drain_s)
         except Unanswered as error:
             _log.warning("job %s given back: %s", job.label, error)
@@ -167,7 +167,7 @@ class Worker:
                 message = wire.encode_message("worker", worker=self.name, **now, **fields)
                 try:
                     self._link.publish(key, message, droppable=True)
-                    self._showing.flush()
+                    self._publisher.flush()
                 except LinkError as error:
                     _log.warning("a heartbeat is lost: %s", error)
                 if ended.wait(HEARTBEAT_S):
@@ -198,7 +198,7 @@ class _Waiting:
 
 
 def _next(work: Iterator[Trajectory], watchdog: Watchdog, deadline_s: float) -> Trajectory | None:
-    with watchdog.over(deadline_s):
+    with watchdog.deadline(deadline_s):
         return next(work, None)
 
 

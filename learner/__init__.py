@@ -1,1 +1,1 @@
-"""A memory: hand out work, take in trajectories, fine-tune, broadcast."""
+"""Central learner: leases jobs, stores trajectories, fine-tunes T_theta and broadcasts its weights."""

@@ -1,7 +1,7 @@
 """The learner process: ``python -m learner RUN_DIR``.  Events go to stdout, a JSON line each.
 
-Started and supervised by ``icrl-dist train``, which names workers that were lost with their machines
-on stdin, a JSON list a line; ends by itself if that parent dies.
+``icrl-dist train`` starts and supervises it, and writes the names of workers that were lost with their
+nodes to its stdin, one JSON list a line.  The process ends by itself if that parent process dies.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ DONE, FAILED, BAD_CONFIG, INTERRUPTED = 0, 1, 2, 130
 
 
 def main() -> int:
-    """Run the learner to its end; the exit code is the command line's."""
+    """Run the learner to its end; returns the exit code of the command line."""
     parser = argparse.ArgumentParser(prog="python -m learner", description=__doc__)
     parser.add_argument("folder", type=Path, help="run folder with a run.toml")
     parser.add_argument(
-        "--endpoint", required=True, help="where to listen, such as tcp/127.0.0.1:7447; port 0 takes a free one"
+        "--endpoint", required=True, help="address to listen on, such as tcp/127.0.0.1:7447; port 0 chooses a free port"
     )
     arguments = parser.parse_args()
     logging.basicConfig(filename=arguments.folder / "learner.log", level=logging.INFO, format="%(asctime)s %(message)s")
@@ -51,10 +51,10 @@ def main() -> int:
         report({"event": "error", "text": str(error)})
         return BAD_CONFIG
     except (RunFailed, StoreError, FloatingPointError, OSError) as error:
-        told = explained(error)
-        if isinstance(told, OSError):  # which nobody foresaw
+        cause = explained(error)
+        if isinstance(cause, OSError):  # an unexpected error: keep its traceback
             raise
-        report({"event": "error", "text": str(told)})
+        report({"event": "error", "text": str(cause)})
         return FAILED
 
 
@@ -65,20 +65,20 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
         for name in (signal.SIGINT, signal.SIGTERM):
             signal.signal(name, lambda *_: service.stop())
         _end_with_parent(service)
-        threading.Thread(target=_listen, args=(service,), name="stdin", daemon=True).start()
-        where = folder / "endpoint"
-        where.write_text(link.endpoints[0] + "\n")
+        threading.Thread(target=_read_lost_workers, args=(service,), name="stdin", daemon=True).start()
+        endpoint_file = folder / "endpoint"
+        endpoint_file.write_text(link.endpoints[0] + "\n")
         place = {"endpoint": link.endpoints[0], "host": socket.gethostname(), "device": service.device}
         report({"event": "listening", **place, "version": service.version})
         try:
             report({"event": "finished", **service.run()})
-            service.desk.finish()  # not before: workers that end before the run does would look lost
-            service.desk.dismiss()
+            service.worker_api.finish()  # not earlier: a worker that ends before the run counts as lost
+            service.worker_api.wait_until_gone()
         except Interrupted:
             report({"event": "interrupted", "text": f"a checkpoint is in {folder / 'checkpoints'}"})
             return INTERRUPTED
         finally:
-            where.unlink(missing_ok=True)
+            endpoint_file.unlink(missing_ok=True)
             service.close()
     return DONE
 
@@ -94,13 +94,13 @@ def _end_with_parent(service: Service) -> None:
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
-def _listen(service: Service, stdin: int = 0) -> None:
+def _read_lost_workers(service: Service, stdin: int = 0) -> None:
     with (
         contextlib.suppress(OSError),
-        open(stdin, "rb", buffering=0, closefd=False) as told,
-    ):  # nothing buffered is locked at exit
-        for line in told:
-            service.desk.excuse(json.loads(line))
+        open(stdin, "rb", buffering=0, closefd=False) as lines,  # unbuffered: a buffer's lock would block the exit
+    ):
+        for line in lines:
+            service.worker_api.lost_with_node(json.loads(line))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Weights out: a put for those present, a queryable for those who come later or repeat older work."""
+"""Broadcast of weights: a put for the workers that are connected, and a queryable for later or older requests."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from icrl_dist.types import Weights
 
 
 class Broadcast:
-    """Publishes versions of T_theta and answers for them, older ones too.
+    """Publishes policy versions of T_theta and answers requests for them, also for older ones.
 
-    ``older`` fetches a version that was published before; it raises for one that there is not.
+    ``older`` loads a version that was published before; it raises for a version that does not exist.
     """
 
     def __init__(self, link: Link, keys: Keys, older: Callable[[int], Weights]) -> None:
         self._link, self._keys, self._older = link, keys, older
         self._lock = threading.Lock()
-        self._newest = self._fetched = (-1, b"")
+        self._newest = self._loaded = (-1, b"")
         self._digests: dict[int, str] = {-1: ""}
         link.serve(keys.weights_latest, self._answer)
 
     @property
     def version(self) -> int:
-        """The newest version; -1 before the first."""
+        """The newest policy version; -1 before the first."""
         return self._newest[0]
 
     def publish(self, weights: Weights) -> None:
-        """Make this the newest version, for workers present and for latecomers."""
+        """Make this the newest version, for connected workers and for later requests."""
         payload = wire.encode_weights(weights)
         with self._lock:
             self._newest = weights.version, payload
@@ -37,14 +37,14 @@ class Broadcast:
         self._link.publish(self._keys.weights, payload, droppable=False)
 
     def digest_of(self, version: int) -> str:
-        """Digest of a version; empty for -1, the policies without weights."""
+        """The weights digest of a version; empty for -1, the policies without weights."""
         with self._lock:
             if version not in self._digests:
                 self._digests[version] = self._older(version).digest
             return self._digests[version]
 
     def _answer(self, query: Query) -> None:
-        """An empty request asks for the newest version, ``want`` for one by its number."""
+        """Answer an empty request with the newest version, a request with ``version`` with that one."""
         version = -1
         if query.payload:
             try:
@@ -55,10 +55,10 @@ class Broadcast:
         with self._lock:
             newest, payload = self._newest
             if not payload or version > newest:
-                query.refuse(f"busy: weights version {max(version, 0)} has not been published yet")
+                query.refuse(f"busy: policy version {max(version, 0)} is not published yet; ask again")
                 return
             if 0 <= version < newest:
-                if self._fetched[0] != version:
-                    self._fetched = version, wire.encode_weights(self._older(version))
-                payload = self._fetched[1]
+                if self._loaded[0] != version:
+                    self._loaded = version, wire.encode_weights(self._older(version))
+                payload = self._loaded[1]
         query.reply(payload)

@@ -1,9 +1,9 @@
-"""The inbox: from untrusted bytes to stored trajectories, every drop counted by reason.
+"""Ingest: decodes and checks untrusted bytes, stores the trajectories, and counts every drop by its reason.
 
-Zenoh's thread only puts a query into a bounded queue.  One thread takes whole groups out,
-checks them, appends them with one fsync, and only then replies: a reply is the promise that
-the trajectory will be there after any crash.  (Checking one group on a second thread while
-another waits for its fsync was slower: the threads wait for each other's interpreter lock.)
+Zenoh's thread only puts a query into a bounded queue.  One thread takes groups out of it,
+checks them, appends them with one fsync, and only then replies: after a reply the trajectory
+survives any crash.  (A second thread that checks one group during the fsync of another was
+slower: the two threads compete for the interpreter lock.)
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from icrl_dist.types import Identity, Job, Spec, Trajectory
 _log = logging.getLogger(__name__)
 
 REASONS = (*wire.REASONS, "spec", "not-finite", "unexpected", "stale-weights", "duplicate", "busy")
-"""Why a message was not stored.  ``duplicate`` is acknowledged, the others are refused."""
+"""Why a message was not stored.  A ``duplicate`` is acknowledged; the others are refused."""
 
 
 class Rejected(Exception):  # noqa: N818
@@ -35,15 +35,16 @@ class Rejected(Exception):  # noqa: N818
         self.reason = reason
 
 
-def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
-    """Raises Rejected unless the trajectory is what its job asked for."""
+def check(trajectory: Trajectory, job: Job, spec: Spec, weights_digest: str) -> None:
+    """Raises Rejected if the trajectory does not match its job, the spec or the weights of the job's policy version."""
     identity, size = trajectory.identity, (spec.horizon + 1, spec.observation)
     if trajectory.observations.shape != size:
-        raise Rejected("spec", f"{identity}: observations {trajectory.observations.shape}, this run needs {size}")
+        raise Rejected("spec", f"{identity}: observations have shape {trajectory.observations.shape}, this run needs {size}")
     if trajectory.queries.shape[1] != spec.observation or trajectory.labels.shape[1] != spec.actions:
-        raise Rejected("spec", f"{identity}: queries {trajectory.queries.shape}, labels {trajectory.labels.shape}")
+        raise Rejected("spec", f"{identity}: queries have shape {trajectory.queries.shape}, labels {trajectory.labels.shape}")
     if (trajectory.actions.ndim == 1) != spec.discrete:
-        raise Rejected("spec", f"{identity}: actions {trajectory.actions.shape} are of the other kind than this run's")
+        kind = "discrete" if spec.discrete else "continuous"
+        raise Rejected("spec", f"{identity}: actions have shape {trajectory.actions.shape}, this run has {kind} actions")
     low, high = (0, spec.actions - 1) if spec.discrete else (-1, 1)
     for chosen in (trajectory.actions, trajectory.taken, *(() if spec.discrete else (trajectory.labels,))):
         if len(chosen) and (chosen.min() < low or chosen.max() > high):
@@ -51,53 +52,59 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, digest: str) -> None:
     if not all(map(_finite, trajectory.arrays().values())):
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
     if trajectory.variation != job.variation(identity):
-        raise Rejected("unexpected", f"{identity}: comes from another variation than its job's")
-    if (trajectory.policy_version, trajectory.weights_digest) != (job.policy_version, digest):
-        raise Rejected(
-            "stale-weights", f"{identity}: weights {trajectory.policy_version} acted, the job names {job.policy_version}"
-        )
+        raise Rejected("unexpected", f"{identity}: its variation is not the one of its job")
+    if (trajectory.policy_version, trajectory.weights_digest) != (job.policy_version, weights_digest):
+        made = f"policy version {trajectory.policy_version} with weights {trajectory.weights_digest[:8]!r}"
+        wanted = f"{job.policy_version} with weights {weights_digest[:8]!r}"
+        raise Rejected("stale-weights", f"{identity}: made by {made}, its job names {wanted}")
 
 
 def _finite(array: np.ndarray) -> bool:
-    """Whether every value is; a sum of squares that is finite, the quick way, says so too."""
+    """Whether every value is finite; a finite sum of squares proves it faster."""
     return bool(np.isfinite(np.vdot(array, array)) or np.isfinite(array).all())
 
 
-class Inbox:
-    """Takes trajectories in on its own thread; ``wants`` and ``stored`` are the Board's."""
+class Ingest:
+    """Stores trajectories on its own thread."""
 
     def __init__(
         self,
         store: Store,
         spec: Spec,
         limit: int,
-        wants: Callable[[Identity], Job | None],
+        pending_job: Callable[[Identity], Job | None],
         digest_of: Callable[[int], str],
         stored: Callable[[Trajectory], None],
         failed: Callable[[BaseException], None],
         capacity: int = 256,
         capacity_bytes: int = 64 << 20,
     ) -> None:
-        """What comes beyond ``capacity`` messages, or ``capacity_bytes`` of them, is answered ``busy``; one always fits."""
+        """``limit``: the largest message in bytes.
+
+        ``pending_job`` returns the job in which a trajectory is missing, None if no job needs it.
+        ``digest_of`` returns the weights digest of a policy version.  ``stored`` is called after a
+        trajectory is stored, ``failed`` when the ingest cannot continue.  At most ``capacity`` messages
+        of together ``capacity_bytes`` are queued (one always fits); a further one is answered ``busy``.
+        """
         self.drops: Counter[str] = Counter()
         self.commits = 0
-        """Groups stored, an fsync each."""
+        """Number of groups stored, with one fsync each."""
         self._store, self._spec, self._limit = store, spec, limit
-        self._wants, self._digest_of, self._stored, self._failed = wants, digest_of, stored, failed
-        self._room = _Room(capacity, capacity_bytes)
+        self._pending_job, self._digest_of, self._stored, self._failed = pending_job, digest_of, stored, failed
+        self._load = _QueueLoad(capacity, capacity_bytes)
         self._queue: queue.SimpleQueue[Query | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="inbox", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
         self._thread.start()
 
     def put(self, query: Query) -> None:
-        """Accept a request without ever blocking; a full inbox answers ``busy``: send it again."""
+        """Queue a request without blocking; what does not fit is answered ``busy``, and the worker sends it again."""
         try:
             trajectories = batching.split(query, self._limit)
         except wire.WireError as error:
             self._refuse(query, error)
             return
         for one in trajectories:
-            if self._room.enter(len(one.payload)):
+            if self._load.add(len(one.payload)):
                 self._queue.put(one)
             else:
                 self.drops["busy"] += 1
@@ -109,7 +116,7 @@ class Inbox:
         query.refuse(str(error))
 
     def close(self) -> None:
-        """Take in what is queued, then stop."""
+        """Store what is queued, then stop the thread."""
         self._queue.put(None)
         self._thread.join()
 
@@ -121,74 +128,74 @@ class Inbox:
                 following = self._next()
             try:
                 self.take(group)
-            except Exception as error:  # the run ends; unanswered, what was sent will be sent again
-                _log.exception("the inbox cannot go on")
+            except Exception as error:  # the run ends; workers send unanswered messages again to the next learner
+                _log.exception("the ingest cannot continue")
                 self._failed(error)
                 return
-            self._room.leave(group)
+            self._load.remove(group)
 
     def _next(self) -> Query | None:
-        """What waits next; None if nothing does, or if the inbox is closing."""
+        """The next queued query; None if the queue is empty or the ingest is closing."""
         try:
             found = self._queue.get_nowait()
         except queue.Empty:
             return None
         if found is None:
-            self._queue.put(None)  # for the next time around
+            self._queue.put(None)  # the loop in _run reads it next
         return found
 
     def take(self, group: list[Query]) -> None:
-        """Check a group of messages, refuse the bad ones, store the good ones, then acknowledge those.
+        """Check a group of messages, refuse the bad ones, store the good ones, then acknowledge these.
 
-        Raises StoreError if they could not be stored; none of them is acknowledged then.
+        Raises StoreError if they cannot be stored; then none of them is acknowledged.
         """
         good: dict[Identity, Trajectory] = {}
-        taken: list[Query] = []
+        acknowledged: list[Query] = []
         for query in group:
             try:
                 trajectory = wire.decode_trajectory(query.payload, self._limit)
                 identity = trajectory.identity
-                job = self._wants(identity)
+                job = self._pending_job(identity)
                 if identity in self._store or identity in good:
                     self.drops["duplicate"] += 1
                 elif job is None:
-                    raise Rejected("unexpected", f"{identity}: nobody asked for it")
+                    raise Rejected("unexpected", f"{identity}: no open job contains it")
                 else:
                     check(trajectory, job, self._spec, self._digest_of(job.policy_version))
                     good[identity] = trajectory
             except (wire.WireError, Rejected) as error:
                 self._refuse(query, error)
             else:
-                taken.append(query)
+                acknowledged.append(query)
         if good:
             self._store.append(list(good.values()))
             self.commits += 1
         for trajectory in good.values():
             self._stored(trajectory)
-        for query in taken:
+        for query in acknowledged:
             query.reply(b"stored")
 
 
-class _Room:
-    """Messages taken in and not yet done with: so many, of so many bytes together."""
+class _QueueLoad:
+    """Number and total size of the messages that are queued or being stored, with an upper bound for each."""
 
     def __init__(self, count: int, size: int) -> None:
         self._lock = threading.Lock()
         self._count = self._size = 0
-        self._most = (count, size)
+        self._bounds = (count, size)
 
-    def enter(self, size: int) -> bool:
-        """Whether there was room for a message of this size, which is now in."""
+    def add(self, size: int) -> bool:
+        """Add a message of ``size`` bytes if it fits; returns whether it did."""
         with self._lock:
-            count, total = self._most
+            count, total = self._bounds
             if self._count and (self._count >= count or self._size + size > total):
                 return False
             self._count += 1
             self._size += size
             return True
 
-    def leave(self, group: Sequence[Query]) -> None:
-        """These are done with."""
+    def remove(self, group: Sequence[Query]) -> None:
+        """Remove messages that are answered."""
         with self._lock:
             self._count -= len(group)
             self._size -= sum(len(query.payload) for query in group)

@@ -1,4 +1,4 @@
-"""What the learner says of a run: to its terminal, to the monitor plane, and to the run's metrics."""
+"""Reporter: sends the events of a run to the terminal, to the monitor plane, and to the metrics file."""
 
 from __future__ import annotations
 
@@ -22,139 +22,146 @@ from icrl_dist.types import Job, Trajectory
 
 _log = logging.getLogger(__name__)
 
-Report = Callable[[dict[str, Any]], None]
-
 PERIOD_S = 0.25
-"""Progress is told this often."""
-_ABOUT_S = 2.0
-"""What a run is about is told this often, for viewers that come late."""
-_ALERTS = 200
-"""Alerts of which monitors are told again, at most."""
+"""Seconds between two progress messages."""
+_DESCRIPTION_S = 2.0
+"""Seconds between two descriptions of the run; they repeat for viewers that connect later."""
+_MAX_ALERTS = 200
+"""Number of active alerts in a description."""
 _INGEST_S = 1.0
+"""Seconds between two rows of ingest metrics."""
 
 
-class Herald:
-    """Says everything once, to whoever wants to hear it; events may come from any thread."""
+class Reporter:
+    """Sends each event once to every destination; any thread may call it."""
 
     def __init__(
-        self, run: Run, folder: Path, link: Link, keys: Keys, metrics: Metrics, report: Report, version: Callable[[], int]
+        self,
+        run: Run,
+        folder: Path,
+        link: Link,
+        keys: Keys,
+        metrics: Metrics,
+        report: Callable[[dict[str, Any]], None],
+        version: Callable[[], int],
     ) -> None:
-        """``version``: the newest of the weights."""
+        """``report`` receives events for the terminal; ``version`` returns the newest policy version."""
         self._run, self._link, self._keys, self._metrics, self._report = run, link, keys, metrics, report
         self._began = (folder / "run.toml").stat().st_mtime if (folder / "run.toml").exists() else time.time()
         self._alerts = Alerts(run.alerts)
         self._lock = threading.Lock()
-        self._about: dict[str, Any] = {}
+        self._description: dict[str, Any] = {}
         self._version = version
-        self._told = dict.fromkeys(("progress", "about", "ingest"), float("-inf"))
-        self._rows: deque[tuple[float, str, dict[str, Any]]] = deque()  # written by the run's own thread
+        self._last_sent = dict.fromkeys(("progress", "description", "ingest"), float("-inf"))
+        self._rows: deque[tuple[float, str, dict[str, Any]]] = deque()
+        """Rows (Unix time, stage, fields) for the metrics file, which only the thread of the run writes."""
 
     def event(self, event: dict[str, Any]) -> None:
-        """Something happened: ``event`` names what, ``text`` says it to people."""
+        """Send an event everywhere: ``event["event"]`` is its kind, ``event["text"]`` a sentence for the user."""
         self._report(event)
         if "text" in event:
-            about = {name: event[name] for name in ("worker", "alive", "identity") if name in event}
-            self.say(event["event"], event["text"], **about)
+            fields = {name: event[name] for name in ("worker", "alive", "identity") if name in event}
+            self.log(event["event"], event["text"], **fields)
 
-    def say(self, what: str, text: str, **about: Any) -> None:
-        """The same to all but the terminal, which is told in other words."""
+    def log(self, what: str, text: str, **fields: Any) -> None:
+        """Send an event to monitors and metrics, but not to the terminal, which has a text of its own for it."""
         now = time.time()
-        self._rows.append((now, "event", {"what": what, "text": text, **about}))
-        self._publish("event", "event", now, what=what, text=text, **about)
+        self._rows.append((now, "event", {"what": what, "text": text, **fields}))
+        self._publish("event", "event", now, what=what, text=text, **fields)
 
-    def about(self, phases: Sequence[Phase], jobs: Sequence[Job]) -> None:
-        """What the run is about: told again from time to time."""
-        self._about = {**about(self._run, phases, jobs), "began": self._began}
-        self._told["about"] = float("-inf")
+    def describe(self, phases: Sequence[Phase], jobs: Sequence[Job]) -> None:
+        """Set the description of the run, which is published repeatedly."""
+        self._description = {**about(self._run, phases, jobs), "began": self._began}
+        self._last_sent["description"] = float("-inf")
 
-    def began(self) -> None:
-        """A phase begins to be collected."""
+    def phase_started(self) -> None:
+        """Reset the alerts at the start of a phase's collection."""
         with self._lock:
             self._alerts.began()
 
     def stored(self, trajectory: Trajectory) -> None:
-        """A trajectory was stored."""
+        """Pass the return of a stored trajectory to the alerts."""
         identity = trajectory.identity
         if identity.stage == "adapt" or registry.of(self._run).earns_in_contexts:
-            place = identity.task, identity.variation, identity.trial
+            trial = identity.task, identity.variation, identity.trial
             with self._lock:
-                self._alerts.returned(place, trajectory.policy_version, trajectory.episode_return)
+                self._alerts.returned(trial, trajectory.policy_version, trajectory.episode_return)
 
     def fitted(self, loss: float, seconds: float) -> None:
-        """The newest version of the weights is fitted and published."""
+        """Report that the newest policy version is fitted and published."""
         version = self._version()
         self._metrics.write(version, "version", loss=loss, seconds=seconds)
-        self.say("version", f"T^{version} is fitted: loss {loss:.3f}, {seconds:.0f} s", version=version)
+        self.log("version", f"T^{version} is fitted: loss {loss:.3f}, {seconds:.0f} s", version=version)
 
-    def labelled(self, round: int, quality: Mapping[str, float]) -> None:
-        """How good a round's own labels are."""
+    def labels_rated(self, round: int, quality: Mapping[str, float]) -> None:
+        """Report the quality of a round's self-made labels: ``agreement`` with optimal labels, and ``label_return``."""
         self._metrics.write(round, "labels", **quality)
         q = quality
-        text = f"labels of round {round}: {q['agreement']:.0%} optimal; return {q['label_return']:.1f} in the trials that label"
+        text = f"labels of round {round}: {q['agreement']:.0%} optimal; return {q['label_return']:.1f} in the labeling trials"
         self._report({"event": "labels", "round": round, **quality})
-        self.say("labels", text)
+        self.log("labels", text)
         with self._lock:
             self._alerts.labels(round, quality["agreement"])
 
-    def progress(self, fields: dict[str, Any], force: bool, desk: Mapping[str, Any]) -> None:
-        """How far a phase is; told if ``force``, or if it is time.
+    def progress(self, fields: dict[str, Any], force: bool, totals: Mapping[str, Any]) -> None:
+        """Send the progress of a phase, if ``force`` is set or ``PERIOD_S`` have passed.
 
-        ``fields`` as in docs/tap.md; ``desk`` as ``Desk.told``.
+        ``fields`` as in docs/tap.md; ``totals`` as in ``WorkerAPI.totals``.
         """
         if not self._due("progress", PERIOD_S) and not force:
             return
         self._report({"event": "progress", **fields})
         self._publish("learner", "learner", **fields)
-        if self._about and self._due("about", _ABOUT_S):
-            self._publish("run", "run", **self._about, alerts=self._on())
+        if self._description and self._due("description", _DESCRIPTION_S):
+            self._publish("run", "run", **self._description, alerts=self._active_alerts())
         if fields["stage"] == "collect" and (self._due("ingest", _INGEST_S) or force):
-            self._ingest(fields, desk)
-        self._alert(fields, desk)
-        self.write()
+            self._write_ingest(fields, totals)
+        self._check_alerts(fields, totals)
+        self.flush()
 
-    def _ingest(self, fields: dict[str, Any], desk: Mapping[str, Any]) -> None:
+    def _write_ingest(self, fields: dict[str, Any], totals: Mapping[str, Any]) -> None:
         self._metrics.write(
             fields["version"] + 1,
             "ingest",
             trajectories=fields["trajectories"],
             arrived=fields["step"],
-            episodes=desk["episodes"],
+            episodes=totals["episodes"],
             workers=fields["workers"],
-            unstored=max(0, desk["episodes"] - desk["acknowledged"]),
+            unstored=max(0, totals["episodes"] - totals["acknowledged"]),
             lag=fields["lag"],
             drops=sum(fields["drops"].values()),
-            resent=desk["resent"],
-            waited_s=desk["waited_s"],
+            resent=totals["resent"],
+            waited_s=totals["waited_s"],
         )
 
-    def _alert(self, fields: dict[str, Any], desk: Mapping[str, Any]) -> None:
+    def _check_alerts(self, fields: dict[str, Any], totals: Mapping[str, Any]) -> None:
         now = time.time()
         with self._lock:
             if fields["stage"] == "collect":
-                self._alerts.waited(time.monotonic(), desk["waited"])
-            changed = self._alerts.check(desk["silent"], now)
+                self._alerts.waited(time.monotonic(), totals["waited"])
+            changed = self._alerts.check(totals["silent"], now)
         for alert in changed:
             self._report({"event": "alert", "text": f"{'ALERT' if alert.active else 'alert'}: {alert.text}"})
             self._rows.append((now, "alert", {"what": alert.name, "active": alert.active, "text": alert.text}))
             about = {"alert": alert.name, "active": alert.active, "text": alert.text}
             self._publish("event", "event", now, what="alert", **about)
 
-    def _on(self) -> list[dict[str, Any]]:
-        """The alerts that are on: told again and again, for viewers that come late or missed how one began or ended."""
+    def _active_alerts(self) -> list[dict[str, Any]]:
+        """The active alerts; they repeat for viewers that connect later or missed a change."""
         with self._lock:
-            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.on[:_ALERTS]]
+            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.on[:_MAX_ALERTS]]
 
-    def write(self) -> None:
-        """Everything said so far into the metrics.  Raises StoreError if it cannot be written."""
+    def flush(self) -> None:
+        """Write all rows so far into the metrics file.  Raises StoreError if it cannot be written."""
         while self._rows:
-            at, stage, about = self._rows.popleft()
-            self._metrics.tell(at, self._version(), stage, **about)
+            at, stage, fields = self._rows.popleft()
+            self._metrics.tell(at, self._version(), stage, **fields)
 
     def _due(self, what: str, period_s: float) -> bool:
         now = time.monotonic()
-        if now - self._told[what] < period_s:
+        if now - self._last_sent[what] < period_s:
             return False
-        self._told[what] = now
+        self._last_sent[what] = now
         return True
 
     def _publish(self, topic: str, kind: str, now: float | None = None, **fields: Any) -> None:
@@ -162,4 +169,4 @@ class Herald:
         try:
             self._link.publish(self._keys.monitor(topic), message, droppable=True)
         except LinkError as error:
-            _log.warning("monitors are not told of this %s: %s", kind, error)
+            _log.warning("a %s message was not published to monitors: %s", kind, error)

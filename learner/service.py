@@ -26,11 +26,11 @@ from icrl_dist.training import fit
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
 from learner.broadcast import Broadcast
-from learner.ingest import Inbox
+from learner.ingest import Ingest
 from learner.phases import PhasePlan
-from learner.reporter import Herald
-from learner.scheduler import Board
-from learner.worker_api import Desk
+from learner.reporter import Reporter
+from learner.scheduler import LeaseScheduler
+from learner.worker_api import WorkerAPI
 
 Report = Callable[[dict[str, Any]], None]
 
@@ -73,10 +73,10 @@ class Service:
         self._partial = 0
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
-        self._herald = Herald(run, folder, link, self._keys, self._metrics, report, lambda: self.version)
-        closing.callback(self._herald.write)
+        self._reporter = Reporter(run, folder, link, self._keys, self._metrics, report, lambda: self.version)
+        closing.callback(self._reporter.flush)
         self._lock = threading.Lock()
-        self._board = Board(run.stream.lease_s)
+        self._scheduler = LeaseScheduler(run.stream.lease_s)
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._error: BaseException | None = None
@@ -89,7 +89,7 @@ class Service:
         self._plan.give_up(checkpoints.given_up(folder, self.version))
         self._opened: set[Phase] = set()
         self._broadcast = Broadcast(link, self._keys, self._older)
-        self.inbox = Inbox(
+        self.ingest = Ingest(
             self.store,
             self._spec,
             run.stream.max_message_bytes,
@@ -98,11 +98,12 @@ class Service:
             self._stored,
             self.fail,
         )
-        closing.callback(self.inbox.close)
+        closing.callback(self.ingest.close)
         acting = lambda job: self._plan.acting(job, self.version)  # noqa: E731
         fail = lambda line: self.fail(RunFailed(line))  # noqa: E731
-        self.desk = Desk(run, folder, link, self._keys, self._board, self._lock, self._herald.event, fail, acting)
-        closing.callback(self.desk.close)
+        report = self._reporter.event
+        self.worker_api = WorkerAPI(run, folder, link, self._keys, self._scheduler, self._lock, report, fail, acting)
+        closing.callback(self.worker_api.close)
         self._taking = False
         self._take_up()
 
@@ -126,19 +127,19 @@ class Service:
 
     def _wants(self, identity: Identity) -> Job | None:
         with self._lock:
-            job = self._board.wants(identity)
+            job = self._scheduler.pending_job(identity)
             if job is None:
-                self._board.repeated(identity, time.monotonic())
+                self._scheduler.repeated(identity, time.monotonic())
             return job
 
     def _stored(self, trajectory: Trajectory) -> None:
         identity = trajectory.identity
         with self._lock:
-            self._board.received(identity, time.monotonic())
-            done = self._board.done(identity.stage, identity.round)
+            self._scheduler.received(identity, time.monotonic())
+            done = self._scheduler.done(identity.stage, identity.round)
         if identity.stage == "adapt":
             self._lag = identity.round - trajectory.policy_version
-        self._herald.stored(trajectory)
+        self._reporter.stored(trajectory)
         if done:
             self._changed.set()
 
@@ -156,26 +157,26 @@ class Service:
         try:
             result = self._run_phases()
         except Interrupted:
-            self._herald.say("interrupted", f"interrupted with T^{self.version} and {len(self.store)} trajectories")
+            self._reporter.log("interrupted", f"interrupted with T^{self.version} and {len(self.store)} trajectories")
             raise
         except Exception as error:
-            self._herald.say("failed", f"failed: {error}")
+            self._reporter.log("failed", f"failed: {error}")
             raise
-        self._herald.say("finished", f"finished with T^{self.version} and {len(self.store)} trajectories")
+        self._reporter.log("finished", f"finished with T^{self.version} and {len(self.store)} trajectories")
         return result
 
     def _run_phases(self) -> dict[str, Any]:
-        self._herald.about(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
+        self._reporter.describe(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
         while (phase := self._plan.next(self.version)) is not None:
             if phase.next_version <= self.version:
                 lost = ", ".join(job.label for job in self._plan.incomplete(phase))
-                self._herald.event({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
+                self._reporter.event({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
             try:
                 self._collect(phase)
                 if phase.next_version > self.version:
                     self._fit(phase)
             except Damaged as error:
-                self._herald.event({"event": "note", "text": str(error)})
+                self._reporter.event({"event": "note", "text": str(error)})
                 self.store.repair()
                 self._tell_repairs()
                 self._plan.give_up({})
@@ -186,8 +187,8 @@ class Service:
             "weights_digest": self._broadcast.digest_of(self.version),
             "version": self.version,
             "trajectories": len(self.store),
-            "drops": dict(self.inbox.drops),
-            "resent": self.desk.resent,
+            "drops": dict(self.ingest.drops),
+            "resent": self.worker_api.resent,
             "repaired": self._mended,
             "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
             "staleness": self._run.stream.staleness,
@@ -201,27 +202,27 @@ class Service:
         self._closing.close()
 
     def _open(self, phase: Phase) -> None:
-        """Put a phase's work on the Board, and that of phases which may run ahead of it."""
+        """Put a phase's work on the LeaseScheduler, and that of phases which may run ahead of it."""
         for one in (phase, *self._plan.ahead(phase, self.version)):
             if one not in self._opened:
                 jobs = self._plan.ask(one)
                 with self._lock:
-                    self._board.open(jobs, self._plan.have)
+                    self._scheduler.open(jobs, self._plan.have)
                 self._opened.add(one)
 
     def _collect(self, phase: Phase) -> None:
         self._open(phase)
-        self._herald.began()
+        self._reporter.phase_started()
         with self._lock:
-            already, _ = self._board.progress(phase.stage, phase.round)
+            already, _ = self._scheduler.progress(phase.stage, phase.round)
         if not self._taking:  # earlier, nothing was expected yet: what comes meanwhile is sent again
-            self._link.serve(self._keys.data, self.inbox.put)
+            self._link.serve(self._keys.data, self.ingest.put)
             self._taking = True
         began = time.monotonic()
         while True:
             with self._lock:
-                arrived, expected = self._board.progress(phase.stage, phase.round)
-                done = self._board.done(phase.stage, phase.round)
+                arrived, expected = self._scheduler.progress(phase.stage, phase.round)
+                done = self._scheduler.done(phase.stage, phase.round)
             per_s = (arrived - already) / max(1e-3, time.monotonic() - began)
             self._progress("collect", phase, arrived, expected, per_s=per_s, force=done)
             if done:
@@ -230,19 +231,20 @@ class Service:
             self._changed.wait(0.2)
             self._changed.clear()
         with self._lock:
-            leases, blamed = self._board.leases(phase.stage, phase.round), dict(self._board.blamed(phase.stage, phase.round))
-            self._board.close(phase.stage, phase.round)
+            leases = self._scheduler.leases(phase.stage, phase.round)
+            blamed = dict(self._scheduler.quarantine_causes(phase.stage, phase.round))
+            self._scheduler.close(phase.stage, phase.round)
             self._opened.discard(phase)
         self._plan.give_up(blamed)
         if not self.store.ledger.count(phase.stage, phase.round):
             raise RunFailed(
-                f"{phase.stage}/{phase.round}: not one trajectory was stored, and {len(blamed)} of its variations are "
+                f"{phase.stage}/{phase.round}: no trajectory was stored, and {len(blamed)} of its variations are "
                 f"quarantined; first: {next(iter(blamed.values()))}"
             )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         quality = self._method.label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
         if quality:
-            self._herald.labelled(phase.round, quality)
+            self._reporter.labels_rated(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
         draw = self._method.data(self._run, phase, self.store) if phase.steps else None
@@ -283,7 +285,7 @@ class Service:
         self._save(files.version_file(self._folder, self.version), weights, loss=loss, **where)
         partial.unlink(missing_ok=True)
         self._broadcast.publish(weights)
-        self._herald.fitted(loss, time.monotonic() - began)
+        self._reporter.fitted(loss, time.monotonic() - began)
 
     def _weights(self) -> Weights:
         """The model's parameters, hashed once."""
@@ -305,7 +307,7 @@ class Service:
     def _tell_repairs(self) -> None:
         self._mended += len(self.store.repaired)
         for note in self.store.repaired:
-            self._herald.event({"event": "repaired", "text": note})
+            self._reporter.event({"event": "repaired", "text": note})
 
     def _check(self) -> None:
         if self._error is not None:
@@ -322,13 +324,13 @@ class Service:
             "steps": total,
             "version": self.version,
             "trajectories": len(self.store),
-            "workers": sum(self.desk.workers.values()),
+            "workers": sum(self.worker_api.workers.values()),
             "lag": self._lag,
-            "drops": dict(self.inbox.drops),
-            "doing": self.desk.doing,
+            "drops": dict(self.ingest.drops),
+            "doing": self.worker_api.long_work,
             **values,
         }
-        self._herald.progress(fields, force, self.desk.told)
+        self._reporter.progress(fields, force, self.worker_api.totals)
 
 
 def _device(name: str) -> torch.device:

@@ -1,4 +1,4 @@
-"""The desk that workers come to: who is there, who gets which job, and what went wrong with it."""
+"""Worker API: answers the requests of workers, leases jobs to them, and records their failures."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from icrl_dist.stream.dispatch import Dispatcher
 from icrl_dist.stream.link import Keys, Link, Query
 from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Job
-from learner.scheduler import Board
+from learner.scheduler import LeaseScheduler
 
-HOPELESS = 8
-"""So many variations quarantined and nothing stored in a phase: the fault is in none of them, and the run ends."""
+MAX_QUARANTINED = 8
+"""The run ends if a phase has this many quarantined variations and no stored trajectory: no single variation is the cause."""
 
-_MOMENT_S = 0.3
-"""A vanished worker's stacks may be on their way, over a network's file system."""
+_STACKS_DELAY_S = 0.3
+"""Seconds to wait for the stacks of a worker that ended: a network file system may show them later."""
 
 _LINES = 60
-"""So many of a worker's stacks are in its record, the newest call of the first thread first."""
+"""Lines of a worker's stacks in its crash record; the newest call of the first thread comes first."""
 
 _COUNTS = {"episodes": int, "steps": int, "resent": int, "trajectories": int, "waited_s": float}
 
 
-class Desk:
-    """Answers workers from the Board and watches them come and go."""
+class WorkerAPI:
+    """Answers workers with leases of the scheduler, and records when they connect, disconnect and fail."""
 
     def __init__(
         self,
@@ -39,122 +39,123 @@ class Desk:
         folder: Path,
         link: Link,
         keys: Keys,
-        board: Board,
+        scheduler: LeaseScheduler,
         lock: threading.Lock,
         report: Callable[[dict[str, Any]], None],
         fail: Callable[[str], None],
-        acting: Callable[[Job], int] | None = None,
+        policy_version: Callable[[Job], int] | None = None,
     ) -> None:
-        """``lock`` guards the Board; ``fail`` ends the run with a line for the user.
+        """``lock`` guards the scheduler; ``fail`` ends the run with one line for the user.
 
-        Crash records go into the run's ``folder``.  ``acting`` as in ``Board.lease``; it is
-        called with the lock held.
+        Crash records are written into the run ``folder``.  ``policy_version`` as in
+        ``LeaseScheduler.lease``; it is called while the lock is held.
         """
-        self._run, self._board, self._lock, self._report, self._fail = run, board, lock, report, fail
-        self._folder, self._acting = folder, acting
+        self._run, self._scheduler, self._lock, self._report, self._fail = run, scheduler, lock, report, fail
+        self._folder, self._policy_version = folder, policy_version
         self.workers: dict[str, bool] = {}
-        """Every worker seen, and whether it is alive."""
+        """Whether each worker that has ever connected is alive."""
         self.counters: dict[str, dict[str, Any]] = {}
-        """The newest that each worker said of itself: episodes, steps, resent, memory_mb and so on."""
-        self._heard: dict[str, float] = {}
+        """The newest counters of each worker: episodes, steps, resent, memory_mb and so on."""
+        self._last_message: dict[str, float] = {}
         self._jobs: dict[str, Job] = {}
-        self._told: set[tuple[str, int, int, int]] = set()
+        self._reported: set[tuple[str, int, int, int]] = set()
         self._finished = threading.Event()
-        self._later = Dispatcher("crash records")
-        link.serve(keys.work, self._work)
-        link.subscribe(keys.heartbeats, lambda _, payload: self._beat(payload))
-        link.watch(keys.alive_all, self._watch)
+        self._delayed = Dispatcher("crash records")
+        link.serve(keys.work, self._on_request)
+        link.subscribe(keys.heartbeats, lambda _, payload: self._on_heartbeat(payload))
+        link.watch(keys.alive_all, self._on_liveliness)
 
     @property
     def resent(self) -> int:
-        """Times that a trajectory had to be sent again, by all workers so far."""
-        return sum(said["resent"] for said in list(self.counters.values()))
+        """How often trajectories were sent again, by all workers so far."""
+        return sum(counters["resent"] for counters in list(self.counters.values()))
 
     @property
-    def told(self) -> dict[str, Any]:
-        """What all workers said of themselves together; for how long each has been silent, and those here have waited."""
-        now, said = time.monotonic(), list(self.counters.values())
-        here = [worker for worker, alive in list(self.workers.items()) if alive and worker in self.counters]
+    def totals(self) -> dict[str, Any]:
+        """Sums of the counters of all workers, and by worker the seconds waited and the seconds since its last message."""
+        now, counters = time.monotonic(), list(self.counters.values())
+        connected = [worker for worker, alive in list(self.workers.items()) if alive and worker in self.counters]
         return {
-            "episodes": sum(one["episodes"] for one in said),
-            "acknowledged": sum(one["trajectories"] for one in said),
+            "episodes": sum(one["episodes"] for one in counters),
+            "acknowledged": sum(one["trajectories"] for one in counters),
             "resent": self.resent,
-            "waited_s": sum(one["waited_s"] for one in said),
-            "waited": {worker: self.counters[worker]["waited_s"] for worker in here},
-            "silent": {worker: now - heard for worker, heard in list(self._heard.items())},
+            "waited_s": sum(one["waited_s"] for one in counters),
+            "waited": {worker: self.counters[worker]["waited_s"] for worker in connected},
+            "silent": {worker: now - last for worker, last in list(self._last_message.items())},
         }
 
     @property
-    def doing(self) -> list[str]:
-        """What the workers that are here say of work that takes long."""
-        here = [worker for worker, alive in sorted(self.workers.items()) if alive]
-        said = (str(self.counters.get(worker, {}).get("doing", "")) for worker in here)
-        return [f"{worker}: {text[:100]}" for worker, text in zip(here, said, strict=True) if text]
+    def long_work(self) -> list[str]:
+        """What each connected worker reports about a job with a long time before its first trajectory."""
+        connected = [worker for worker, alive in sorted(self.workers.items()) if alive]
+        texts = (str(self.counters.get(worker, {}).get("doing", "")) for worker in connected)
+        return [f"{worker}: {text[:100]}" for worker, text in zip(connected, texts, strict=True) if text]
 
     def finish(self) -> None:
-        """From now on, tell whoever asks to stop."""
+        """Answer every worker that asks for a job with "stop" from now on."""
         self._finished.set()
 
-    def dismiss(self, timeout_s: float = 3.0) -> None:
-        """After the end: wait until every worker has been told to stop, or time is up, and tidy up."""
+    def wait_until_gone(self, timeout_s: float = 3.0) -> None:
+        """Wait after ``finish`` until every worker has ended, at most ``timeout_s``; remove empty stacks files."""
         deadline = time.monotonic() + timeout_s
         while any(self.workers.values()) and time.monotonic() < deadline:
             time.sleep(0.02)
         crash_reports.sweep(self._folder)
 
-    def excuse(self, workers: Collection[str]) -> None:
-        """These workers went with their machines: what was held against their jobs, and is still open, is taken back."""
+    def lost_with_node(self, workers: Collection[str]) -> None:
+        """Record that these workers ended because their nodes failed: their deaths do not count against their jobs."""
         with self._lock:
-            before = set(self._board.quarantined)
+            before = set(self._scheduler.quarantined)
             for worker in workers:
-                self._board.excuse(worker)
-            again = before - set(self._board.quarantined)
-            self._told -= again
-        for key in sorted(again):
+                self._scheduler.lost_with_node(worker)
+            released = before - set(self._scheduler.quarantined)
+            self._reported -= released
+        for key in sorted(released):
             name = "/".join(map(str, key))
-            text = f"variation {name} is tried again: its workers went with their machines"
+            text = f"variation {name} is leased again: its workers ended because their nodes failed"
             self._report({"event": "released", "identity": name, "text": text})
 
     def close(self) -> None:
         """Write no more crash records; the link stays open."""
-        self._later.close()
+        self._delayed.close()
 
-    def _watch(self, worker: str, alive: bool) -> None:
+    def _on_liveliness(self, worker: str, alive: bool) -> None:
         if alive:
-            self._join(worker)
+            self._connected(worker)
         else:
-            self._leave(worker)
+            self._disconnected(worker)
 
-    def _join(self, worker: str) -> None:
+    def _connected(self, worker: str) -> None:
         with self._lock:
             again = self.workers.get(worker) is False
             self.workers[worker] = True
-            self._heard.pop(crash_reports.predecessor(worker) or "", None)  # nobody waits for that one any more
-            self._board.back(worker)
+            replaced = crash_reports.predecessor(worker) or ""
+            self._last_message.pop(replaced, None)  # this worker has been replaced, so its silence is no alert
+            self._scheduler.worker_back(worker)
         text = f"worker {worker} {'is back' if again else 'joined'}"
         self._report({"event": "worker", "worker": worker, "alive": True, "text": text})
 
-    def _leave(self, worker: str) -> None:
+    def _disconnected(self, worker: str) -> None:
         crashed = not self._finished.is_set()
         cause = f"worker {worker} died"
-        if crashed and self._stacks(worker):
-            cause += f": {self._stacks(worker)[0]}"
+        if crashed and (stacks := self._stacks(worker)):
+            cause += f": {stacks[0]}"
         with self._lock:
             self.workers[worker] = False
             job = self._jobs.pop(worker, None)
-            freed = self._board.lost(worker, time.monotonic(), cause)
+            freed = self._scheduler.worker_lost(worker, time.monotonic(), cause)
         text = f"worker {worker} is gone"
         if freed:
-            text += "; its job goes to another: " + ", ".join(job.label for job in freed)
+            text += "; its job will be leased again: " + ", ".join(job.label for job in freed)
         self._report({"event": "worker", "worker": worker, "alive": False, "text": text})
         if crashed:
-            self._later.post(lambda: self._vanished(worker, job), _MOMENT_S)
-        self._tell_quarantines()
+            self._delayed.post(lambda: self._record_end(worker, job), _STACKS_DELAY_S)
+        self._report_quarantines()
 
-    def _vanished(self, worker: str, job: Job | None) -> None:
-        """The record of a worker that went without a word: killed, crashed in C, or stuck."""
+    def _record_end(self, worker: str, job: Job | None) -> None:
+        """Write the crash record of a worker that ended without a report: it was killed, crashed in C, or was stuck."""
         if self.workers[worker]:
-            return  # it was cut off and is back
+            return  # it was disconnected and is connected again
         stacks = self._stacks(worker)
         record = {
             "what": "vanished",
@@ -165,11 +166,11 @@ class Desk:
             "last_said": self.counters.get(worker, {}),
             "stacks": stacks,
         }
-        why = stacks[0] if stacks else "without a word"
-        self._record(record, f"worker {worker} vanished ({why})")
+        cause = stacks[0] if stacks else "no stacks were written: it was killed or disconnected"
+        self._record(record, f"worker {worker} ended without a report ({cause})")
 
     def _stacks(self, worker: str) -> list[str]:
-        """First lines of what the worker's watchdog wrote, if anything."""
+        """The first lines that the worker's watchdog wrote; empty if it wrote nothing."""
         try:
             with crash_reports.stacks_of(self._folder, worker).open(errors="replace") as file:
                 return [line.rstrip() for line, _ in zip(file, range(_LINES), strict=False)]
@@ -180,46 +181,46 @@ class Desk:
         try:
             text += f"; {crash_reports.write(self._folder, record)}"
         except OSError as error:
-            text += f"; its record cannot be written: {error}"
+            text += f"; its crash record cannot be written: {error}"
         self._report({"event": "crash", "worker": record["worker"], "text": text})
 
-    def _tell_quarantines(self) -> None:
+    def _report_quarantines(self) -> None:
         with self._lock:
-            new = {key: cause for key, cause in self._board.quarantined.items() if key not in self._told}
-            self._told.update(new)
+            new = {key: cause for key, cause in self._scheduler.quarantined.items() if key not in self._reported}
+            self._reported.update(new)
             phases = {key[:2] for key in new}
-            hopeless = [phase for phase in phases if self._hopeless(*phase)]
+            failed = [phase for phase in phases if self._phase_failed(*phase)]
         for key, cause in new.items():
             name = "/".join(map(str, key))
-            text = f"variation {name} is quarantined, the run goes on without it: {cause}"
+            text = f"variation {name} is quarantined, the run continues without it: {cause}"
             self._report({"event": "quarantine", "identity": name, "cause": cause, "text": text})
-        for stage, round_ in hopeless:
-            found = self._board.blamed(stage, round_)
+        for stage, round_ in failed:
+            found = self._scheduler.quarantine_causes(stage, round_)
             self._fail(
-                f"{stage}/{round_}: not one trajectory was stored, and {len(found)} of its variations are quarantined; "
+                f"{stage}/{round_}: no trajectory was stored, and {len(found)} of its variations are quarantined; "
                 f"first: {found[0][1]}"
             )
 
-    def _hopeless(self, stage: str, round_: int) -> bool:
-        arrived, expected = self._board.progress(stage, round_)
-        return not arrived and (not expected or len(self._board.blamed(stage, round_)) >= HOPELESS)
+    def _phase_failed(self, stage: str, round_: int) -> bool:
+        arrived, expected = self._scheduler.progress(stage, round_)
+        return not arrived and (not expected or len(self._scheduler.quarantine_causes(stage, round_)) >= MAX_QUARANTINED)
 
-    def _beat(self, payload: bytes) -> None:
+    def _on_heartbeat(self, payload: bytes) -> None:
         kind, fields = wire.decode_message(payload)
         if kind == "worker":
-            self._hear(fields)
+            self._update_counters(fields)
 
-    def _hear(self, fields: dict[str, Any]) -> None:
-        """What a worker says of itself; a heartbeat may be overtaken, so counts never fall."""
+    def _update_counters(self, fields: dict[str, Any]) -> None:
+        """Keep a worker's newest counters; they never decrease, because heartbeats may arrive late."""
         worker = str(fields["worker"])
         with self._lock:
             before = self.counters.get(worker, {})
             counts = {name: max(kind(fields[name]), before.get(name, 0)) for name, kind in _COUNTS.items()}
             self.counters[worker] = {**before, **fields, **counts}
-            self._heard[worker] = time.monotonic()
-            self._board.reached(worker, str(fields.get("job")), int(fields.get("reached", 0)))
+            self._last_message[worker] = time.monotonic()
+            self._scheduler.reached(worker, str(fields.get("job")), int(fields.get("reached", 0)))
 
-    def _work(self, query: Query) -> None:
+    def _on_request(self, query: Query) -> None:
         try:
             kind, fields = wire.decode_message(query.payload, self._run.stream.max_message_bytes)
             query.reply(self._answer(kind, fields))
@@ -230,13 +231,14 @@ class Desk:
         worker = str(fields["worker"])
         if kind == "hello":
             if fields["version"] != icrl_dist.__version__:
-                raise ValueError(f"worker {worker} runs icrl-dist {fields['version']}, the learner {icrl_dist.__version__}")
+                theirs, ours = fields["version"], icrl_dist.__version__
+                raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
             if fields["code"] != version.digest():
-                theirs = str(fields["code"])[:8]
-                raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {version.digest()[:8]}")
+                theirs, ours = str(fields["code"])[:8], version.digest()[:8]
+                raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code")
             return wire.encode_message("hello", run=dumps(self._run))
         if kind == "ask":
-            self._hear(fields)
+            self._update_counters(fields)
             return self._lease(worker)
         if kind == "failed":
             stage, round_, task, first = fields["job"]
@@ -245,13 +247,13 @@ class Desk:
         if kind == "note":
             self._report({"event": "note", "text": f"worker {worker}: {str(fields['text'])[:200]}"})
             return wire.encode_message("noted")
-        raise ValueError(f"message kind {kind!r}: expected hello, ask, failed or note")
+        raise ValueError(f"message kind {kind!r} is not known; use hello, ask, failed or note")
 
     def _lease(self, worker: str) -> bytes:
         if self._finished.is_set():
             return wire.encode_message("stop")
         with self._lock:
-            lease = self._board.lease(worker, time.monotonic(), self._acting)
+            lease = self._scheduler.lease(worker, time.monotonic(), self._policy_version)
             if lease is None:
                 self._jobs.pop(worker, None)
                 return wire.encode_message("wait", seconds=0.1)
@@ -260,11 +262,11 @@ class Desk:
 
     def _failed(self, worker: str, name: tuple[str, int, int, int], record: dict[str, Any], file: str) -> None:
         with self._lock:
-            self._board.failed(worker, name, str(record["exception"]))
+            self._scheduler.job_failed(worker, name, str(record["exception"]))
         text = f"worker {worker}: job {record['job']} failed: {record['exception']}"
         kept = crash_reports.folder_of(self._folder) / Path(file).name
         if file and kept.is_file():
             self._report({"event": "crash", "worker": worker, "text": f"{text}; {kept}"})
         else:
             self._record({**record, "worker": Path(worker).name}, text)
-        self._tell_quarantines()
+        self._report_quarantines()

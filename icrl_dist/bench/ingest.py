@@ -1,6 +1,6 @@
-"""Durable trajectories a second: one worker process, the learner's own inbox and store, with and without fsync.
+"""Durable trajectories a second: one worker process, the learner's own ingest and store, with and without fsync.
 
-Everything of a run but the learning: the worker encodes and sends on credit, the inbox decodes,
+Everything of a run but the learning: the worker encodes and sends on credit, the ingest decodes,
 checks, appends to the store, and answers once the store says that it is on disk.
 """
 
@@ -31,7 +31,7 @@ from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Job, Spec, Trajectory
-from learner.ingest import Inbox
+from learner.ingest import Ingest
 
 CREDITS = StreamConfig().credits
 """A run's own default."""
@@ -131,12 +131,12 @@ def fsync_p50_ms(folder: Path, count: int = 60) -> float:
 
 
 class _Learner:
-    """The learner's side of the stream: an inbox, and a store of its own for every turn."""
+    """The learner's side of the stream: an ingest, and a store of its own for every turn."""
 
     def __init__(self, link: ZenohLink, folder: Path, worker: subprocess.Popen[bytes]) -> None:
         self._folder, self._worker = folder, worker
         self._numbers = itertools.count()
-        self._inbox: Inbox | None = None
+        self._ingest: Ingest | None = None
         self._failure: BaseException | None = None
         self._idle: queue.SimpleQueue[Query] = queue.SimpleQueue()
         self.stored = self.commits = 0
@@ -150,23 +150,23 @@ class _Learner:
         folder = self._folder / f"turn-{next(self._numbers)}"
         stored: list[float] = []
         with contextlib.closing(Store(folder, durable=durable)) as store:
-            self._inbox = inbox = self._open(store, stored)
+            self._ingest = ingest = self._open(store, stored)
             began = time.monotonic()
             self._waiting.reply(b"%f" % seconds)
             self._waiting = self._next_request()
-            inbox.close()
+            ingest.close()
         shutil.rmtree(folder)  # what was not fsynced need not be written either, in the next one's time
-        if inbox.drops:
-            raise RuntimeError(f"the inbox dropped {dict(inbox.drops)}: this measures nothing")
+        if ingest.drops:
+            raise RuntimeError(f"the ingest dropped {dict(ingest.drops)}: this measures nothing")
         if durable:
             self.stored += len(stored)
-            self.commits += inbox.commits
+            self.commits += ingest.commits
         return len(stored) / (stored[-1] - began)
 
     def stop(self) -> None:
         self._waiting.reply(b"0")
 
-    def _open(self, store: Store, stored: list[float]) -> Inbox:
+    def _open(self, store: Store, stored: list[float]) -> Ingest:
         one = example()
         size, actions = one.observations.shape[1], one.labels.shape[1]
         spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))
@@ -175,11 +175,11 @@ class _Learner:
         def note(_: Trajectory) -> None:
             stored.append(time.monotonic())
 
-        return Inbox(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, self._fail)
+        return Ingest(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, self._fail)
 
     def _put(self, query: Query) -> None:
-        assert self._inbox is not None
-        self._inbox.put(query)
+        assert self._ingest is not None
+        self._ingest.put(query)
 
     def _fail(self, error: BaseException) -> None:
         self._failure = error

@@ -1,6 +1,6 @@
 """The rates that ``icrl-dist plan`` reckons with: a little of each part of a run, timed on this machine.
 
-Everything measured is the run's own code at the run's own sizes: a job, the inbox, steps of the
+Everything measured is the run's own code at the run's own sizes: a job, the ingest, steps of the
 fit, episodes of the evaluation.  What is too long is timed in part and continued.
 """
 
@@ -40,12 +40,12 @@ from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.training import batches, fit
 from icrl_dist.types import Job, Trajectory
-from learner.ingest import Inbox
+from learner.ingest import Ingest
 
 BUDGET_S = 8.0
 """A part that takes longer is timed for so long and continued in thought."""
 _ENOUGH = 64
-"""Trajectories that the inbox is timed with, at least so often as to fill a second."""
+"""Trajectories that the ingest is timed with, at least so often as to fill a second."""
 
 Tell = Callable[[str], None]
 
@@ -74,7 +74,7 @@ def _measure(run: Run, name: str, tell: Tell, budget_s: float) -> Rates:
             tell(f"{phase.stage}: a job")
             torch.set_num_threads(1)
             seen[phase.stage] = _job(run, asked[0], model, budget_s)
-            tell(f"{phase.stage}: the inbox")
+            tell(f"{phase.stage}: the ingest")
             torch.set_num_threads(1)
             ingest = min(ingest, _ingest(run, asked[0], seen[phase.stage][1]))
             tell(f"{phase.stage}: steps of the fit")
@@ -205,7 +205,7 @@ def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
     acknowledged: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     few = sample[: min(len(sample), _ENOUGH)]
     with tempfile.TemporaryDirectory(dir=_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
-        inbox = Inbox(
+        learner_ingest = Ingest(
             store,
             spec,
             run.stream.max_message_bytes,
@@ -215,7 +215,7 @@ def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
             acknowledged.put,
         )
         with ZenohLink.listen("tcp/127.0.0.1:0") as link, ZenohLink.connect(link.endpoints[0], 10.0) as theirs:
-            link.serve(keys.data, inbox.put)
+            link.serve(keys.data, learner_ingest.put)
             sender = CreditSender(theirs, keys.data, run.stream.credits, run.stream.reply_timeout_s)
             began, sent = time.perf_counter(), 0
             while time.perf_counter() - began < 1.0:
@@ -226,7 +226,7 @@ def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
             sender.drain(60.0)
             rate = sent / (time.perf_counter() - began)
             sender.close()
-        inbox.close()
+        learner_ingest.close()
         if not acknowledged.empty():
             raise acknowledged.get()
     return rate

@@ -102,7 +102,7 @@ class _Heard:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            if found := re.match(r"worker (\S+) is gone; its job goes to another: (\S+)", line):
+            if found := re.match(r"worker (\S+) is gone; its job will be leased again: (\S+)", line):
                 with self._changed:
                     self._freed.append((found[1], found[2]))
                     self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""How many workers one learner bears: 1, 8, 64, 256 simulated ones against the learner's own inbox and store.
+"""How many workers one learner bears: 1, 8, 64, 256 simulated ones against the learner's own ingest and store.
 
 A simulated worker is a session of its own over a real link, with a run's credits, which replays
 recorded trajectories as fast as they are acknowledged.  Several share a process, so that two
@@ -37,7 +37,7 @@ from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.endpoints import parse
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Job, Spec, Trajectory
-from learner.ingest import Inbox
+from learner.ingest import Ingest
 
 WORKERS = (1, 8, 64, 256)
 PROCESSES = 4
@@ -151,8 +151,8 @@ def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
     stored: list[float] = []
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     with contextlib.closing(Store(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
-        inbox = _inbox(store, count, stored, failures)
-        link.serve(KEYS.data, inbox.put)
+        learner_ingest = _open_ingest(store, count, stored, failures)
+        link.serve(KEYS.data, learner_ingest.put)
         before = process.memory_info().rss
         with _workers(link.endpoints[0], count, seconds) as others:
             connected, cpu, began = process.memory_info().rss, _cpu(process), time.monotonic()
@@ -164,7 +164,7 @@ def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
                 most = max(most, process.memory_info().rss)
             said = [json.loads(_answer(one)) for one in others]
             used, took = _cpu(process) - cpu, time.monotonic() - began
-        inbox.close()
+        learner_ingest.close()
         if not failures.empty():
             raise failures.get()
     taken = sorted(itertools.chain.from_iterable(one["taken"] for one in said))
@@ -173,11 +173,11 @@ def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
         "ingest_per_s": round(len(stored) / (stored[-1] - began), 1),
         "ack_p50_ms": round(1e3 * statistics.median(taken), 1),
         "ack_p99_ms": round(1e3 * taken[math.ceil(0.99 * (len(taken) - 1))], 1),
-        "busy": inbox.drops["busy"],
+        "busy": learner_ingest.drops["busy"],
         "resent": sum(one["resent"] for one in said),
-        "duplicates": inbox.drops["duplicate"],
+        "duplicates": learner_ingest.drops["duplicate"],
         "trajectories": len(stored),
-        "trajectories_an_fsync": round(len(stored) / inbox.commits, 1),
+        "trajectories_an_fsync": round(len(stored) / learner_ingest.commits, 1),
         "mb": round(most / 1e6, 1),
         "kb_a_worker": round((connected - before) / 1e3 / count, 1),
         "learner_cores": round(used / took, 2),
@@ -189,7 +189,7 @@ def _cpu(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def _inbox(store: Store, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Inbox:
+def _open_ingest(store: Store, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
     one = example()
     size, actions = one.observations.shape[1], one.labels.shape[1]
     spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))
@@ -198,7 +198,7 @@ def _inbox(store: Store, count: int, stored: list[float], failures: queue.Simple
     def note(_: Trajectory) -> None:
         stored.append(time.monotonic())
 
-    return Inbox(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, failures.put)
+    return Ingest(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, failures.put)
 
 
 @contextlib.contextmanager

@@ -217,7 +217,7 @@ def local_ray() -> Iterator[Any]:
 
     if ray.is_initialized():
         raise RuntimeError("a Ray session is open in this process: run this benchmark in one of its own")
-    local.begin(ray, _log.warning, address="local", num_cpus=2, configure_logging=False)
+    local.start_ray(ray, _log.warning, address="local", num_cpus=2, configure_logging=False)
     try:
         yield ray
     finally:

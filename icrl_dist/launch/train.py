@@ -150,7 +150,7 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
             thread.start()
             try:
                 result = service.run()
-                service.desk.finish()
+                service.worker_api.finish()
                 return result
             except Interrupted:
                 raise TrainInterrupted from None

@@ -114,9 +114,7 @@ def check_suite(run: Run, suite: str) -> None:
     """Raises ConfigError if the run's problem or method lacks a part that the suite needs."""
     problem, method = registry.of(run), methods.of(run)
     if suite == "offline" and problem.exact is None:
-        raise ConfigError(
-            f"--suite offline: {run.problem} has no exact answers for expert data; use --suite online"
-        )
+        raise ConfigError(f"--suite offline: {run.problem} has no exact answers for expert data; use --suite online")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
 

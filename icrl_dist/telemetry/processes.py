@@ -14,7 +14,7 @@ def is_learner(process: psutil.Process) -> bool:
 
 def is_worker(process: psutil.Process, spare: bool = False) -> bool:
     """Whether this is a worker at work, or with ``spare`` also one that waits to replace another."""
-    return ("_Host" if spare else "_Host.work") in _words(process)
+    return ("WorkerActor" if spare else "WorkerActor.work") in _words(process)
 
 
 def _words(process: psutil.Process) -> str:

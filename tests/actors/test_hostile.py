@@ -1,4 +1,4 @@
-"""Real worker processes and an environment that is hostile to them: in one variation it raises, dies or hangs."""
+"""Real worker processes with an environment in which one variation raises, kills its process, or hangs."""
 
 import contextlib
 import gc
@@ -12,14 +12,14 @@ from pathlib import Path
 
 import psutil
 import pytest
+from icrl_dist.methods.recipes import METHODS
 
 from actors.fleet import Fleet, FleetFailed
-from icrl_dist.methods.recipes import METHODS
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
-from learner.scheduler import Board
-from learner.worker_api import Desk
+from learner.scheduler import LeaseScheduler
+from learner.worker_api import WorkerAPI
 from tests.e2e.training import wait_for
 
 KEYS = Keys("test")
@@ -37,19 +37,19 @@ with ZenohLink.connect(endpoint, timeout_s=30.0) as link:
 """
 
 
-class Learner:
-    """A Board and a Desk on a real link; what arrives is kept by identity."""
+class LearnerSide:
+    """A LeaseScheduler and a WorkerAPI on a real link; received trajectories are kept by identity."""
 
     def __init__(self, run, folder, lease_s):
         self.run, self.folder, self.stored, self.events, self.failures = run, folder, {}, [], []
         self.jobs = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])[:2]
         self.everything = {i for job in self.jobs for i in job.identities()}
         self.lock = threading.Lock()
-        self.board = Board(lease_s, floor_s=lease_s)
-        self.board.open(self.jobs, lambda job: ())
+        self.scheduler = LeaseScheduler(lease_s, floor_s=lease_s)
+        self.scheduler.open(self.jobs, lambda job: ())
         self.link = ZenohLink.listen("tcp/127.0.0.1:0")
-        arguments = self.link, KEYS, self.board, self.lock, self.events.append, self.failures.append
-        self.desk = Desk(run, folder, *arguments)
+        arguments = self.link, KEYS, self.scheduler, self.lock, self.events.append, self.failures.append
+        self.worker_api = WorkerAPI(run, folder, *arguments)
         self.link.serve(KEYS.data, self.take)
 
     @property
@@ -60,23 +60,23 @@ class Learner:
         for one in batching.split(query, 1 << 20):
             identity = wire.decode_trajectory(one.payload, 1 << 20).identity
             with self.lock:
-                if self.board.wants(identity):
+                if self.scheduler.pending_job(identity):
                     assert identity not in self.stored
                     self.stored[identity] = one.payload
-                    self.board.received(identity, time.monotonic())
-                    done = self.board.done("pretrain", 0)
+                    self.scheduler.received(identity, time.monotonic())
+                    done = self.scheduler.done("pretrain", 0)
                 else:
-                    self.board.repeated(identity, time.monotonic())
+                    self.scheduler.repeated(identity, time.monotonic())
                     done = False
             one.reply(b"stored")
             if done:
-                self.desk.finish()
+                self.worker_api.finish()
 
     def done(self):
         with self.lock:
-            done = self.board.done("pretrain", 0)
+            done = self.scheduler.done("pretrain", 0)
         if done:
-            self.desk.finish()
+            self.worker_api.finish()
         return done
 
     def events_of(self, kind):
@@ -86,17 +86,17 @@ class Learner:
         return [json.loads(path.read_text()) for path in sorted((self.folder / "crashes").glob("*.json"))]
 
     def close(self):
-        self.desk.close()
+        self.worker_api.close()
         self.link.close()
 
 
 @pytest.fixture
 def learner(small_run, tmp_path):
-    """``learner(lease_s)``: the learner's side of a phase of two jobs."""
+    """``learner(lease_s)``: the learner side of a phase with two jobs."""
     with contextlib.ExitStack() as stack:
 
         def made(lease_s):
-            one = Learner(small_run, tmp_path, lease_s)
+            one = LearnerSide(small_run, tmp_path, lease_s)
             stack.callback(one.close)
             return one
 
@@ -105,11 +105,11 @@ def learner(small_run, tmp_path):
 
 @pytest.fixture
 def hostile(small_run, monkeypatch):
-    """``hostile(deed)``: from now on, processes that are started find the second task's second variation hostile."""
+    """``hostile(failure)``: in processes started later, the second variation of the second task fails in this way."""
 
-    def begin(deed):
+    def begin(failure):
         job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
-        monkeypatch.setenv("HOSTILE", deed)
+        monkeypatch.setenv("HOSTILE", failure)
         monkeypatch.setenv("HOSTILE_VARIATION", repr(job.variations[4]))
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HOSTILE), str(HOSTILE.parents[2])]))
 
@@ -121,7 +121,7 @@ CULPRIT = "pretrain/0/1/1"
 
 @pytest.fixture
 def worker(learner):
-    """``worker(learner, name)``: a worker in a process of its own; none outlives the test."""
+    """``worker(learner, name)``: a worker in its own process, which ends with the test at the latest."""
     with contextlib.ExitStack() as stack:
 
         def start(learner, name):
@@ -135,7 +135,7 @@ def worker(learner):
         yield start
 
 
-def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(learner, hostile, worker):
+def test_a_variation_that_raises_is_quarantined_and_its_worker_continues(learner, hostile, worker):
     hostile("raise")
     learner = learner(60.0)
     process = worker(learner, "w0")
@@ -145,7 +145,7 @@ def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(lea
     assert {i for i in learner.everything if i not in learner.stored} == {
         i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")
     }
-    ((name, cause),) = learner.board.blamed()
+    ((name, cause),) = learner.scheduler.quarantine_causes()
     assert name == CULPRIT and cause.startswith("ZeroDivisionError: the room broke (sitecustomize.py:")
     assert [event["identity"] for event in learner.events_of("quarantine")] == [CULPRIT]
     assert [record["job"] for record in learner.records()] == ["pretrain/0/0"] * 2 + [CULPRIT]
@@ -153,21 +153,23 @@ def test_a_variation_that_raises_is_quarantined_by_one_worker_which_lives_on(lea
     assert sorted(path.name for path in (learner.folder / "crashes").iterdir()) == [f"w0-{n}.json" for n in (1, 2, 3)]
 
 
-@pytest.mark.parametrize(("deed", "function"), [("sleep", "sleep_for_ever"), ("hold", "hold_the_interpreter_in_c")])
-def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, hostile, worker, monkeypatch, deed, function):
-    hostile(deed)
+@pytest.mark.parametrize(("failure", "function"), [("sleep", "sleep_for_ever"), ("hold", "hold_the_interpreter_in_c")])
+def test_a_stuck_worker_writes_its_stacks_and_ends_and_another_does_its_job(
+    learner, hostile, worker, monkeypatch, failure, function
+):
+    hostile(failure)
     learner = learner(5.0)
     process = worker(learner, "w0")
     _, log = process.communicate(timeout=150)
     assert process.returncode == 1, log
     stacks = (learner.folder / "crashes" / "w0.stacks").read_text()
     assert stacks.startswith("Timeout (0:00:0") and f" in {function}" in stacks and " in random_context" in stacks
-    assert (" in _bark" in stacks) is (deed == "sleep"), "the thread of Python's writes them wherever it can"
+    assert (" in _dump_and_exit" in stacks) is (failure == "sleep"), "the Python thread writes them whenever it can run"
     wait_for(lambda: learner.events_of("crash"), "the record")
     (record,) = learner.records()
     assert (record["what"], record["job"]) == ("vanished", "pretrain/0/0")
     assert record["last_said"]["episodes"] == 0
-    if deed == "sleep":  # the heartbeat went on; nothing does while the interpreter's lock is held
+    if failure == "sleep":  # heartbeats continue, but not while another thread holds the interpreter lock
         assert record["last_said"]["job"] == "pretrain/0/0" and record["last_said"]["memory_mb"] > 10
     assert any(function in line for line in record["stacks"])
     monkeypatch.delenv("HOSTILE")
@@ -175,11 +177,11 @@ def test_a_stuck_worker_says_where_and_ends_and_another_does_its_job(learner, ho
     wait_for(learner.done, "the phase")
     _, log = process.communicate(timeout=100)
     assert process.returncode == 0, log
-    assert set(learner.stored) == learner.everything and not learner.board.quarantined
-    assert not (learner.folder / "crashes" / "w0-1.stacks").exists(), "nothing stood in it"
+    assert set(learner.stored) == learner.everything and not learner.scheduler.quarantined
+    assert not (learner.folder / "crashes" / "w0-1.stacks").exists(), "it was empty"
 
 
-def test_a_crash_in_c_leaves_its_stacks(learner, hostile, worker):
+def test_a_crash_in_c_writes_the_stacks(learner, hostile, worker):
     hostile("segfault")
     learner = learner(60.0)
     process = worker(learner, "w0")
@@ -193,7 +195,7 @@ def test_a_crash_in_c_leaves_its_stacks(learner, hostile, worker):
 
 @pytest.fixture
 def fleet():
-    """``fleet(actors, restarts)``: a real one, on as many cores as there are."""
+    """``fleet(actors, restarts)``: a real fleet, on any number of cores."""
     with contextlib.ExitStack() as stack:
 
         def made(actors, restarts, **options):
@@ -204,12 +206,12 @@ def fleet():
         yield made
 
 
-# What Ray had started before it was started again is ended, but not by the objects that it forgets.
-FORGETFUL = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+# The processes of a failed start of Ray are ended, but Ray's own objects for them are only garbage-collected.
+LEFT_OBJECTS = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
 def kill_rays_node_once():
-    """As soon as there is one in this process's family."""
+    """Kill Ray's node process as soon as this process has one among its descendants."""
 
     def killed():
         for process in psutil.Process().children(recursive=True):
@@ -222,35 +224,37 @@ def kill_rays_node_once():
     wait_for(killed, "Ray's node")
 
 
-@FORGETFUL
+@LEFT_OBJECTS
 def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_others_finish(learner, hostile, fleet):
     hostile("kill")
     learner, fleet, notes = learner(60.0), fleet(1, 3), []
     gc.collect()
     fleet.start(learner.endpoint, "test", learner.folder)
-    wait_for(lambda: (fleet.watch(notes.append, 1), learner.done())[1], "the rest of the phase", 200)  # 1: keep a spare
+    wait_for(
+        lambda: (fleet.watch(notes.append, 1), learner.done())[1], "the rest of the phase", 200
+    )  # progress 1: a spare is kept
     wait_for(lambda: not fleet.watch(notes.append, 0), "the worker's end")
     assert (fleet.deaths, len(notes)) == (3, 3) and all("starting it again" in note for note in notes)
     missing = learner.everything - set(learner.stored)
     assert missing == {i for i in learner.everything if str(i).startswith(f"{CULPRIT}/")}
-    ((name, cause),) = learner.board.blamed()
+    ((name, cause),) = learner.scheduler.quarantine_causes()
     assert (name, cause) == (CULPRIT, "worker w0-2 died")
     assert [event["identity"] for event in learner.events_of("quarantine")] == [CULPRIT]
     wait_for(lambda: len(learner.events_of("crash")) == 3, "the records")
     assert sorted(record["job"] for record in learner.records()) == ["pretrain/0/0", "pretrain/0/0", CULPRIT]
 
 
-@FORGETFUL
-def test_a_fleet_comes_up_though_rays_node_died_and_gives_up_on_a_worker_that_keeps_dying(learner, hostile, fleet):
+@LEFT_OBJECTS
+def test_a_fleet_starts_although_rays_node_died_and_fails_when_a_worker_dies_repeatedly(learner, hostile, fleet):
     hostile("exit")
     killer, notes = threading.Thread(target=kill_rays_node_once), []
     killer.start()
     learner, fleet = learner(60.0), fleet(1, 1, note=notes.append)
     killer.join()
     gc.collect()
-    tries = len(notes)  # a busy machine may need one more
+    tries = len(notes)  # a busy machine may need one more attempt
     assert tries >= 1 and all(": starting it again, " in note for note in notes)
     fleet.start(learner.endpoint, "test", learner.folder)
     with pytest.raises(FleetFailed, match="worker w0 died 2 times without progress"):
-        wait_for(lambda: fleet.watch(notes.append, 7) and False, "giving up", 100)
+        wait_for(lambda: fleet.watch(notes.append, 7) and False, "the failure of the fleet", 100)
     assert (fleet.deaths, len(notes)) == (2, tries + 1)

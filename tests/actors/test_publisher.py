@@ -1,12 +1,12 @@
-"""What a worker shows: few messages, every trajectory in one of them, some episodes whole."""
+"""A worker publishes few messages, every trajectory once, and some complete episodes."""
 
 import itertools
 import threading
 
 import pytest
 
-from actors import publisher
-from actors.publisher import Samples, Showing
+from actors import publisher as publisher_module
+from actors.publisher import EpisodeSampler, TrajectoryPublisher
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys
 from icrl_dist.types import Identity
@@ -15,15 +15,15 @@ from tests.monitor.messages import trajectory
 KEYS = Keys("test")
 
 
-class Heard:
-    """A link that keeps what is published, and the clock that the worker looks at."""
+class RecordingLink:
+    """Keeps the published messages; ``now`` replaces the clock of the publisher."""
 
     def __init__(self, monkeypatch):
         self.messages, self.now = [], 0.0
-        monkeypatch.setattr(publisher.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(publisher_module.time, "monotonic", lambda: self.now)
 
     def publish(self, key, payload, droppable):
-        assert droppable, "nobody who looks on may stop a worker"
+        assert droppable, "a viewer must not be able to block a worker"
         kind, fields = wire.decode_message(payload)
         if kind == "trajectories":
             assert key == KEYS.monitor("trajectories/w0")
@@ -31,60 +31,60 @@ class Heard:
 
 
 @pytest.fixture
-def heard(monkeypatch):
-    return Heard(monkeypatch)
+def link(monkeypatch):
+    return RecordingLink(monkeypatch)
 
 
-def test_the_first_at_once_the_next_together_the_last_when_flushed(heard):
-    shown = Showing(heard, KEYS, "w0")
+def test_the_first_is_sent_at_once_the_next_together_the_rest_by_flush(link):
+    publisher = TrajectoryPublisher(link, KEYS, "w0")
     for trial in range(25):
-        heard.now = 0.01 * trial
-        shown.show(trajectory(f"adapt/0/3/1/{trial}"))
-    assert [len(one) for one in heard.messages] == [1, 10, 10]
-    shown.flush()
-    shown.flush()
-    assert [len(one) for one in heard.messages] == [1, 10, 10, 4]
-    assert list(itertools.chain(*heard.messages)) == [f"adapt/0/3/1/{trial}" for trial in range(25)]
+        link.now = 0.01 * trial
+        publisher.publish(trajectory(f"adapt/0/3/1/{trial}"))
+    assert [len(one) for one in link.messages] == [1, 10, 10]
+    publisher.flush()
+    publisher.flush()
+    assert [len(one) for one in link.messages] == [1, 10, 10, 4]
+    assert list(itertools.chain(*link.messages)) == [f"adapt/0/3/1/{trial}" for trial in range(25)]
 
 
-def test_whoever_ends_few_episodes_tells_of_each_at_once(heard):
-    shown = Showing(heard, KEYS, "w0")
+def test_rare_episodes_are_each_sent_at_once(link):
+    publisher = TrajectoryPublisher(link, KEYS, "w0")
     for trial in range(3):
-        heard.now = 0.2 * trial
-        shown.show(trajectory(f"adapt/0/3/1/{trial}"))
-        assert len(heard.messages) == trial + 1
+        link.now = 0.2 * trial
+        publisher.publish(trajectory(f"adapt/0/3/1/{trial}"))
+        assert len(link.messages) == trial + 1
 
 
-def test_a_message_holds_only_so_many(heard):
-    shown = Showing(heard, KEYS, "w0")
+def test_a_message_has_a_maximum_of_trajectories(link):
+    publisher = TrajectoryPublisher(link, KEYS, "w0")
     for trial in range(600):
-        shown.show(trajectory(f"adapt/0/3/1/{trial}"))
-    assert [len(one) for one in heard.messages] == [1, 256, 256]
+        publisher.publish(trajectory(f"adapt/0/3/1/{trial}"))
+    assert [len(one) for one in link.messages] == [1, 256, 256]
 
 
-def test_two_threads_lose_and_repeat_nothing(heard):
-    shown = Showing(heard, KEYS, "w0")
+def test_with_two_threads_each_trajectory_is_sent_once(link):
+    publisher = TrajectoryPublisher(link, KEYS, "w0")
     ended = threading.Event()
 
     def beat():
         while not ended.is_set():
-            shown.flush()
+            publisher.flush()
 
     beating = threading.Thread(target=beat)
     beating.start()
     for trial in range(500):
-        shown.show(trajectory(f"adapt/0/3/1/{trial}"))
+        publisher.publish(trajectory(f"adapt/0/3/1/{trial}"))
     ended.set()
     beating.join()
-    shown.flush()
-    assert list(itertools.chain(*heard.messages)) == [f"adapt/0/3/1/{trial}" for trial in range(500)]
+    publisher.flush()
+    assert list(itertools.chain(*link.messages)) == [f"adapt/0/3/1/{trial}" for trial in range(500)]
 
 
-def test_shown_episodes_are_few_and_every_variation_has_its_turn():
-    samples, shown = Samples(per_s=4.0, burst=8, again_s=2.0), []
+def test_selected_episodes_are_few_and_every_variation_has_its_turn():
+    sampler, selected = EpisodeSampler(per_s=4.0, burst=8, again_s=2.0), []
     for trial in range(60):  # 30 variations end an episode together, four times a second
         now = 0.25 * trial
-        shown += [v for v in range(30) if samples.take(Identity("adapt", 0, 0, v, trial), now)]
-    assert len(shown) <= 8 + 4 * 15
-    assert sorted(shown[:30]) == list(range(30))
-    assert len(shown) > 38, "and then the next turn"
+        selected += [v for v in range(30) if sampler.take(Identity("adapt", 0, 0, v, trial), now)]
+    assert len(selected) <= 8 + 4 * 15
+    assert sorted(selected[:30]) == list(range(30))
+    assert len(selected) > 38, "the next turn has started"

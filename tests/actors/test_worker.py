@@ -38,18 +38,18 @@ def weights(run, version):
     return Weights(version, arrays, wire.weights_digest(arrays))
 
 
-class Learner:
-    """Hands out a list of answers, keeps what arrives."""
+class ScriptedLearner:
+    """Answers requests for jobs from a list, and keeps the requests and trajectories."""
 
     def __init__(self, link, run, answers):
-        self.run, self.answers, self.asked, self.stored = run, list(answers), [], []
+        self.run, self.answers, self.requests, self.stored = run, list(answers), [], []
         self.refused = set()
         link.serve(KEYS.work, self.work)
         link.serve(KEYS.data, self.data)
 
     def work(self, query):
         kind, fields = wire.decode_message(query.payload)
-        self.asked.append((kind, fields))
+        self.requests.append((kind, fields))
         if kind == "hello":
             query.reply(wire.encode_message("hello", run=dumps(self.run)))
         elif kind == "failed":
@@ -74,30 +74,30 @@ def job_message(job):
 STOP = wire.encode_message("stop")
 
 
-def test_a_worker_does_its_job_says_who_it_is_and_stops(hub, small_run):
+def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
     job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[2]
-    learner = Learner(hub(), small_run, [wire.encode_message("wait", seconds=0.01), job_message(job), STOP])
+    learner = ScriptedLearner(hub(), small_run, [wire.encode_message("wait", seconds=0.01), job_message(job), STOP])
     seen = []
     watching = hub()
     watching.subscribe(KEYS.monitor_all, lambda key, payload: seen.append(wire.decode_message(payload)))
     Worker(hub(), "test", "w7").run()
     assert [t.identity for t in learner.stored] == list(job.identities())
     assert {t.worker for t in learner.stored} == {"w7"}
-    assert learner.asked[0][1]["version"] == icrl_dist.__version__
-    assert [kind for kind, _ in learner.asked] == ["hello", "ask", "ask", "ask"]
-    told = lambda: [  # noqa: E731
-        row["identity"] for kind, said in list(seen) if kind == "trajectories" for row in monitor_messages.rows(said)
+    assert learner.requests[0][1]["version"] == icrl_dist.__version__
+    assert [kind for kind, _ in learner.requests] == ["hello", "ask", "ask", "ask"]
+    published = lambda: [  # noqa: E731
+        row["identity"] for kind, fields in list(seen) if kind == "trajectories" for row in monitor_messages.rows(fields)
     ]
-    eventually(lambda: told() == [str(i) for i in job.identities()])  # the mailbox has a thread of its own
+    eventually(lambda: published() == [str(i) for i in job.identities()])  # messages are delivered on another thread
 
 
-def test_a_job_that_raises_is_reported_and_the_worker_goes_on(hub, small_run):
+def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
     phase = METHODS["icag"].phases(small_run)[0]
     good, other = METHODS["icag"].ask(small_run, phase)[:2]
     bad = dataclasses.replace(other, settings=())
-    learner = Learner(hub(), small_run, [job_message(bad), job_message(good), STOP])
+    learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     Worker(hub(), "test", "w0").run()
-    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert report["job"] == list(bad.name) and report["file"] == ""
     record = report["record"]
     assert "KeyError" in record["exception"] and ".py:" in record["exception"]
@@ -109,7 +109,7 @@ def test_a_job_that_raises_is_reported_and_the_worker_goes_on(hub, small_run):
     assert len(learner.stored) == len(list(good.identities()))
 
 
-def test_the_record_names_the_trajectory_that_was_under_way(hub, small_run, monkeypatch, tmp_path):
+def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, small_run, monkeypatch, tmp_path):
     job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
     real = jobs.do
 
@@ -120,41 +120,41 @@ def test_the_record_names_the_trajectory_that_was_under_way(hub, small_run, monk
         raise ZeroDivisionError("\udcff the room broke")
 
     monkeypatch.setattr(jobs, "do", breaks_at_the_third)
-    learner = Learner(hub(), small_run, [job_message(job), STOP])
+    learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     monkeypatch.setattr(worker_module, "Watchdog", lambda run, name: Watchdog(None, name))  # pytest's process has one
-    monkeypatch.setattr(worker_module._log, "exception", lambda *words: None)  # not every log can hold such words
+    monkeypatch.setattr(worker_module._log, "exception", lambda *texts: None)  # a log file may not accept this text
     Worker(hub(), "test", "w3", folder=tmp_path).run()
-    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert [t.identity for t in learner.stored] == list(job.identities())[:2]
     assert report["record"]["identity"] == str(list(job.identities())[2])
     assert report["file"] == "w3-1.json"
     assert json.loads((tmp_path / "crashes" / "w3-1.json").read_text()) == report["record"]
 
 
-def test_a_refused_trajectory_fails_its_own_job_and_no_other(hub, small_run):
+def test_a_refused_trajectory_fails_its_own_job_only(hub, small_run):
     bad, good = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[:2]
-    learner = Learner(hub(), small_run, [job_message(bad), job_message(good), STOP])
+    learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     learner.refused = set(list(bad.identities())[:5])
     Worker(hub(), "test", "w0").run()
-    (report,) = [fields for kind, fields in learner.asked if kind == "failed"]
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert report["job"] == list(bad.name)
     assert "Refused: not-finite: pretrain/0/0/0/0" in report["record"]["exception"] and report["record"]["identity"] == ""
     assert {t.identity for t in learner.stored} >= set(good.identities())
 
 
-def test_every_ask_says_what_was_done_and_heartbeats_go_on_meanwhile(hub, small_run, monkeypatch):
+def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, small_run, monkeypatch):
     monkeypatch.setattr(worker_module, "HEARTBEAT_S", 0.01)
     job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
-    heard = []
+    heartbeats = []
     beaten = threading.Event()
     watching = hub()
 
-    def hear(_, payload):
-        heard.append(wire.decode_message(payload))
-        if sum(fields["job"] == job.label for _, fields in heard) == 3:
+    def receive(_, payload):
+        heartbeats.append(wire.decode_message(payload))
+        if sum(fields["job"] == job.label for _, fields in heartbeats) == 3:
             beaten.set()
 
-    watching.subscribe(KEYS.heartbeats, hear)
+    watching.subscribe(KEYS.heartbeats, receive)
     real = jobs.do
 
     def stuck_for_three_beats(job, policies, worker, *_):
@@ -162,15 +162,15 @@ def test_every_ask_says_what_was_done_and_heartbeats_go_on_meanwhile(hub, small_
         return real(job, policies, worker)
 
     monkeypatch.setattr(jobs, "do", stuck_for_three_beats)
-    learner = Learner(hub(), small_run, [job_message(job), STOP])
+    learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     Worker(hub(), "test", "w0").run()
-    asks = [fields for kind, fields in learner.asked if kind == "ask"]
+    asks = [fields for kind, fields in learner.requests if kind == "ask"]
     count = len(list(job.identities()))
-    said = [{name: ask[name] for name in ("episodes", "steps", "trajectories", "resent")} for ask in asks]
-    assert said[0] == dict.fromkeys(said[0], 0)
-    assert said[1] == {"episodes": count, "steps": count * small_run.darkroom.horizon, "trajectories": count, "resent": 0}
-    assert {kind for kind, _ in heard} == {"worker"}
-    assert all(fields["worker"] == "w0" and fields["memory_mb"] > 10 and fields["waited_s"] >= 0 for _, fields in heard)
+    counters = [{name: ask[name] for name in ("episodes", "steps", "trajectories", "resent")} for ask in asks]
+    assert counters[0] == dict.fromkeys(counters[0], 0)
+    assert counters[1] == {"episodes": count, "steps": count * small_run.darkroom.horizon, "trajectories": count, "resent": 0}
+    assert {kind for kind, _ in heartbeats} == {"worker"}
+    assert all(fields["worker"] == "w0" and fields["memory_mb"] > 10 and fields["waited_s"] >= 0 for _, fields in heartbeats)
 
 
 def test_a_refused_hello_ends_the_worker_with_the_reason(hub):
@@ -179,7 +179,7 @@ def test_a_refused_hello_ends_the_worker_with_the_reason(hub):
         Worker(hub(), "test", "w0").run()
 
 
-def test_a_worker_gives_up_when_the_learner_stays_away(hub):
+def test_a_worker_ends_when_the_learner_does_not_answer_for_long(hub):
     with pytest.raises(Unanswered):
         Worker(hub(), "test", "w0", patience_s=0.3).run()
 
@@ -192,13 +192,13 @@ def committed_run(small_run):
 
 
 def always(monkeypatch):
-    """Let every belief be read."""
+    """Publish the belief at every decision."""
     monkeypatch.setattr(beliefs, "PERIOD_S", 0.0)
     monkeypatch.setattr(beliefs, "SHARE", float("inf"))
 
 
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
-def test_whoever_looks_on_sees_beliefs_and_changes_no_byte(committed_run, deploy, monkeypatch):
+def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monkeypatch):
     always(monkeypatch)
     round_0 = METHODS["icaa"].phases(committed_run)[1]
     job = METHODS["icaa"].ask(committed_run, round_0)[0]
@@ -207,71 +207,71 @@ def test_whoever_looks_on_sees_beliefs_and_changes_no_byte(committed_run, deploy
 
     def work(topic):
         network = MemoryHub().link
-        learner = Learner(network(), committed_run, [job_message(job), STOP])
+        learner = ScriptedLearner(network(), committed_run, [job_message(job), STOP])
         latest = wire.encode_weights(weights(committed_run, 0))
         network().serve(KEYS.weights_latest, lambda query: query.reply(latest))
-        heard = []
-        network().subscribe(KEYS.monitor(topic), lambda key, payload: heard.append(wire.decode_message(payload)))
+        messages = []
+        network().subscribe(KEYS.monitor(topic), lambda key, payload: messages.append(wire.decode_message(payload)))
         read = []
         real = Room.read
         with monkeypatch.context() as patched:
-            patched.setattr(Room, "read", lambda *asked: read.append(real(*asked)) or read[-1])
+            patched.setattr(Room, "read", lambda *arguments: read.append(real(*arguments)) or read[-1])
             Worker(network(), "test", "w0").run()
-        return [wire.trajectory_digest(t) for t in learner.stored], heard, read
+        return [wire.trajectory_digest(t) for t in learner.stored], messages, read
 
-    watched, heard, read = work("belief/w0")
+    watched, messages, read = work("belief/w0")
     unwatched, _, unread = work("belief/w1")
     assert watched == unwatched and len(watched) == len(list(job.identities()))
     decisions = job.trials * committed_run.darkroom.horizon
     assert len(read) == decisions and not unread
     shown = [identity for identity in job.identities() if (identity.task, identity.variation) == job.rows()[-1]]
-    assert [fields["identity"] for _, fields in heard][:: committed_run.darkroom.horizon] == [str(one) for one in shown]
-    kind, fields = heard[-1]
+    assert [fields["identity"] for _, fields in messages][:: committed_run.darkroom.horizon] == [str(one) for one in shown]
+    kind, fields = messages[-1]
     variation = job.variation(shown[-1])
     assert (kind, fields["worker"], fields["size"]) == ("belief", "w0", 3)
     assert tuple(fields["goal"]) == variation.task.vector("goal")
     assert sum(fields["implied"]) == pytest.approx(1, abs=1e-4) and sum(fields["exact"]) == pytest.approx(1, abs=1e-4)
     assert fields["exact"] == pytest.approx(read[-1].exact, abs=1e-5)
-    kept = [fields["transitions"] for _, fields in heard]
+    kept = [fields["transitions"] for _, fields in messages]
     assert kept[0] == 0 and max(kept) <= 20 + committed_run.darkroom.horizon and fields["time"] > 1e9
-    assert (kept[1] == 1) == (deploy == "committed"), "Algorithm 1 lets an episode in when it has ended"
+    assert (kept[1] == 1) == (deploy == "committed"), "Algorithm 1 adds an episode to the context at its end"
 
 
-def test_beliefs_take_a_share_of_the_time_and_no_more(hub, small_run, monkeypatch):
+def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
     link, watching, clock, cost = hub(), hub(), [100.0, 0.0], 0.02
     watching.subscribe(KEYS.monitor("belief/w0"), lambda key, payload: None)
     monkeypatch.setattr(beliefs.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(beliefs.time, "thread_time", lambda: clock[1])
-    told = Beliefs(link, KEYS.monitor("belief/w0"), "w0", small_run)
+    publish_belief = Beliefs(link, KEYS.monitor("belief/w0"), "w0", small_run)
     read = []
 
-    def message(*asked):
+    def message(*arguments):
         read.append(clock[0])
         clock[1] += cost
         return b""
 
-    monkeypatch.setattr(told, "_message", message)
+    monkeypatch.setattr(publish_belief, "_message", message)
     job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
     identity = next(iter(job.identities()))
 
-    def look(seconds):
+    def published_in(seconds):
         read.clear()
         for _ in range(seconds * 10):
             clock[0] += 0.1
-            told(None, 0, identity, job.variation(identity))
+            publish_belief(None, 0, identity, job.variation(identity))
         return len(read)
 
-    assert look(80) * cost <= 80 / 200 + cost and read[-1] - read[-2] >= 4.0
+    assert published_in(80) * cost <= 80 / 200 + cost and read[-1] - read[-2] >= 4.0
     cost = 0.001
-    look(5)
-    assert look(20) == pytest.approx(20, abs=2), "once a second is enough"
+    published_in(5)
+    assert published_in(20) == pytest.approx(20, abs=2), "at most once per second"
 
 
-def test_a_belief_that_fails_is_lost_and_the_job_is_not(hub, small_run, monkeypatch, caplog):
+def test_an_error_in_a_belief_does_not_fail_the_job(hub, small_run, monkeypatch, caplog):
     always(monkeypatch)
-    monkeypatch.setattr(Room, "read", lambda *asked: 1 / 0)
+    monkeypatch.setattr(Room, "read", lambda *arguments: 1 / 0)
     job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
-    learner = Learner(hub(), small_run, [job_message(job), STOP])
+    learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     hub().serve(KEYS.weights_latest, lambda query: query.reply(wire.encode_weights(weights(small_run, 0))))
     hub().subscribe(KEYS.monitor_all, lambda key, payload: None)
     Worker(hub(), "test", "w0").run()
@@ -279,7 +279,7 @@ def test_a_belief_that_fails_is_lost_and_the_job_is_not(hub, small_run, monkeypa
     assert "a belief is lost: division by zero" in caplog.text
 
 
-def test_the_policy_waits_for_exactly_the_version_that_is_named(hub, small_run):
+def test_the_policy_waits_for_exactly_the_requested_version(hub, small_run):
     learner = hub()
     latest = [b""]
     learner.serve(KEYS.weights_latest, lambda q: q.reply(latest[0]) if latest[0] else q.refuse("busy"))
@@ -293,28 +293,28 @@ def test_the_policy_waits_for_exactly_the_version_that_is_named(hub, small_run):
     model, digest = policy.at(1)
     assert digest == one.digest
     np.testing.assert_array_equal(weights_of(model)["head.weight"], one.arrays["head.weight"])
-    assert policy.at(0)[1] == zero.digest, "a job of an earlier round that is done again"
+    assert policy.at(0)[1] == zero.digest, "a repeated job of an earlier round"
     with pytest.raises(Unanswered, match="version 0 is gone; the learner is at 1"):
         LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20).at(0)
 
 
-def test_the_policy_asks_for_an_older_version_by_its_number_and_forgets_the_oldest(hub, small_run):
+def test_the_policy_requests_an_older_version_by_number_and_drops_the_oldest(hub, small_run):
     learner = hub()
     versions = [weights(small_run, v) for v in range(7)]
-    asked = []
+    requested = []
 
     def answer(query):
-        asked.append(wire.decode_message(query.payload)[1]["version"])
-        query.reply(wire.encode_weights(versions[asked[-1]]))
+        requested.append(wire.decode_message(query.payload)[1]["version"])
+        query.reply(wire.encode_weights(versions[requested[-1]]))
 
     learner.serve(KEYS.weights_latest, answer)
     policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20)
     for version in (6, 2, 6, 0, 1, 3, 2, 6):
         assert policy.at(version)[1] == versions[version].digest
-    assert asked == [6, 2, 0, 1, 3, 6]
+    assert requested == [6, 2, 0, 1, 3, 6]
 
 
-def test_the_policy_does_not_wait_for_ever(hub, small_run):
+def test_the_policy_waits_a_limited_time(hub, small_run):
     policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
     with pytest.raises(Unanswered, match=r"version 3 did not come within 0.3 s"):
         policy.at(3)

@@ -1,4 +1,4 @@
-"""The ingest benchmark: what it counts went through the real inbox and store, and it refuses to measure nothing."""
+"""The ingest benchmark: what it counts went through the real ingest and store, and it refuses to measure nothing."""
 
 from __future__ import annotations
 

@@ -25,9 +25,9 @@ def test_what_is_replayed_differs_in_its_trial_only():
 
 def test_it_measures_every_size_and_leaves_nothing_behind(on_disk, tmp_path, monkeypatch):
     stored = []
-    real = scale._inbox
+    real = scale._open_ingest
 
-    def inbox(store, count, times, failures):
+    def open_ingest(store, count, times, failures):
         made = real(store, count, times, failures)
         take = made.take
 
@@ -38,7 +38,7 @@ def test_it_measures_every_size_and_leaves_nothing_behind(on_disk, tmp_path, mon
         made.take = counted
         return made
 
-    monkeypatch.setattr(scale, "_inbox", inbox)
+    monkeypatch.setattr(scale, "_open_ingest", open_ingest)
     result = scale.run(tmp_path / "here", seconds=1.0, workers=(1, 6))
     assert stored[-1] == set(range(6)), "a worker was not heard"
     one, six = result["rows"]

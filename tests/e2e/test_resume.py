@@ -1,4 +1,4 @@
-"""Everything killed at once, again and again, and any number of workers: the same bytes."""
+"""Runs that are killed several times, and runs with other numbers of workers, give the same bytes."""
 
 import os
 import re
@@ -11,7 +11,7 @@ import pytest
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests.e2e.training import (
-    ONE_LIFE,
+    NO_RESTARTS,
     SMOKE,
     endpoint_of,
     equal,
@@ -25,27 +25,27 @@ from tests.e2e.training import (
 
 
 def act_when(folder, reached, act):
-    """Act as soon as the monitor plane says something that ``reached`` accepts."""
+    """Call ``act`` at the first monitor message that ``reached`` accepts."""
     happened = threading.Event()
 
-    def hear(key, payload):
+    def receive(key, payload):
         if reached(*wire.decode_message(payload)):
             happened.set()
 
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
-        link.subscribe(f"icrl/{folder.name}/mon/**", hear)
+        link.subscribe(f"icrl/{folder.name}/mon/**", receive)
         assert happened.wait(400)
         act()
 
 
 def kill_when(process, folder, reached):
-    """Kill everything then."""
+    """Kill the run and all its processes at the first monitor message that ``reached`` accepts."""
     act_when(folder, reached, lambda: kill_the_tree(process))
-    (folder / "endpoint").unlink(missing_ok=True)  # a learner that outlived its parent by a moment has taken it along
+    (folder / "endpoint").unlink(missing_ok=True)  # the learner may have removed it while it ended
 
 
 def collecting(phase, count):
-    """Whether so many trajectories of a phase have been sent."""
+    """A condition that holds once ``count`` trajectories of a phase were sent."""
     seen = set()
 
     def reached(kind, fields):
@@ -61,9 +61,9 @@ def fitting(kind, fields):
 
 
 @pytest.mark.timeout(900)
-def test_kill_9_of_the_whole_tree_twice_then_of_the_command_alone_changes_nothing(reference, tmp_path):
+def test_killing_all_processes_twice_and_then_the_command_changes_nothing(reference, tmp_path):
     folder = tmp_path / "killed"
-    run = ["train", *SMOKE, *ONE_LIFE, "--out", folder]
+    run = ["train", *SMOKE, *NO_RESTARTS, "--out", folder]
     moments = [fitting, collecting("adapt/0/", 30)]
     for number, reached in enumerate(moments):
         process = start(*run, "--actors", "1", *["--resume"] * bool(number), start_new_session=True)
@@ -75,24 +75,24 @@ def test_kill_9_of_the_whole_tree_twice_then_of_the_command_alone_changes_nothin
     def kill_the_command():
         wait_for(lambda: len(workers_of(process)) == 2, "both workers")
         family = psutil.Process(process.pid).children(recursive=True)
-        # Ray's two agents notice by themselves, within a minute.
-        ours.extend(p for p in family if re.search("learner|_Host", " ".join(p.cmdline())))
+        # Ray's two agents end by themselves within a minute.
+        ours.extend(p for p in family if re.search("learner|WorkerActor", " ".join(p.cmdline())))
         os.kill(process.pid, signal.SIGKILL)
         finish(process)
 
     act_when(folder, collecting("adapt/1/", 1), kill_the_command)
     assert len(ours) >= 3
-    again = start(*run, "--resume")  # at once: the old learner may still be there
+    again = start(*run, "--resume")  # at once: the old learner may still run
     output = finish(again)
     assert again.returncode == 0, output
     assert equal(result_of(folder), reference)
     _, alive = psutil.wait_procs(ours, timeout=60)
-    assert not [p.cmdline() for p in alive], "whoever was left alone ended by itself"
+    assert not [p.cmdline() for p in alive], "processes without a parent ended by themselves"
 
 
-def test_four_workers_end_with_the_bytes_of_none(reference, tmp_path):
+def test_four_workers_give_the_same_bytes_as_one_process(reference, tmp_path):
     folder = tmp_path / "workers-4"
-    process = start("train", *SMOKE, *ONE_LIFE, "--out", folder, "--actors", 4, "--oversubscribe")
+    process = start("train", *SMOKE, *NO_RESTARTS, "--out", folder, "--actors", 4, "--oversubscribe")
     output = finish(process)
     assert process.returncode == 0, output
     assert equal(result_of(folder), reference)

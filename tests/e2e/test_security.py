@@ -14,7 +14,7 @@ from icrl_dist.stream.link import Keys, LinkError, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
 from tests.contracts.link_battery import eventually
-from tests.e2e.training import ONE_LIFE, SMOKE, endpoint_of, equal, finish, result_of, start
+from tests.e2e.training import NO_RESTARTS, SMOKE, endpoint_of, equal, finish, result_of, start
 
 KEYS = Keys("run")
 TLS = "transport/link/tls/"
@@ -327,7 +327,7 @@ def test_a_whole_run_of_one_worker_by_tls_ends_with_the_bytes_of_none(ours, refe
     folder = tmp_path / "secure"
     tls = ["--actors", "1", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", ours]
     with contextlib.ExitStack() as stack:
-        run = stack.enter_context(start("train", *SMOKE, *ONE_LIFE, *tls, "--out", folder))
+        run = stack.enter_context(start("train", *SMOKE, *NO_RESTARTS, *tls, "--out", folder))
         stack.callback(run.terminate)
         assert endpoint_of(folder).startswith("tls/")
         tap = stack.enter_context(start("tap", folder, "--count", "1"))

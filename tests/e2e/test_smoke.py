@@ -1,4 +1,4 @@
-"""The real thing: a learner process, two Ray workers, Zenoh over loopback, two ICAA rounds."""
+"""A complete run: a learner process, two Ray workers, Zenoh over loopback, two ICAA rounds."""
 
 import contextlib
 import json
@@ -23,7 +23,7 @@ from icrl_dist.stream.link import Refused
 from learner import checkpoints
 from tests.e2e.training import (
     CLI,
-    ONE_LIFE,
+    NO_RESTARTS,
     SMALLER,
     SMOKE,
     endpoint_of,
@@ -38,19 +38,19 @@ from tests.e2e.training import (
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """One run through Ray and Zenoh with a tap and the documented script beside it."""
+    """One run through Ray and Zenoh, observed by ``tap`` and by the script of docs/tap.md."""
     folder = tmp_path_factory.mktemp("runs") / "smoke"
-    process = start("train", *SMALLER, *ONE_LIFE, "--out", folder, "--json")
+    process = start("train", *SMALLER, *NO_RESTARTS, "--out", folder, "--json")
     endpoint = endpoint_of(folder)
     script = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs" / "tap.md").read_text(), re.DOTALL)
     commands = {
         "tap": [*CLI, "tap", "--connect", endpoint],
         "documented": [sys.executable, "-c", script.group(1), endpoint, folder.name],
     }
-    heard = {name: folder.parent / name for name in commands}
+    outputs = {name: folder.parent / name for name in commands}
     with contextlib.ExitStack() as stack:
-        # Into files: a pipe that nobody empties would hold up the listener.
-        files = {name: stack.enter_context(heard[name].open("w")) for name in commands}
+        # Into files: a full pipe would block the listener.
+        files = {name: stack.enter_context(outputs[name].open("w")) for name in commands}
         listeners = [subprocess.Popen(commands[name], stdout=files[name], stderr=subprocess.DEVNULL) for name in commands]
         output = finish(process)
         for listener in listeners:
@@ -60,12 +60,12 @@ def undisturbed(tmp_path_factory):
             finally:
                 listener.kill()
                 listener.wait()
-    lines = {name: file.read_text().splitlines() for name, file in heard.items()}
+    lines = {name: file.read_text().splitlines() for name, file in outputs.items()}
     assert process.returncode == 0, output
     return folder, output, lines
 
 
-def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undisturbed):
+def test_every_trajectory_arrived_once_with_the_policy_version_of_its_round(undisturbed):
     folder, _, _ = undisturbed
     run = load(str(folder / "run.toml"))
     method = recipes.METHODS[run.method]
@@ -82,7 +82,7 @@ def test_every_leased_trajectory_arrived_once_with_the_weights_of_its_round(undi
     assert {t.policy_version for t in trajectories} == {-1, 0, 1}
 
 
-def test_ray_and_inline_end_with_the_same_bytes(undisturbed, reference):
+def test_ray_and_inline_give_the_same_bytes(undisturbed, reference):
     assert equal(result_of(undisturbed[0]), reference)
 
 
@@ -115,20 +115,20 @@ def test_acting_with_zeroed_weights_changes_the_actions(undisturbed):
     assert (actions(zero=False) != actions(zero=True)).any()
 
 
-def test_tap_and_the_documented_script_print_a_line_a_trajectory(undisturbed):
+def test_tap_and_the_documented_script_print_one_line_per_trajectory(undisturbed):
     folder, _, lines = undisturbed
     store = Store(folder / "dataset")
     stored = {str(row.identity) for row in store.ledger}
     store.close()
     for name in ("tap", "documented"):
-        heard = [json.loads(line) for line in lines[name]]
-        identities = [fields["identity"] for fields in heard]
+        messages = [json.loads(line) for line in lines[name]]
+        identities = [fields["identity"] for fields in messages]
         assert identities and set(identities) <= stored, name
-        # Connected before the first round began, and nobody was slow: all of the last round.
+        # Both connected before the first round and were fast enough to receive the whole last round.
         assert sum(i.startswith("adapt/1") for i in identities) == 14 * (20 + 1), name
 
 
-def test_evaluate_prints_returns_beside_the_oracles(undisturbed):
+def test_evaluate_prints_returns_and_those_of_the_oracle(undisturbed):
     process = start("evaluate", undisturbed[0], "--episodes", "2", "--seeds", "2", "--p", "0", "0.4", "--json")
     output = finish(process)
     assert process.returncode == 0, output
@@ -139,7 +139,7 @@ def test_evaluate_prints_returns_beside_the_oracles(undisturbed):
     assert next(row for row in rows if row["agent"] == "oracle")["episodes"] == [9.0, 9.0]
 
 
-def test_kill_9_of_the_learner_then_of_a_worker_midway_changes_nothing(reference, tmp_path):
+def test_killing_the_learner_and_then_a_worker_changes_nothing(reference, tmp_path):
     folder = tmp_path / "killed"
     process = start("train", *SMOKE, "--out", folder)
 
@@ -164,9 +164,9 @@ def test_kill_9_of_the_learner_then_of_a_worker_midway_changes_nothing(reference
     assert result["drops"]["not-msgpack"] == 1
 
 
-def test_a_polite_kill_is_a_ctrl_c(tmp_path):
+def test_sigterm_has_the_effect_of_ctrl_c(tmp_path):
     folder = tmp_path / "terminated"
-    process = start("train", *SMOKE, *ONE_LIFE, "--actors", "1", "--out", folder)
+    process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", folder)
     with on_first_adapt_trajectory(folder, process.terminate) as terminated:
         family = psutil.Process(process.pid).children(recursive=True)
         assert terminated.wait(300)
@@ -177,9 +177,9 @@ def test_a_polite_kill_is_a_ctrl_c(tmp_path):
     assert not [p.cmdline() for p in alive]
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(reference, tmp_path):
+def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_continues(reference, tmp_path):
     folder = tmp_path / "interrupted"
-    process = start("train", *SMOKE, *ONE_LIFE, "--actors", "1", "--out", folder, start_new_session=True)
+    process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", folder, start_new_session=True)
     with on_first_adapt_trajectory(folder, lambda: os.killpg(process.pid, signal.SIGINT)) as interrupted:
         family = psutil.Process(process.pid).children(recursive=True)
         assert interrupted.wait(300)
@@ -189,7 +189,9 @@ def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_goes_on(reference,
     assert "--resume" in output and (folder / "checkpoints" / "version-0000.npz").exists()
     _, alive = psutil.wait_procs(family, timeout=60)
     assert not [p.cmdline() for p in alive]
-    again = start("train", *SMOKE, *ONE_LIFE, "--engine", "inline", "--out", folder, "--resume")  # whose bytes are the same
+    again = start(
+        "train", *SMOKE, *NO_RESTARTS, "--engine", "inline", "--out", folder, "--resume"
+    )  # inline gives the same bytes
     output = finish(again)
     assert again.returncode == 0, output
     assert equal(result_of(folder), reference)

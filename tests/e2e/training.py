@@ -1,4 +1,4 @@
-"""Driving real runs from a test: start them, wait for the right moment, hold their results together."""
+"""Helpers for complete runs in tests: start them, wait for a moment, compare their results."""
 
 import contextlib
 import json
@@ -16,10 +16,10 @@ from icrl_dist.telemetry import processes
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
 # Both of smoke's rounds, with fewer trajectories in each.
 SMALLER = ["smoke", "--pretrain.contexts", "140", "--icaa.trials", "20", "--icaa.context-trials", "6"]
-# The same with hardly an evaluation.
+# The same with a very small evaluation.
 SMOKE = [*SMALLER, "--evaluate.episodes", "1", "--evaluate.seeds", "1", "--evaluate.p", "0"]
-# For runs in which no process dies and is replaced: no worker is kept ready for it.
-ONE_LIFE = ["--learner.restarts", "0"]
+# For runs in which no process dies: no spare worker is kept.
+NO_RESTARTS = ["--learner.restarts", "0"]
 
 
 def start(*arguments, **options):
@@ -47,23 +47,23 @@ def wait_for(condition, what, timeout=300):
 
 def endpoint_of(folder):
     file = folder / "endpoint"
-    return wait_for(lambda: file.exists() and file.read_text().strip(), "the learner listening")
+    return wait_for(lambda: file.exists() and file.read_text().strip(), "the start of the learner")
 
 
 @contextlib.contextmanager
 def on_first_adapt_trajectory(folder, act, round_=0):
-    """Calls ``act`` once, when a trajectory of the round shows on the monitor plane."""
+    """Call ``act`` once, when a trajectory of the round appears on the monitor plane."""
     acted = threading.Event()
 
-    def hear(key, payload):
+    def receive(key, payload):
         _, fields = wire.decode_message(payload)
-        heard = any(one["identity"].startswith(f"adapt/{round_}") for one in monitor_messages.rows(fields))
-        if heard and not acted.is_set():
+        in_round = any(one["identity"].startswith(f"adapt/{round_}") for one in monitor_messages.rows(fields))
+        if in_round and not acted.is_set():
             acted.set()
             act()
 
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
-        link.subscribe(f"icrl/{folder.name}/mon/trajectories/**", hear)
+        link.subscribe(f"icrl/{folder.name}/mon/trajectories/**", receive)
         acted.link = link
         yield acted
 
@@ -77,7 +77,7 @@ def equal(result, other):
 
 
 def kill_the_tree(process):
-    """SIGKILL to the command and to everything that it started, Ray's own processes included."""
+    """Send SIGKILL to the command and to all processes that it started, Ray's included."""
     family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
     for member in family:
         with contextlib.suppress(psutil.NoSuchProcess):

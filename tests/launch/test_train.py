@@ -9,7 +9,7 @@ import pytest
 from actors import fleet
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.launch import learner_process, train
-from learner.__main__ import _listen
+from learner.__main__ import _read_lost_workers
 
 
 @pytest.fixture
@@ -43,11 +43,11 @@ def test_a_learner_receives_the_workers_lost_with_a_node_and_a_restarted_one_rec
     until(lambda: received.read_text().endswith('\n["w0", "w1", "w2", "w3"]\n'))
 
 
-def test_the_learner_passes_the_lost_workers_to_its_worker_api():
-    received, (read, write) = [], os.pipe()
+def test_workers_lost_with_nodes_reach_the_worker_api():
+    heard, (read, write) = [], os.pipe()
     os.write(write, b'["w0"]\n["w1", "w2"]\n')
     os.close(write)
-    _listen(SimpleNamespace(desk=SimpleNamespace(excuse=received.append)), read)
+    _read_lost_workers(SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=heard.append)), read)
     os.close(read)
     assert received == [["w0"], ["w1", "w2"]]
 

@@ -1,4 +1,4 @@
-"""ICAG with rounds on T_theta's own histories, through the learner: stopped or not, and explained."""
+"""ICAG with DAgger rounds through the learner: interrupted runs, and explanations of trajectories."""
 
 import dataclasses
 
@@ -25,18 +25,18 @@ def run(small_run):
     )
 
 
-def test_a_round_of_practice_stopped_midway_goes_on_to_the_same_bytes(run, tmp_path, monkeypatch):
+def test_an_interrupted_dagger_round_continues_to_the_same_bytes(run, tmp_path, monkeypatch):
     whole = run_inline(run, tmp_path / "whole")
     assert whole["version"] == 2
     assert whole["trajectories"] == 42 + 2 * 7 * run.adversary.count * 3
 
     def stop(event):
         if event["event"] == "progress" and (event["stage"], event["version"]) == ("fit", 1) and event["step"] >= 3:
-            made[0].stop()
+            services[0].stop()
 
-    made = []
+    services = []
     real = service.Service.run
-    monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
+    monkeypatch.setattr(service.Service, "run", lambda self: services.append(self) or real(self))
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     with pytest.raises(TrainInterrupted):
         run_inline(run, tmp_path / "stopped", stop)
@@ -46,7 +46,7 @@ def test_a_round_of_practice_stopped_midway_goes_on_to_the_same_bytes(run, tmp_p
     assert same(run_inline(run, tmp_path / "stopped", resume=True), whole)
 
 
-def test_a_history_is_explained_and_made_again(run, tmp_path):
+def test_a_history_is_explained_and_reproduced(run, tmp_path):
     run_inline(run, tmp_path / "run")
     answer = explain.explain(tmp_path / "run", Identity("adapt", 1, 3, 2, 1), rerun=True)
     assert answer["rerun_equal"] and answer["policy_version"] == 1

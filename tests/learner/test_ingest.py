@@ -1,4 +1,4 @@
-"""Untrusted bytes on the data key: counted by reason, refused, and harmless."""
+"""The ingest: invalid messages are refused and counted by reason, valid trajectories are stored before the reply."""
 
 import dataclasses
 import threading
@@ -6,19 +6,19 @@ import threading
 import msgpack
 import numpy as np
 import pytest
+from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist.collect import jobs
-from icrl_dist.methods.recipes import METHODS
 from icrl_dist.problems import registry
 from icrl_dist.storage.dataset import Store
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import batching, wire
 from icrl_dist.types import Identity, Spec
-from learner.ingest import REASONS, Inbox, Rejected, check
+from learner.ingest import REASONS, Ingest, Rejected, check
 
 
-class Asked:
-    """A query that remembers its answer."""
+class FakeQuery:
+    """A query that keeps its answer."""
 
     key = "data"
 
@@ -49,11 +49,11 @@ def trajectories(job):
 
 
 @pytest.fixture
-def inbox(tmp_path, small_run, job):
+def ingest(tmp_path, small_run, job):
     store = Store(tmp_path)
     wanted = set(job.identities())
     failures = []
-    made = Inbox(
+    opened = Ingest(
         store,
         registry.spec(job.variations[0].task),
         1 << 20,
@@ -62,43 +62,43 @@ def inbox(tmp_path, small_run, job):
         lambda t: wanted.discard(t.identity),
         failures.append,
     )
-    made.store, made.failures = store, failures
-    yield made
-    made.close()
+    opened.store, opened.failures = store, failures
+    yield opened
+    opened.close()
     store.close()
 
 
-def put(inbox, *payloads):
-    """What became of the trajectories of one request: empty where stored, else why not."""
-    query = Asked(batching.join(payloads))
-    inbox.put(query)
+def put(ingest, *payloads):
+    """Send one request; returns for each trajectory an empty text, or the reason for which it was not stored."""
+    query = FakeQuery(batching.join(payloads))
+    ingest.put(query)
     assert query.answered.wait(60)
     answers = batching.reasons(query.answer, len(payloads))
     return answers if len(answers) > 1 else answers[0]
 
 
-def test_a_good_trajectory_is_on_disk_before_the_answer(inbox, trajectories, monkeypatch):
+def test_a_trajectory_is_stored_before_the_answer(ingest, trajectories, monkeypatch):
     order = []
-    append = inbox.store.append
-    monkeypatch.setattr(inbox.store, "append", lambda items: (append(items), order.append("stored")))
-    reply = Asked.reply
-    monkeypatch.setattr(Asked, "reply", lambda self, payload: (order.append("answered"), reply(self, payload)))
-    put(inbox, wire.encode_trajectory(trajectories[0]))
+    append = ingest.store.append
+    monkeypatch.setattr(ingest.store, "append", lambda items: (append(items), order.append("stored")))
+    reply = FakeQuery.reply
+    monkeypatch.setattr(FakeQuery, "reply", lambda self, payload: (order.append("answered"), reply(self, payload)))
+    put(ingest, wire.encode_trajectory(trajectories[0]))
     assert order == ["stored", "answered"]
-    assert trajectories[0].identity in inbox.store
+    assert trajectories[0].identity in ingest.store
 
 
-def test_a_duplicate_is_acknowledged_and_stored_once(inbox, trajectories):
+def test_a_duplicate_is_acknowledged_and_stored_once(ingest, trajectories):
     payload = wire.encode_trajectory(trajectories[0])
-    assert put(inbox, payload) == put(inbox, payload) == ""
-    assert len(inbox.store) == 1 and inbox.drops == {"duplicate": 1}
-    pair = [Asked(wire.encode_trajectory(trajectories[1])) for _ in range(2)]
-    inbox.take(pair)
-    assert len(inbox.store) == 2 and [q.answer for q in pair] == [b"stored"] * 2
+    assert put(ingest, payload) == put(ingest, payload) == ""
+    assert len(ingest.store) == 1 and ingest.drops == {"duplicate": 1}
+    pair = [FakeQuery(wire.encode_trajectory(trajectories[1])) for _ in range(2)]
+    ingest.take(pair)
+    assert len(ingest.store) == 2 and [q.answer for q in pair] == [b"stored"] * 2
 
 
-def broken(trajectory):
-    """Every way to be wrong, and the reason it must be counted under."""
+def invalid(trajectory):
+    """Invalid messages of every kind, each with the reason under which it is counted."""
     good = wire.encode_trajectory(trajectory)
     nan = trajectory.rewards.copy()
     nan[0] = np.nan
@@ -133,18 +133,18 @@ def broken(trajectory):
     ]
 
 
-def test_bad_messages_are_counted_by_reason_refused_and_harm_nothing(inbox, trajectories):
-    cases = broken(trajectories[0])
+def test_invalid_messages_are_refused_and_counted_by_reason(ingest, trajectories):
+    cases = invalid(trajectories[0])
     for reason, payload in cases:
-        before = inbox.drops[reason]
-        answer = put(inbox, payload)
+        before = ingest.drops[reason]
+        answer = put(ingest, payload)
         assert answer.startswith(reason), (reason, answer)
-        assert inbox.drops[reason] == before + 1
-    assert len(inbox.store) == 0 and set(inbox.drops) <= set(REASONS)
-    assert put(inbox, wire.encode_trajectory(trajectories[0])) == ""
+        assert ingest.drops[reason] == before + 1
+    assert len(ingest.store) == 0 and set(ingest.drops) <= set(REASONS)
+    assert put(ingest, wire.encode_trajectory(trajectories[0])) == ""
 
 
-def test_vectors_of_actions_are_held_to_the_spec(trajectories, job):
+def test_continuous_actions_are_checked_against_the_spec(trajectories, job):
     spec = Spec((0.0, 0.0), (2.0, 2.0), 3, len(trajectories[0].actions), discrete=False)
     one, rng = trajectories[0], np.random.default_rng(0)
     shapes = {"actions": (len(one.actions), 3), "labels": (len(one.queries), 3), "taken": (len(one.taken), 3)}
@@ -163,16 +163,16 @@ def test_vectors_of_actions_are_held_to_the_spec(trajectories, job):
     with pytest.raises(Rejected, match=r"spec.*labels"):
         check(good, job, dataclasses.replace(spec, actions=4), "")
     for odd, other in ((one, dataclasses.replace(spec, actions=5)), (good, dataclasses.replace(spec, discrete=True))):
-        with pytest.raises(Rejected, match="of the other kind"):
+        with pytest.raises(Rejected, match=r"this run has (discrete|continuous) actions"):
             check(odd, job, other, "")
 
 
-def test_each_trajectory_of_a_request_is_answered_for_itself(inbox, trajectories):
+def test_each_trajectory_of_a_request_has_its_own_answer(ingest, trajectories):
     good = [wire.encode_trajectory(t) for t in trajectories[:3]]
-    answers = put(inbox, good[0], b"\xc1garbage", good[1], good[0], good[2])
+    answers = put(ingest, good[0], b"\xc1garbage", good[1], good[0], good[2])
     assert [bool(a) for a in answers] == [False, True, False, False, False]
     assert answers[1].startswith("not-msgpack")
-    assert len(inbox.store) == 3 and inbox.drops == {"not-msgpack": 1, "duplicate": 1}
+    assert len(ingest.store) == 3 and ingest.drops == {"not-msgpack": 1, "duplicate": 1}
 
 
 @pytest.mark.parametrize(
@@ -185,16 +185,16 @@ def test_each_trajectory_of_a_request_is_answered_for_itself(inbox, trajectories
         ("version", msgpack.packb({"v": 2, "kind": "batch", "items": []})),
     ],
 )
-def test_a_request_that_is_no_batch_is_refused_whole(inbox, reason, payload):
-    query = Asked(payload)
-    inbox.put(query)
-    assert query.answer.startswith(reason) and inbox.drops == {reason: 1}
+def test_a_request_that_is_not_a_batch_is_refused(ingest, reason, payload):
+    query = FakeQuery(payload)
+    ingest.put(query)
+    assert query.answer.startswith(reason) and ingest.drops == {reason: 1}
 
 
 def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, trajectories):
     gate = threading.Event()
     store = Store(tmp_path / "gated")
-    inbox = Inbox(
+    ingest = Ingest(
         store,
         registry.spec(job.variations[0].task),
         1 << 20,
@@ -205,65 +205,65 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
         capacity=2,
     )
     payload = wire.encode_trajectory(trajectories[0])
-    queries = [Asked(batching.join([payload])) for _ in range(8)]
+    queries = [FakeQuery(batching.join([payload])) for _ in range(8)]
     for query in queries:
-        inbox.put(query)
+        ingest.put(query)
     busy = [q for q in queries if q.answer and batching.reasons(q.answer, 1) == ["busy"]]
-    assert len(busy) >= 4 and inbox.drops["busy"] == len(busy)
+    assert len(busy) >= 4 and ingest.drops["busy"] == len(busy)
     gate.set()
     assert all(q.answered.wait(60) for q in queries)
-    inbox.close()
+    ingest.close()
     store.close()
 
 
-def test_the_queue_is_bounded_in_bytes_and_lets_one_in_however_large(tmp_path, small_run, job, trajectories):
+def test_the_queue_is_bounded_in_bytes_and_accepts_one_message_of_any_size(tmp_path, small_run, job, trajectories):
     gate = threading.Event()
     store = Store(tmp_path / "gated")
     spec = registry.spec(job.variations[0].task)
     payloads = [wire.encode_trajectory(t) for t in trajectories[:4]]
     size = len(payloads[0])
-    for room, expected in ((2 * size + size // 2, 2), (size // 2, 1)):
+    for capacity, expected in ((2 * size + size // 2, 2), (size // 2, 1)):
         gate.clear()
-        inbox = Inbox(
-            store, spec, 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity_bytes=room
+        ingest = Ingest(
+            store, spec, 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity_bytes=capacity
         )
-        query = Asked(batching.join(payloads))
-        inbox.put(query)
-        assert inbox.drops == {"busy": 4 - expected}
+        query = FakeQuery(batching.join(payloads))
+        ingest.put(query)
+        assert ingest.drops == {"busy": 4 - expected}
         gate.set()
         assert query.answered.wait(60)
         assert batching.reasons(query.answer, 4) == [""] * expected + ["busy"] * (4 - expected)
-        inbox.close()  # what was taken in is done with, so there is room again
-        assert inbox._room._count == inbox._room._size == 0
+        ingest.close()  # waits until the queued messages are answered
+        assert ingest._load._count == ingest._load._size == 0
     store.close()
 
 
-def test_numbers_that_the_ledger_cannot_hold_are_refused_and_harm_nothing(inbox, trajectories):
+def test_numbers_too_large_for_the_ledger_are_refused(ingest, trajectories):
     message = msgpack.unpackb(wire.encode_trajectory(trajectories[0]))
     for number in (1 << 31, (1 << 64) - 1):
         message["identity"][4] = number
-        assert put(inbox, msgpack.packb(message)).startswith("schema: identity")
-    assert put(inbox, wire.encode_trajectory(trajectories[0])) == "" and inbox.failures == []
+        assert put(ingest, msgpack.packb(message)).startswith("schema: identity")
+    assert put(ingest, wire.encode_trajectory(trajectories[0])) == "" and ingest.failures == []
 
 
-def test_large_numbers_are_finite(inbox, trajectories):
+def test_the_largest_float32_values_count_as_finite(ingest, trajectories):
     rewards = np.full_like(trajectories[0].rewards, 3e38)
-    assert put(inbox, wire.encode_trajectory(dataclasses.replace(trajectories[0], rewards=rewards))) == ""
-    assert inbox.commits == 1
+    assert put(ingest, wire.encode_trajectory(dataclasses.replace(trajectories[0], rewards=rewards))) == ""
+    assert ingest.commits == 1
 
 
-def test_a_full_disk_acknowledges_nothing_and_is_reported(inbox, trajectories, monkeypatch):
+def test_on_a_full_disk_nothing_is_acknowledged_and_the_error_is_reported(ingest, trajectories, monkeypatch):
     def full(items):
         raise StoreError("segment: could not be written (No space left on device)")
 
-    monkeypatch.setattr(inbox.store, "append", full)
-    query = Asked(batching.join([wire.encode_trajectory(trajectories[0])]))
-    inbox.put(query)
-    inbox._thread.join(60)
-    assert query.answer is None and "No space left" in str(inbox.failures[0])
+    monkeypatch.setattr(ingest.store, "append", full)
+    query = FakeQuery(batching.join([wire.encode_trajectory(trajectories[0])]))
+    ingest.put(query)
+    ingest._thread.join(60)
+    assert query.answer is None and "No space left" in str(ingest.failures[0])
 
 
-def test_a_failed_inbox_closes_even_with_a_full_queue(tmp_path, small_run, job, trajectories):
+def test_a_failed_ingest_can_be_closed_with_a_full_queue(tmp_path, small_run, job, trajectories):
     failures = []
 
     def bug(identity):
@@ -271,10 +271,10 @@ def test_a_failed_inbox_closes_even_with_a_full_queue(tmp_path, small_run, job, 
 
     store = Store(tmp_path / "bug")
     spec = registry.spec(job.variations[0].task)
-    inbox = Inbox(store, spec, 1 << 20, bug, lambda v: "", lambda t: None, failures.append, capacity=2)
+    ingest = Ingest(store, spec, 1 << 20, bug, lambda v: "", lambda t: None, failures.append, capacity=2)
     payload = wire.encode_trajectory(trajectories[0])
     for _ in range(20):
-        inbox.put(Asked(batching.join([payload])))
-    inbox.close()
+        ingest.put(FakeQuery(batching.join([payload])))
+    ingest.close()
     assert [type(f) for f in failures] == [ZeroDivisionError]
     store.close()

@@ -1,4 +1,4 @@
-"""The commands leave what they are not asked to replace: whole runs in one process, and each command that is refused."""
+"""Commands replace only what they may replace: complete runs in one process, and every refused command."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ def train(*words):
 
 @pytest.fixture(scope="module")
 def finished(module_run, no_tensorboard, tmp_path_factory):
-    """A run that ended, evaluated and all, which nobody changes; its folder."""
+    """The folder of a finished and evaluated run that no test changes."""
     place = tmp_path_factory.mktemp("finished")
     (place / "small.toml").write_text(dumps(module_run))
     assert train(place / "small.toml", "--engine", "inline", "--out", place / "run") == 0
@@ -34,7 +34,7 @@ def finished(module_run, no_tensorboard, tmp_path_factory):
 
 @pytest.fixture
 def run(finished, tmp_path, monkeypatch):
-    """A copy of it, beside its run file."""
+    """A copy of the finished run, beside its run file."""
     monkeypatch.setattr(run_folder, "WAIT_S", 0.05)
     shutil.copyfile(finished.parent / "small.toml", tmp_path / "small.toml")
     folder = shutil.copytree(finished, tmp_path / "run")
@@ -53,11 +53,11 @@ def refused(capsys, code, *given):
     return line
 
 
-def test_a_finished_run_is_ours_to_the_last_file(finished):
+def test_a_finished_run_contains_only_our_files(finished):
     assert run_folder.foreign(finished) == []
 
 
-def test_contradictory_flags_touch_nothing(run, capsys):
+def test_contradictory_flags_change_nothing(run, capsys):
     before = files(run.parent)
     assert "--resume --overwrite" in refused(capsys, 2, *words(run, "--resume", "--overwrite"))
     assert files(run.parent) == before
@@ -72,24 +72,24 @@ def test_an_empty_out_is_the_current_folder_and_refused(run, capsys, monkeypatch
     assert files(run.parent) == before
 
 
-def test_without_a_gpu_the_earlier_run_comes_back(run, capsys, monkeypatch):
+def test_without_a_gpu_the_earlier_run_is_restored(run, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     before = files(run.parent)
     assert "no GPU is seen" in refused(capsys, 1, *words(run, "--overwrite", "--learner.device", "cuda"))
     assert files(run.parent) == before
 
 
-def test_without_a_cluster_the_earlier_run_comes_back(run, capsys, monkeypatch):
+def test_without_a_cluster_the_earlier_run_is_restored(run, capsys, monkeypatch):
     def absent(*_):
-        raise ConfigError("--address auto: nobody there")
+        raise ConfigError("--address auto: no answer")
 
     monkeypatch.setattr(fleet, "Fleet", absent)
     before = files(run.parent)
     line = refused(capsys, 2, run.parent / "small.toml", "--address", "auto", "--out", run, "--overwrite")
-    assert "nobody there" in line and files(run.parent) == before
+    assert "no answer" in line and files(run.parent) == before
 
 
-def test_a_fork_of_another_model_leaves_the_run_that_it_was_to_replace(run, finished, capsys):
+def test_a_refused_fork_changes_nothing(run, finished, capsys):
     before = files(run.parent)
     given = ("--from", f"{finished}@0", "--engine", "inline", "--out", run, "--overwrite", "--set", "model.width=32")
     assert "a fork has its parent's model" in refused(capsys, 2, *given)
@@ -103,7 +103,7 @@ def test_a_fork_never_replaces_its_parent(run, capsys):
     assert files(run.parent) == before
 
 
-def test_a_run_that_is_on_is_not_replaced(run, capsys):
+def test_a_running_run_is_not_replaced(run, capsys):
     before = files(run.parent)
     with hold(run):
         assert "a run is active in this folder" in refused(capsys, 2, *words(run, "--overwrite"))
@@ -117,8 +117,8 @@ def test_the_users_files_beside_a_run_are_named_and_kept(run, capsys):
     assert files(run.parent) == before
 
 
-def test_an_interrupted_successor_leaves_the_earlier_run(run, capsys, monkeypatch):
-    def interrupted(asked, folder, report):
+def test_an_interrupted_new_run_leaves_the_earlier_one(run, capsys, monkeypatch):
+    def interrupted(run_settings, folder, report):
         (folder / "learner.log").touch()
         raise launch.TrainInterrupted
 
@@ -130,7 +130,7 @@ def test_an_interrupted_successor_leaves_the_earlier_run(run, capsys, monkeypatc
     assert files(run.parent) == before
 
 
-def test_a_successor_replaces_the_run_at_its_first_checkpoint_and_is_locked_while_it_is_evaluated(run, monkeypatch):
+def test_a_new_run_replaces_the_earlier_at_its_first_checkpoint_and_is_locked_during_evaluation(run, monkeypatch):
     seen, online, aside = [], heldout.online, run_folder.aside_of(run)
 
     def evaluated(*given):
@@ -139,13 +139,13 @@ def test_a_successor_replaces_the_run_at_its_first_checkpoint_and_is_locked_whil
 
     real = launch.train_inline
 
-    def trained(asked, folder, report):
-        def heard(event):
+    def trained(run_settings, folder, report):
+        def observe(event):
             report(event)
             if event["event"] == "progress":
                 seen.append((event["version"] >= 0, aside.exists()))
 
-        return real(asked, folder, heard)
+        return real(run_settings, folder, observe)
 
     monkeypatch.setattr(heldout, "online", evaluated)
     monkeypatch.setattr(launch, "train_inline", trained)
@@ -155,7 +155,7 @@ def test_a_successor_replaces_the_run_at_its_first_checkpoint_and_is_locked_whil
     assert seen[-1] == (True, False) and load(str(run / "run.toml")).seed == 1
 
 
-def test_to_resume_a_finished_run_changes_no_result(run):
+def test_resuming_a_finished_run_changes_no_result(run):
     stamps = {path: path.stat().st_mtime_ns for path in (run / "checkpoints").iterdir()}
     result = json.loads((run / "result.json").read_text())
     result["seconds"] = 12345.6
@@ -166,7 +166,7 @@ def test_to_resume_a_finished_run_changes_no_result(run):
     assert {path: path.stat().st_mtime_ns for path in (run / "checkpoints").iterdir()} == stamps
 
 
-def test_a_finished_run_that_is_mended_keeps_its_seconds_and_says_what_was_mended(run):
+def test_a_repaired_finished_run_keeps_its_seconds_and_counts_the_repair(run):
     result = json.loads((run / "result.json").read_text())
     (run / "result.json").write_text(json.dumps(result | {"seconds": 12345.6}))
     path = sorted((run / "dataset").glob("segment-*"))[0]
@@ -178,7 +178,7 @@ def test_a_finished_run_that_is_mended_keeps_its_seconds_and_says_what_was_mende
     assert (after["seconds"], after["repaired"], after["dataset_digest"]) == (12345.6, 1, result["dataset_digest"])
 
 
-def test_a_report_of_other_settings_is_never_replaced(run):
+def test_a_report_of_other_settings_is_not_replaced(run):
     def evaluate(what, *more):
         assert cli.main(["evaluate", str(what), "--episodes", "2", "--seeds", "1", *more]) == 0
         return files(run / "report")

@@ -1,4 +1,4 @@
-"""Damage, forks and overlapping rounds, whole runs in one process: what is lost is made again, to the byte."""
+"""Damage, forks and overlapping rounds in complete runs: lost data is collected again with the same bytes."""
 
 import dataclasses
 import json
@@ -21,7 +21,7 @@ __all__ = ["no_tensorboard", "parent"]
 
 
 def copy_of(parent, folder):
-    """The run once more, to be damaged."""
+    """Copy the run, to damage it; returns the segments of its dataset."""
     return sorted((shutil.copytree(parent[0], folder) / "dataset").glob("segment-*"))
 
 
@@ -32,7 +32,7 @@ def flip(path, at):
 
 
 @pytest.mark.parametrize("segment", [0, 1])
-def test_a_changed_byte_in_data_of_any_round_is_named_and_collected_again(parent, tmp_path, segment):
+def test_data_with_a_changed_byte_is_reported_and_collected_again(parent, tmp_path, segment):
     folder, events = tmp_path / "run", []
     segments = copy_of(parent, folder)
     flip(segments[segment], segments[segment].stat().st_size // 2)
@@ -44,34 +44,34 @@ def test_a_changed_byte_in_data_of_any_round_is_named_and_collected_again(parent
     assert Store(folder / "dataset").digest() == parent[1]["dataset_digest"]
 
 
-def test_a_segment_that_is_gone_is_collected_again_with_the_weights_of_its_round(parent, tmp_path):
+def test_a_missing_segment_is_collected_again_with_the_policy_version_of_its_round(parent, tmp_path):
     folder = tmp_path / "run"
     copy_of(parent, folder)[1].unlink()
     assert same(run_inline(parent[2], folder, resume=True), parent[1])
 
 
-def test_damage_while_the_run_is_on_is_found_before_it_is_learned_from(parent, tmp_path):
-    folder, struck = tmp_path / "run", []
+def test_damage_during_a_run_is_found_before_training_uses_it(parent, tmp_path):
+    folder, damaged = tmp_path / "run", []
 
-    def strike(event):
-        if event.get("stage") == "collect" and event.get("phase") == "adapt" and not struck:
-            struck.append(folder / "dataset" / "segment-000000.frames")
-            flip(struck[0], struck[0].stat().st_size // 2)
+    def damage(event):
+        if event.get("stage") == "collect" and event.get("phase") == "adapt" and not damaged:
+            damaged.append(folder / "dataset" / "segment-000000.frames")
+            flip(damaged[0], damaged[0].stat().st_size // 2)
         if event["event"] == "repaired":
-            struck.append(event["text"])
+            damaged.append(event["text"])
 
-    result = run_inline(parent[2], folder, strike)
-    assert len(struck) == 2 and "segment-000000.frames: took out a damaged range" in struck[1]
+    result = run_inline(parent[2], folder, damage)
+    assert len(damaged) == 2 and "segment-000000.frames: took out a damaged range" in damaged[1]
     assert same(result, parent[1])
 
 
-def test_one_learner_a_folder(parent, monkeypatch):
+def test_a_folder_has_at_most_one_learner(parent, monkeypatch):
     monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
     with hold(parent[0]), pytest.raises(StoreError, match="another learner is at work"):
         train.train_inline(parent[2], parent[0], print)
 
 
-def test_a_fork_with_the_same_numbers_ends_where_its_parent_did(parent, tmp_path):
+def test_a_fork_with_the_same_settings_ends_with_the_bytes_of_its_parent(parent, tmp_path):
     folder = tmp_path / "fork"
     assert same(run_inline(parent[2], folder, source=(parent[0], 1)), parent[1])
     names = [path.name for path in sorted((folder / "dataset").iterdir())]
@@ -80,7 +80,7 @@ def test_a_fork_with_the_same_numbers_ends_where_its_parent_did(parent, tmp_path
     assert (folder / "checkpoints" / "version-0001.npz").samefile(parent[0] / "checkpoints" / "version-0001.npz")
 
 
-def test_a_fork_with_other_numbers_keeps_the_data_that_it_began_with(parent, tmp_path):
+def test_a_fork_with_other_settings_keeps_the_data_of_its_parent(parent, tmp_path):
     folder, before = tmp_path / "fork", parent[1]["dataset_digest"]
     run = override(parent[2], ["adversary.count=2"], "--set")
     result = run_inline(run, folder, source=(parent[0], 1))
@@ -92,7 +92,7 @@ def test_a_fork_with_other_numbers_keeps_the_data_that_it_began_with(parent, tmp
     flip(folder / "dataset" / "segment-000002.frames", 60)
     (folder / "dataset" / "segment-000001.frames").unlink()
     again = run_inline(run, folder, resume=True)
-    assert same(again, result), "an ancestor's data is asked for with the ancestor's numbers"
+    assert same(again, result), "the data of an ancestor is collected with the settings of the ancestor"
     assert Store(parent[0] / "dataset", readonly=True).digest() == before
     grandchild = run_inline(run, tmp_path / "grandchild", source=(folder, 2))
     assert same(grandchild, result)
@@ -101,13 +101,13 @@ def test_a_fork_with_other_numbers_keeps_the_data_that_it_began_with(parent, tmp
 @pytest.mark.parametrize(
     ("settings", "message"), [(["model.width=32"], "its parent's model"), (["darkroom.horizon=9"], "its parent's darkroom")]
 )
-def test_a_fork_that_does_not_fit_is_refused(parent, tmp_path, settings, message):
+def test_an_incompatible_fork_is_refused(parent, tmp_path, settings, message):
     with pytest.raises(ConfigError, match=message):
         train.prepare(override(parent[2], settings, "--set"), tmp_path / "fork", False, False, (parent[0], 0))
     assert not (tmp_path / "fork" / "run.toml").exists()
 
 
-def test_what_to_fork_from_is_checked(parent, tmp_path):
+def test_the_source_of_a_fork_is_checked(parent, tmp_path):
     assert parse_source(f"{parent[0]}@1") == (parent[0], 1)
     assert parse_source(str(parent[0])) == (parent[0], 2)
     for text, message in (
@@ -119,30 +119,32 @@ def test_what_to_fork_from_is_checked(parent, tmp_path):
             parse_source(text)
 
 
-def test_rounds_that_overlap_name_weights_one_version_old_at_most(parent, tmp_path):
+def test_overlapping_rounds_use_policy_versions_at_most_one_old(parent, tmp_path):
     folder = tmp_path / "async"
     result = run_inline(override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set"), folder)
     store = Store(folder / "dataset", readonly=True)
     adapt = 7 * 3 * (parent[2].icaa.trials + 1)
     assert result["trajectories"] == 42 + 3 * adapt == len(store)
     lags = {int(lag): count for lag, count in result["lag"].items()}
-    assert set(lags) == {0, 1} and sum(lags.values()) == 3 * adapt, "round 1's first jobs go out before T^1 is there"
+    assert set(lags) == {0, 1} and sum(lags.values()) == 3 * adapt, (
+        "the first jobs of round 1 are leased before T^1 is published"
+    )
     for task in range(7):
         for round_ in range(3):
             acted = store.ledger.acted("adapt", round_, (task - task % 2, task - task % 2 + 2))
-            assert len(acted) == 1 and round_ - 1 <= acted[0] <= round_, "one T^j in all trials of a job"
+            assert len(acted) == 1 and round_ - 1 <= acted[0] <= round_, "the same T^j acts in all trials of a job"
     assert parent[1]["lag"] == {"0": 2 * adapt} and parent[1]["staleness"] == 0
 
 
-def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began_with(parent, tmp_path, monkeypatch):
+def test_a_stopped_asynchronous_run_continues_its_jobs_with_the_same_policy_versions(parent, tmp_path, monkeypatch):
     run = override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set")
-    made, real = [], service.Service.run
-    monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
+    services, real = [], service.Service.run
+    monkeypatch.setattr(service.Service, "run", lambda self: services.append(self) or real(self))
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
 
     def stop(event):
         if event.get("stage") == "fit" and event["version"] == 0:
-            made[0].stop()
+            services[0].stop()
 
     with pytest.raises(train.TrainInterrupted):
         run_inline(run, tmp_path / "run", stop)
@@ -154,7 +156,7 @@ def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began
             assert len(store.ledger.acted("adapt", round_, (first, first + 2))) == 1
 
 
-def test_explain_checks_everything_that_is_left(parent):
+def test_explain_checks_every_file_of_a_trajectory(parent):
     folder, result, run = parent
     answer = explain.explain(folder, Identity("adapt", 1, 3, 2, 1), rerun=True)
     assert answer["rerun_equal"] and answer["intact"] and answer["weights_intact"] and not answer["from_ancestor"]
@@ -169,7 +171,7 @@ def test_explain_checks_everything_that_is_left(parent):
         explain.explain(folder, Identity("adapt", 9, 0, 0, 0))
 
 
-def test_a_rerun_that_comes_out_otherwise_is_said(parent, monkeypatch):
+def test_a_rerun_with_other_bytes_is_reported(parent, monkeypatch):
     real = jobs.adapt
 
     def other(job, policies, worker, tell=None):
@@ -181,25 +183,25 @@ def test_a_rerun_that_comes_out_otherwise_is_said(parent, monkeypatch):
     assert answer["rerun_equal"] is False and "DIFFERENT bytes" in explain.describe(answer)
 
 
-def test_a_variation_that_cannot_be_run_is_left_out_and_listed(parent, tmp_path, monkeypatch):
+def test_a_variation_that_always_fails_is_quarantined_and_listed(parent, tmp_path, monkeypatch):
     run, real, broken = parent[2], jobs.adapt, []
 
     def failing(job, policies, worker, *_):
         if not broken:
-            broken.append(job.variations[4])  # of the first job: the second task's second variation
+            broken.append(job.variations[4])  # in the first job: the second variation of the second task
         for trajectory in real(job, policies, worker):
             if broken[0] in job.variations and trajectory.identity.trial == 1:
-                raise ZeroDivisionError("this one breaks")
+                raise ZeroDivisionError("this variation fails")
             yield trajectory
 
     monkeypatch.setattr(jobs, "adapt", failing)
     folder, events = tmp_path / "run", []
     result = run_inline(run, folder, events.append)
     ((quarantined,)) = result["quarantined"]
-    assert quarantined["variation"] == "adapt/0/1/1" and "ZeroDivisionError: this one breaks" in quarantined["cause"]
+    assert quarantined["variation"] == "adapt/0/1/1" and "ZeroDivisionError: this variation fails" in quarantined["cause"]
     adapt = 7 * 3 * (run.icaa.trials + 1)
     assert result["trajectories"] == 42 + 2 * adapt - (run.icaa.trials + 1) and result["version"] == 2
     assert [e["identity"] for e in events if e["event"] == "quarantine"] == ["adapt/0/1/1"]
     assert list((folder / "crashes").glob("*.json"))
-    assert same(run_inline(run, folder, resume=True), result), "what is quarantined stays left out"
-    assert same(run_inline(run, tmp_path / "again"), result), "how many of its trials were stored makes no difference"
+    assert same(run_inline(run, folder, resume=True), result), "quarantined variations are not collected again"
+    assert same(run_inline(run, tmp_path / "again"), result), "the number of its stored trials makes no difference"

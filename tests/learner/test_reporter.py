@@ -1,4 +1,4 @@
-"""What a run says of itself while it is on: to monitors, and in its metrics."""
+"""The reporter during a run: messages to monitors, rows of metrics, and events for the terminal."""
 
 import dataclasses
 import json
@@ -16,33 +16,33 @@ METRICS = service.Metrics
 
 
 @pytest.fixture
-def said(small_run, tmp_path, monkeypatch):
-    """``said(**thresholds)``: a run's monitor messages, its metrics' rows, and the terminal's events."""
+def train(small_run, tmp_path, monkeypatch):
+    """``train(**thresholds)``: a run; returns its monitor messages, rows of metrics, and events for the terminal."""
 
-    def train(**thresholds):
-        heard, events, publish = [], [], MemoryLink.publish
+    def run_with(**thresholds):
+        messages, events, publish = [], [], MemoryLink.publish
 
-        def listen(link, key, payload, droppable):
+        def record(link, key, payload, droppable):
             if "/mon/" in key:
-                heard.append((key.split("/mon/")[1], *wire.decode_message(payload)))
+                messages.append((key.split("/mon/")[1], *wire.decode_message(payload)))
             publish(link, key, payload, droppable)
 
-        monkeypatch.setattr(MemoryLink, "publish", listen)
+        monkeypatch.setattr(MemoryLink, "publish", record)
         monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
-        monkeypatch.setattr(reporter, "_ABOUT_S", 0.0)
+        monkeypatch.setattr(reporter, "_DESCRIPTION_S", 0.0)
         monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
         run = dataclasses.replace(small_run, alerts=AlertsConfig(**thresholds))
-        launch.prepare(run, tmp_path / "said", resume=False, overwrite=False)
-        launch.train_inline(run, tmp_path / "said", events.append)
-        rows = [json.loads(line) for line in (tmp_path / "said" / "metrics.jsonl").read_text().splitlines()]
-        return heard, rows, events
+        launch.prepare(run, tmp_path / "run", resume=False, overwrite=False)
+        launch.train_inline(run, tmp_path / "run", events.append)
+        rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+        return messages, rows, events
 
-    return train
+    return run_with
 
 
-def test_monitors_are_told_all_that_docs_say(said):
-    heard, rows, _ = said()
-    of = {kind: [fields for _, found, fields in heard if found == kind] for _, kind, _ in heard}
+def test_monitors_receive_all_documented_messages(train):
+    messages, rows, _ = train()
+    of = {kind: [fields for _, found, fields in messages if found == kind] for _, kind, _ in messages}
     assert of.keys() == {"trajectories", "episode", "worker", "learner", "run", "event"}
     (about, *_) = of["run"]
     assert (about["method"], about["problem"], about["rounds"]) == ("icaa", "darkroom", 2)
@@ -52,21 +52,23 @@ def test_monitors_are_told_all_that_docs_say(said):
     assert of["event"][-1]["what"] in ("finished", "worker")
     assert {row["stage"].partition("/")[0] for row in rows} <= {*NAMES, *TEXTS}
     stored = [row["trajectories"] for row in rows if row["stage"] == "ingest"]
-    told = [one["identity"] for fields in of["trajectories"] for one in monitor_messages.rows(fields)]
-    assert stored == sorted(stored) and stored[-1] == len(told) == len(set(told))
-    assert len(of["episode"]) < len(told), "only some are shown whole"
-    assert len(of["trajectories"]) < len(told) / 2, "a message tells of many"
+    identities = [one["identity"] for fields in of["trajectories"] for one in monitor_messages.rows(fields)]
+    assert stored == sorted(stored) and stored[-1] == len(identities) == len(set(identities))
+    assert len(of["episode"]) < len(identities), "only some episodes are published completely"
+    assert len(of["trajectories"]) < len(identities) / 2, "a message contains many trajectories"
 
 
-def test_an_alert_reaches_terminal_monitors_and_metrics(said):
-    heard, rows, events = said(zero_episodes=1)
-    alerts = [fields for topic, _, fields in heard if topic == "event" and fields["what"] == "alert"]
+def test_an_alert_reaches_terminal_monitors_and_metrics(train):
+    messages, rows, events = train(zero_episodes=1)
+    alerts = [fields for topic, _, fields in messages if topic == "event" and fields["what"] == "alert"]
     assert alerts and alerts[0]["alert"] == "zero" and alerts[0]["active"] is True
     written = [row for row in rows if row["stage"] == "alert"]
     assert [(row["what"], row["active"], row["text"]) for row in written] == [
         (a["alert"], a["active"], a["text"]) for a in alerts
     ]
-    (*_, last) = [fields["alerts"] for _, kind, fields in heard if kind == "run"]
-    assert {*last[0]} == {"name", "text", "since"} and last[0]["name"] == "zero", "a viewer that comes late is told, too"
+    (*_, last) = [fields["alerts"] for _, kind, fields in messages if kind == "run"]
+    assert {*last[0]} == {"name", "text", "since"} and last[0]["name"] == "zero", (
+        "a viewer that connects later receives it, too"
+    )
     shown = [event["text"] for event in events if event["event"] == "alert"]
     assert shown[0].startswith("ALERT: stuck at zero for 1 episodes: variation ")

@@ -1,4 +1,4 @@
-"""Whole runs in one process: the same bytes whatever happened on the way."""
+"""Complete runs in one process: an interruption changes no byte of the result."""
 
 import dataclasses
 import json
@@ -33,10 +33,10 @@ def no_tensorboard():
 
 @pytest.fixture(scope="module")
 def parent(module_run, no_tensorboard, tmp_path_factory):
-    """An undisturbed run that nobody changes: its folder, its result and its numbers."""
+    """An undisturbed run that no test changes: its folder, its result and its settings."""
     folder = tmp_path_factory.mktemp("runs") / "undisturbed"
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("torch._dynamo", "torch._inductor"):  # a learner that imports torch's compiler starts late
+        for name in ("torch._dynamo", "torch._inductor"):  # importing torch's compiler would delay the start of the learner
             patch.setitem(sys.modules, name, None)
         return folder, run_inline(module_run, folder), module_run
 
@@ -51,7 +51,7 @@ def same(result, other):
     return [result[n] for n in names] == [other[n] for n in names]
 
 
-def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small_run, parent):
+def test_a_run_stores_every_trajectory_once_with_the_policy_version_of_its_round(small_run, parent):
     folder, undisturbed, _ = parent
     store = Store(folder / "dataset", readonly=True)
     versions = [checkpoints.read_manifest(version_file(folder, v)) for v in range(3)]
@@ -68,14 +68,14 @@ def test_a_run_stores_every_leased_trajectory_once_with_its_rounds_weights(small
     assert undisturbed["version"] == 2 and undisturbed["drops"] == {}
 
 
-def test_repeating_a_run_gives_the_same_bytes_and_another_seed_others(small_run, tmp_path, undisturbed):
+def test_a_repeated_run_gives_the_same_bytes_and_another_seed_other_bytes(small_run, tmp_path, undisturbed):
     assert same(run_inline(small_run, tmp_path / "again"), undisturbed)
     other = run_inline(dataclasses.replace(small_run, seed=1), tmp_path / "other")
     assert other["dataset_digest"] != undisturbed["dataset_digest"]
 
 
 @pytest.mark.parametrize("when", [("collect", 0, 20), ("fit", 0, 4), ("collect", 2, 40), ("fit", 2, 3)])
-def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, undisturbed, when, monkeypatch):
+def test_a_run_stopped_at_any_step_resumes_to_the_same_bytes(small_run, tmp_path, undisturbed, when, monkeypatch):
     what, next_version, step = when
     stopped = []
 
@@ -83,11 +83,11 @@ def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, u
         at = event.get("stage"), event.get("version", -2) + 1
         if event["event"] == "progress" and at == (what, next_version) and event["step"] >= step and not stopped:
             stopped.append(event)
-            made[0].stop()
+            services[0].stop()
 
-    made = []
+    services = []
     real = service.Service.run
-    monkeypatch.setattr(service.Service, "run", lambda self: made.append(self) or real(self))
+    monkeypatch.setattr(service.Service, "run", lambda self: services.append(self) or real(self))
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     folder = tmp_path / "stopped"
     with pytest.raises(train.TrainInterrupted):
@@ -99,7 +99,7 @@ def test_a_run_stopped_anywhere_resumes_to_the_same_bytes(small_run, tmp_path, u
     assert same(run_inline(small_run, folder, resume=True), undisturbed)
 
 
-def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(parent):
+def test_the_agent_of_a_run_loads_with_a_complete_manifest(parent):
     folder, undisturbed, _ = parent
     agent = load_agent(folder, seed=0)
     manifest = agent.manifest
@@ -111,7 +111,7 @@ def test_the_agent_of_a_run_loads_and_says_where_it_comes_from(parent):
     assert agent.act(np.zeros((2, 2))).shape == (2,)
 
 
-def test_a_folder_in_use_and_other_numbers_are_refused(small_run, tmp_path, parent):
+def test_an_existing_folder_and_changed_settings_are_refused(small_run, tmp_path, parent):
     folder = shutil.copytree(parent[0], tmp_path / "undisturbed")
     with pytest.raises(ConfigError, match="exists: use --resume"):
         train.prepare(small_run, folder, resume=False, overwrite=False)
@@ -129,14 +129,12 @@ def test_a_folder_in_use_and_other_numbers_are_refused(small_run, tmp_path, pare
         run_inline(large, folder, resume=True)
 
 
-def test_a_job_that_always_fails_ends_the_run_with_its_cause(small_run, tmp_path, monkeypatch):
+def test_a_job_that_always_fails_ends_the_run_with_the_cause(small_run, tmp_path, monkeypatch):
     from icrl_dist.collect import jobs
 
     def broken(job, worker):
         raise ZeroDivisionError("the environment broke")
 
     monkeypatch.setattr(jobs, "random_context", broken)
-    with pytest.raises(
-        train.TrainFailed, match=r"not one trajectory was stored, and .* ZeroDivisionError: the environment broke"
-    ):
+    with pytest.raises(train.TrainFailed, match=r"no trajectory was stored, and .* ZeroDivisionError: the environment broke"):
         run_inline(small_run, tmp_path / "broken")

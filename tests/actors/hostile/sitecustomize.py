@@ -1,7 +1,7 @@
-"""Read by every Python process that finds it on PYTHONPATH: makes one variation hostile to its worker.
+"""Every Python process with this folder on PYTHONPATH imports this file: it makes one variation fail in its worker.
 
-This is how a test reaches into worker processes that it does not start itself.  ``HOSTILE`` is
-what the variation does in its third step, ``HOSTILE_VARIATION`` its ``repr``.
+A test uses it to change worker processes that it does not start itself.  ``HOSTILE`` names the failure
+in the variation's third step, ``HOSTILE_VARIATION`` is the ``repr`` of the variation.
 """
 
 import os
@@ -22,9 +22,9 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
             time.sleep(1000)
 
     def hold_the_interpreter_in_c():
-        ctypes.PyDLL(None).sleep(1000)  # PyDLL keeps the lock of the interpreter
+        ctypes.PyDLL(None).sleep(1000)  # PyDLL does not release the interpreter lock
 
-    DEEDS = {
+    FAILURES = {
         "raise": raise_an_error,
         "sleep": sleep_for_ever,
         "hold": hold_the_interpreter_in_c,
@@ -34,7 +34,7 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
     }
 
     class Hostile:
-        """A batch of environments, one of which does its deed."""
+        """A batch of environments that fails in its third step."""
 
         def __init__(self, batch):
             self._batch = batch
@@ -46,13 +46,13 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
         def step(self, action):
             self._steps += 1
             if self._steps == 3:
-                DEEDS[os.environ["HOSTILE"]]()
+                FAILURES[os.environ["HOSTILE"]]()
             return self._batch.step(action)
 
     real = registry.batch
 
     def batch(variations):
-        """The real environments, unless the hostile variation is among them."""
+        """The real environments; they fail if the hostile variation is among them."""
         made = real(variations)
         return Hostile(made) if any(repr(v) == os.environ["HOSTILE_VARIATION"] for v in variations) else made
 

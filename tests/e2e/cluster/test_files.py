@@ -1,4 +1,4 @@
-"""What Ray says of the on-premises file, and that it sends what the package is made of."""
+"""Ray accepts the on-premises cluster file, and the file copies every source of the package to the nodes."""
 
 import tomllib
 
@@ -6,11 +6,11 @@ import click
 import jsonschema
 import pytest
 
-from tests.e2e import hosts
+from tests.e2e import simulated_nodes
 from tests.e2e.cluster.files import accepted, shipped
 
 
-def test_ray_accepts_the_shipped_file_and_wants_every_worker():
+def test_ray_accepts_the_shipped_file_with_every_worker_node():
     whole = accepted(shipped())
     (kind,) = whole["available_node_types"].values()
     assert kind["min_workers"] == kind["max_workers"] == len(shipped()["provider"]["worker_ips"])
@@ -26,7 +26,7 @@ def test_ray_accepts_the_shipped_file_and_wants_every_worker():
         (("auth",), "ssh_private_key", 7),
     ],
 )
-def test_ray_refuses_a_file_with_a_slip(where, key, value):
+def test_ray_refuses_a_file_with_a_mistake(where, key, value):
     config = shipped()
     table = config
     for name in where:
@@ -36,17 +36,17 @@ def test_ray_refuses_a_file_with_a_slip(where, key, value):
         accepted(config)
 
 
-def test_ray_refuses_a_file_without_workers():
+def test_ray_refuses_a_file_without_worker_nodes():
     config = shipped()
     del config["provider"]["worker_ips"]
     with pytest.raises(click.ClickException):
         accepted(config)
 
 
-def test_what_the_package_is_made_of_is_sent_to_the_hosts():
-    project = tomllib.loads((hosts.ROOT / "pyproject.toml").read_text())
+def test_all_sources_of_the_package_are_copied_to_the_nodes():
+    project = tomllib.loads((simulated_nodes.ROOT / "pyproject.toml").read_text())
     sources = {source for source in shipped()["file_mounts"].values() if not source.startswith("~")}
     assert sources == {"pyproject.toml", "constraints.txt", project["project"]["readme"]} | {
         package.split(".")[0] for package in project["tool"]["setuptools"]["packages"]
     }
-    assert all((hosts.ROOT / source).exists() for source in sources)
+    assert all((simulated_nodes.ROOT / source).exists() for source in sources)

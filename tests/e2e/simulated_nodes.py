@@ -1,7 +1,7 @@
-"""Hosts on this machine, for tests: each has an address, a home, /tmp and an ssh server of its own.
+"""Simulated cluster nodes on this machine, for tests: each has its own address, home, /tmp and ssh server.
 
-A host is a process with namespaces.  All of it (network, mounts, processes) ends with that
-process, and the process ends when the test does, however that ends: it reads a pipe from it.
+A node is a process with its own namespaces.  Its network, mounts and processes end with that process.
+The process reads a pipe from the test, so it ends when the test ends for any reason.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import psutil
 
 ROOT = Path(__file__).parents[2]
 HOME = "/run/home"
-"""A host's home folder, on the host."""
+"""Home folder of a node, as a path on the node."""
 PATH = f"{sys.prefix}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 CODE = f"PYTHONPATH={ROOT}"
-"""What makes every host run this checkout, wherever the environment's own copy lies."""
+"""Makes every node run this checkout and not the package installed in the environment."""
 NEEDED = ("openssl", "ip", "unshare", "nsenter", "ssh", "ssh-keygen", "/usr/sbin/sshd", "rsync")
 
 INIT = """
@@ -57,7 +57,7 @@ UseDNS no
 
 
 def missing() -> str:
-    """Why there can be no hosts here; empty if there can."""
+    """Why simulated nodes are impossible on this machine; empty if they are possible."""
     if os.geteuid() != 0:
         return "namespaces with networks need root"
     absent = [name for name in NEEDED if shutil.which(name) is None]
@@ -68,27 +68,27 @@ def missing() -> str:
         capture_output=True,
         text=True,
     )
-    return f"no namespaces here: {trial.stderr.strip()}" if trial.returncode else ""
+    return f"no namespaces on this machine: {trial.stderr.strip()}" if trial.returncode else ""
 
 
 @dataclass(frozen=True)
-class Host:
-    """A running host."""
+class SimulatedNode:
+    """A running node."""
 
     name: str
     address: str
     home: Path
-    """Its home folder, as seen from here; on the host ``HOME``."""
+    """Home folder as a path on this machine; on the node it is ``HOME``."""
     init: psutil.Process
-    """Its first process: all others on the host descend from it."""
+    """First process of the node; all others descend from it."""
 
     def command(self, *arguments: object) -> list[str]:
-        """The command that runs ``arguments`` on the host, as root with the tests' environment first on PATH."""
+        """The command that runs ``arguments`` on the node, as root with the tests' environment first on PATH."""
         enter = ["nsenter", "-t", str(self.init.pid), "-m", "-p", "-u", "-i", "-n"]
         return [*enter, "env", "-i", f"HOME={HOME}", "USER=root", f"PATH={PATH}", CODE, *map(str, arguments)]
 
     def run(self, *arguments: object, timeout: float = 90) -> str:
-        """What the command printed; raises AssertionError with that if it fails."""
+        """Run a command on the node; returns its output.  Raises AssertionError with the output if it fails."""
         done = subprocess.run(
             self.command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=timeout
         )
@@ -96,7 +96,7 @@ class Host:
         return done.stdout
 
     def processes(self, word: str) -> list[psutil.Process]:
-        """Its processes with ``word`` in their command line."""
+        """The processes of the node with ``word`` in their command line."""
         found = []
         for process in self.init.children(recursive=True):
             with contextlib.suppress(psutil.NoSuchProcess):
@@ -106,19 +106,19 @@ class Host:
 
 
 @contextlib.contextmanager
-def running(folder: Path, names: Sequence[str]) -> Iterator[list[Host]]:
-    """Hosts on one network that reach each other by ssh with the key ``~/.ssh/id_ed25519`` of each."""
+def running(folder: Path, names: Sequence[str]) -> Iterator[list[SimulatedNode]]:
+    """Start nodes on one network; they reach each other by ssh with the key ``~/.ssh/id_ed25519`` of each."""
     key = folder / "key"
     for name in ("key", "host_key"):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / name], check=True)
     with contextlib.ExitStack() as stack:
-        hosts = [stack.enter_context(_host(folder / name, name, f"10.0.0.{n}", key)) for n, name in enumerate(names, 1)]
-        _connect(hosts)
-        yield hosts
+        nodes = [stack.enter_context(_node(folder / name, name, f"10.0.0.{n}", key)) for n, name in enumerate(names, 1)]
+        _connect(nodes)
+        yield nodes
 
 
 @contextlib.contextmanager
-def _host(files: Path, name: str, address: str, key: Path) -> Iterator[Host]:
+def _node(files: Path, name: str, address: str, key: Path) -> Iterator[SimulatedNode]:
     (files / "home" / ".ssh").mkdir(parents=True, mode=0o700)
     (files / "home").chmod(0o700)
     shutil.copy(key, files / "home" / ".ssh" / "id_ed25519")
@@ -136,20 +136,20 @@ def _host(files: Path, name: str, address: str, key: Path) -> Iterator[Host]:
         try:
             assert process.stdout.readline() == "ready\n", f"{name} did not start"
             (init,) = psutil.Process(process.pid).children()
-            yield Host(name, address, files / "home", init)
+            yield SimulatedNode(name, address, files / "home", init)
         finally:
             process.stdin.close()
             process.wait(timeout=20)
 
 
-def _connect(hosts: Sequence[Host]) -> None:
-    """A bridge on the first host, and a cable from it to each of the others."""
-    first, *others = hosts
+def _connect(nodes: Sequence[SimulatedNode]) -> None:
+    """Create a bridge on the first node and a virtual cable from it to each other node."""
+    first, *others = nodes
     first.run("ip", "link", "add", "bridge", "type", "bridge")
-    for number, host in enumerate(others):
-        ends = (f"port{number}", "netns", first.init.pid, "type", "veth", "peer", "name", "eth0", "netns", host.init.pid)
+    for number, node in enumerate(others):
+        ends = (f"port{number}", "netns", first.init.pid, "type", "veth", "peer", "name", "eth0", "netns", node.init.pid)
         subprocess.run(["ip", "link", "add", "name", *map(str, ends)], check=True)
         first.run("ip", "link", "set", f"port{number}", "master", "bridge", "up")
-    for host, device in ((first, "bridge"), *((host, "eth0") for host in others)):
-        host.run("ip", "address", "add", f"{host.address}/24", "dev", device)
-        host.run("ip", "link", "set", device, "up")
+    for node, device in ((first, "bridge"), *((node, "eth0") for node in others)):
+        node.run("ip", "address", "add", f"{node.address}/24", "dev", device)
+        node.run("ip", "link", "set", device, "up")
