@@ -82,7 +82,7 @@ class InContextAgent:
         Raises ValueError for a batch of another shape.
         """
         states = self._shaped("obs", obs, np.float32, self.model.spec.observation)
-        return self._policy.act(states, self._rng.random((len(states), self.model.reads.numbers)))
+        return self._policy.act(states, self._rng.random((len(states), self.model.action_head.uniforms)))
 
     def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
         """One transition of each environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, the others ``(B,)``.
