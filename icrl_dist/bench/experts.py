@@ -19,8 +19,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.sac.batched import Products, SACBatch
-from icrl_dist.experts.sac.draws import of_updates
+from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch
+from icrl_dist.experts.sac.draws import update_draws
 from icrl_dist.experts.sac.sb3_files import blank
 from icrl_dist.types import Spec
 
@@ -75,9 +75,9 @@ def run(quick: bool = False, paper: Sizes = PAPER, small: Sizes = SMALL) -> dict
     return result | {"ok": not reasons, "reasons": reasons}
 
 
-def compare(sizes: Sizes, products: Products, turns: int) -> tuple[float, float]:
+def compare(sizes: Sizes, matmul_dtype: MatmulDtype, turns: int) -> tuple[float, float]:
     """Updates per CPU-second per expert, ours and stable-baselines3's: medians over ``turns``, after one more."""
-    ours, theirs = lockstep(sizes, products), alone(sizes.config)
+    ours, theirs = lockstep(sizes, matmul_dtype), alone(sizes.config)
     found = []
     for _ in range(turns + 1):
         found.append((sizes.experts * sizes.ours / _seconds(ours, sizes.ours), sizes.theirs / _seconds(theirs, sizes.theirs)))
@@ -91,18 +91,18 @@ def _seconds(update: Callable[[int], None], count: int) -> float:
     return time.process_time() - began
 
 
-def lockstep(sizes: Sizes, products: Products, device: str = "cpu", graph: bool = True) -> Callable[[int], None]:
+def lockstep(sizes: Sizes, matmul_dtype: MatmulDtype, device: str = "cpu", graph: bool = True) -> Callable[[int], None]:
     """So many updates of our experts."""
     config = sizes.config
-    experts = SACBatch(range(sizes.experts), SPEC, config, device, products, None, graph)
+    experts = SACBatch(range(sizes.experts), SPEC, config, device, matmul_dtype, None, graph)
     remembered = [_remembered(np.random.default_rng((0, index)), config.replay) for index in range(sizes.experts)]
     rows = np.stack([np.concatenate(columns, axis=1) for columns in remembered])
     experts.replay.load({"rows": rows, "added": np.array(config.replay)})
     episodes, shape = itertools.count(), (config.batch, SPEC.actions)
 
     def update(count: int) -> None:
-        for picks, noise in of_updates(range(sizes.experts), next(episodes), shape, count, experts.device):
-            experts.learn(picks, noise)
+        for picks, noise in update_draws(range(sizes.experts), next(episodes), shape, count, experts.device):
+            experts.update_from_replay(picks, noise)
 
     return update
 

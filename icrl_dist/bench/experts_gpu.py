@@ -18,8 +18,8 @@ import torch
 from icrl_dist.bench.experts import REMEMBERED, Sizes, alone, lockstep
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.sac.batched import Products, SACBatch, pick, train
-from icrl_dist.experts.sac.draws import Chance
+from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch, pick, train
+from icrl_dist.experts.sac.draws import EpisodeDraws
 from icrl_dist.problems import registry, splits
 from icrl_dist.problems.registry import Batch
 
@@ -30,7 +30,7 @@ PAPER = "dmc-cartpole-balance"
 """The run whose m x K experts are trained."""
 STEPS = 1_500
 """Steps of that training in which the experts learn."""
-_KINDS: dict[str, tuple[Products, bool]] = {
+_KINDS: dict[str, tuple[MatmulDtype, bool]] = {
     "fp32_no_graph": ("float32", False),
     "bf16_no_graph": ("bfloat16", False),
     "fp32": ("float32", True),
@@ -154,7 +154,7 @@ def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.devic
         spent[part] += time.perf_counter() - began
 
     with timed("draw"):
-        drawn = Chance(range(env.batch), experts.steps // horizon, env.spec, config, count, device)
+        drawn = EpisodeDraws(range(env.batch), experts.steps // horizon, env.spec, config, count, device)
     updates = iter(drawn.updates)
     seen = np.asarray(env.reset(drawn.starts), np.float32)
     for number in range(horizon):
@@ -163,10 +163,10 @@ def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.devic
         with timed("environment"):
             step = env.step(action)
         with timed("remember"):
-            experts.remember(seen, action, step)
+            experts.store(seen, action, step)
         if number % config.update_every == 0:
             with timed("update"):
-                experts.learn(*next(updates))
+                experts.update_from_replay(*next(updates))
         seen = step.observation
     return {part: seconds / horizon for part, seconds in spent.items()}
 

@@ -170,7 +170,7 @@ def _training(job: Job, budget_s: float) -> float:
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        train(env, short, 20 * horizon, range(env.batch), progress, by=trained_by(env.batch))
+        train(env, short, 20 * horizon, range(env.batch), progress, backend=trained_by(env.batch))
     return float(np.median(np.diff(times))) * config.steps / horizon  # the first episode is over before they learn
 
 

@@ -27,7 +27,7 @@ from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, sav
 from icrl_dist.types import Job, Trajectory, Variation
 
 if TYPE_CHECKING:
-    from icrl_dist.experts.sac.batched import By, SACBatch
+    from icrl_dist.experts.sac.batched import Backend, SACBatch
 
 _log = logging.getLogger(__name__)
 
@@ -76,20 +76,20 @@ def _histories(job: Job, config: SACConfig, tell: Tell) -> list[History]:
     return [found[variation] for variation in job.variations]
 
 
-def trained_by(experts: int) -> By:
+def trained_by(experts: int) -> Backend:
     """stable-baselines3, the reference, trains a job's expert that is alone; several train in lockstep, and one on a GPU."""
     from icrl_dist.experts.sac.batched import pick
 
     return "stable-baselines3" if experts == 1 and pick("auto").type == "cpu" else "lockstep"
 
 
-def _trainer(by: By) -> Trainer:
+def _trainer(by: Backend) -> Trainer:
     from icrl_dist.experts.sac.batched import pick
 
     return "lockstep, cuda" if by == "lockstep" and pick("auto").type == "cuda" else by
 
 
-def _train(job: Job, variations: Sequence[Variation], by: By, config: SACConfig, tell: Tell) -> list[History]:
+def _train(job: Job, variations: Sequence[Variation], by: Backend, config: SACConfig, tell: Tell) -> list[History]:
     from icrl_dist.experts.sac.batched import train
 
     names = [key(variation, config, job.seed, _trainer(by), job.trials) for variation in variations]
@@ -110,7 +110,7 @@ def _train(job: Job, variations: Sequence[Variation], by: By, config: SACConfig,
             save_checkpoint(part, Checkpoint(arrays, {}))
             written = time.monotonic()
 
-    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, progress, state=state, by=by)
+    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, progress, state=state, backend=by)
     columns, led = labelled(recorder.columns(), experts.act), lead(env, experts.act, seeds, range(env.batch))
     made = assembled(job, variations, columns, led, experts.arrays["actor"].cpu().numpy(), tell)
     if part is not None:

@@ -50,7 +50,7 @@ def test_each_side_makes_the_updates_it_is_timed_for_from_the_same_memory(monkey
 def rates(fp32, bf16, small):
     """In place of what is measured: our rate over theirs, of which the first turn is left out."""
     told = {("float32", 10): fp32, ("bfloat16", 10): bf16, ("float32", 20): small}
-    return lambda sizes, products, turns: (told[products, sizes.experts], 1.0)
+    return lambda sizes, matmul_dtype, turns: (told[matmul_dtype, sizes.experts], 1.0)
 
 
 @pytest.mark.parametrize("native", [True, False])
@@ -138,10 +138,10 @@ def test_hours_are_the_warm_ups_steps_at_their_pace_and_the_rest_at_that_of_upda
 def test_what_cannot_be_measured_is_said_and_loses_nothing_else(monkeypatch):
     real = experts_gpu.lockstep
 
-    def lockstep(sizes, products, device, graph):
+    def lockstep(sizes, matmul_dtype, device, graph):
         if graph:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing\nand more")
-        return real(sizes, products, device, graph)
+        return real(sizes, matmul_dtype, device, graph)
 
     def missing():
         raise ModuleNotFoundError("No module named 'dm_control'")
