@@ -120,7 +120,7 @@ def test_hours_are_the_warm_ups_steps_at_their_pace_and_the_rest_at_that_of_upda
     now = [0.0]
 
     def made(env, config, steps, seeds, progress, device):
-        trained = experts.SACBatch(seeds, env.spec, run, device)
+        trained = experts.SACBatch(seeds, env.spec, config, device)
         for trained.steps in range(10, steps + 1, 10):
             now[0] += 1.0 if trained.steps <= 20 else 9.0 if trained.steps == 30 else 5.0
             progress(trained, np.zeros(2))
