@@ -94,9 +94,7 @@ def run(workers: int = 8, pairs: int = 10) -> dict[str, Any]:
 
 def describe(result: dict[str, Any]) -> str:
     """The result as a small table."""
-    rows = [
-        f"{'bytes':>12}{'ours':>10}{'Ray':>10}{'ratio':>8}   ms until all {result['workers']} have loaded the weights"
-    ]
+    rows = [f"{'bytes':>12}{'ours':>10}{'Ray':>10}{'ratio':>8}   ms until all {result['workers']} have loaded the weights"]
     rows += [
         f"{result[f'bytes_{s}']:>12,}{result[f'ours_ms_{s}']:>10.1f}{result[f'ray_ms_{s}']:>10.1f}{result[f'ratio_{s}']:>8.2f}"
         for s in WIDTHS
