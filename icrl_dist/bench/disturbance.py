@@ -1,8 +1,8 @@
-"""What the default disturbances cost: the return that an undisturbed expert loses under each.
+"""How strong the default disturbances are: the return that an undisturbed expert loses under them.
 
-An adversary that takes nothing away makes a variation that is no other task.  In DeepMind Control
-the expert is a SAC expert of the problem's nominal task; in Meta-World it is the scripted policy,
-told the goal, which sees hand and object where the adversary shows them.
+A disturbance without loss creates variations that are not different tasks.  In DeepMind Control the
+expert is a SAC expert of the problem's nominal task.  In Meta-World it is the scripted policy with the
+true goal; it observes hand and object as displaced by the adversary.
 """
 
 from __future__ import annotations
@@ -22,52 +22,53 @@ from icrl_dist.config.toml import nearest
 from icrl_dist.experts import cache
 from icrl_dist.experts.cache import History
 from icrl_dist.experts.train import ExpertPolicy, train_expert
+from icrl_dist.interfaces import Policy
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.network_adversary import networks
 from icrl_dist.problems.dmc import domains
 from icrl_dist.problems.metaworld import pick_place
-from icrl_dist.rollout.deployment import Actor, deploy_online
+from icrl_dist.rollout.episode import deploy_online
 from icrl_dist.types import Adversary, Job, Task, Variation
 
 PROBLEMS = (*domains.PROBLEMS, pick_place.KIND)
 WEAK = 0.02
-"""Share of the return that the default adversaries take on average, below which they are called weak."""
+"""Default adversaries are weak if the mean relative loss of return under them is below this."""
 EARNS = 0.01
-"""Mean reward a step that an expert must earn undisturbed, or there is nothing to lose."""
+"""Mean reward per step that an expert needs without disturbance: below it, a relative loss means nothing."""
 LONGER = dict.fromkeys(("dmc-cheetah-run", "dmc-reacher-easy", "dmc-reacher-hard"), 36_000)
-"""Steps of an expert's training where it has hardly begun to earn after its run file's 12,000."""
-_CHANCE, _ADVERSARIES = 1, 2
+"""Training steps for problems whose experts have almost no return after the 12,000 steps of the run file."""
+_EPISODES, _ADVERSARIES = 1, 2  # spawn keys of the generators
 
 Report = Callable[[str], None]
-Make = Callable[[Any], Actor]
-"""The policy that acts in a batch of environments."""
+Make = Callable[[Any], Policy]
+"""Makes the policy for a batch of environments."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Sizes:
-    """How much is measured."""
+class DisturbanceSizes:
+    """The size of the measurement."""
 
     adversaries: int = 9
-    """K, beside the null adversary."""
+    """K, in addition to the null adversary."""
     episodes: int = 10
-    """Under each adversary, in DeepMind Control."""
+    """Episodes under each adversary, in DeepMind Control."""
     tasks: int = 5
-    """Of Meta-World, where a task begins always alike: each for one episode under each adversary."""
+    """Tasks of Meta-World, each with one episode per adversary, because its initial states are fixed."""
     steps: int = 0
-    """Of an expert's training; 0: its run file's, or those of ``LONGER``."""
+    """Training steps of an expert; 0: those of the run file, or of ``LONGER``."""
 
 
-QUICK = Sizes(episodes=3, tasks=2, steps=4_000)
+QUICK = DisturbanceSizes(episodes=3, tasks=2, steps=4_000)
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """Which disturbance of a problem: at strength 1, the largest force of a preset, or so many metres."""
+    """A disturbance of a problem; strength 1 is the largest force of a preset, or a displacement in metres."""
 
     forces: str
-    """``paper`` or ``qarl``; Meta-World: empty."""
+    """The preset, ``paper`` or ``qarl``; empty in Meta-World."""
     task: Task
-    """Of an adversary's widths and strength; DeepMind Control: the nominal one, which the expert was trained in."""
+    """The task that adversaries are made for; in DeepMind Control the nominal one, in which the expert was trained."""
     outputs: int
     """Components of an adversary's action."""
 
@@ -75,220 +76,222 @@ class Setting:
 def run(
     problem: str | None = None,
     quick: bool = False,
-    report: Report = lambda said: None,
-    sizes: Sizes | None = None,
+    report: Report = lambda text: None,
+    sizes: DisturbanceSizes | None = None,
 ) -> dict[str, Any]:
-    """Shares of the return that are lost under K default adversaries, of every problem or of the one named.
+    """Relative losses of return under K default adversaries, for every problem or for ``problem``.
 
-    Experts are those of the problem's laptop run file, in its cache: what was trained before is not
-    trained again.  Raises ConfigError for an unknown problem.
+    Experts have the settings of the problem's laptop run file and are stored in its cache, so each is
+    trained only once.  Raises ConfigError for an unknown problem.
     """
     if problem is not None and problem not in PROBLEMS:
         known = ", ".join(PROBLEMS)
         raise ConfigError(f"bench disturbance: problem = {problem!r}{nearest(problem, PROBLEMS)}: choose one of {known}")
-    sizes = sizes or (QUICK if quick else Sizes())
+    sizes = sizes or (QUICK if quick else DisturbanceSizes())
     rows = []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         for kind in PROBLEMS if problem is None else (problem,):
-            config = numbers(kind, sizes.steps)
+            config = sac_config(kind, sizes.steps)
             make = policy(kind, config, report)
-            for one in settings(kind):
-                report(f"{kind}: {sizes.adversaries} adversaries{one.forces and f', forces of {one.forces}'}")
-                rows.append(_row(kind, one, make, sizes, config))
+            for setting in settings(kind):
+                preset = setting.forces and f", forces of the preset {setting.forces}"
+                report(f"{kind}: {sizes.adversaries} adversaries{preset}")
+                rows.append(_row(kind, setting, make, sizes, config))
                 report(describe_row(rows[-1]))
     finally:
         torch.set_num_threads(threads)
     return {"quick": quick, **dataclasses.asdict(sizes), "problems": rows, "weak": sum(bool(row["weak"]) for row in rows)}
 
 
-def numbers(kind: str, steps: int = 0) -> SACConfig:
-    """SAC's numbers for an expert of this problem: its laptop run file's, but for so many ``steps``, or those of ``LONGER``."""
+def sac_config(kind: str, steps: int = 0) -> SACConfig:
+    """SAC settings for this problem's experts: those of its laptop run file, with ``steps``, or the steps of ``LONGER``."""
     config = load(f"{kind}-laptop" if kind in domains.PROBLEMS else "metaworld-laptop").sac
     return dataclasses.replace(config, steps=steps or LONGER.get(kind, config.steps))
 
 
 def settings(kind: str) -> list[Setting]:
-    """The disturbances of a problem: both presets of forces where they differ, Meta-World's metres."""
+    """The disturbances of a problem: both presets of forces if they differ; in Meta-World one displacement."""
     if kind == pick_place.KIND:
         return [Setting("", pick_place.task((0.0, 0.65, 0.02), (0.0, 0.85, 0.2)), pick_place.MOVED)]
     forces = domains.problem(kind).forces
     presets = ("paper",) if forces["paper"] == forces["qarl"] else ("paper", "qarl")
-    return [Setting(one, domains.task(kind, forces=one), forces[one].count) for one in presets]  # type: ignore[index]
+    return [Setting(preset, domains.task(kind, forces=preset), forces[preset].count) for preset in presets]  # type: ignore[index]
 
 
 def policy(kind: str, config: SACConfig, report: Report) -> Make:
-    """Makes the problem's expert; trains it first if it is not in the cache."""
+    """The function that makes the problem's expert; trains the expert if it is not in the cache."""
     if kind == pick_place.KIND:
-        return ToldTheGoal
+        return ScriptedWithGoal
     history = expert(kind, config, report)
     return lambda env: ExpertPolicy([history] * env.batch, config)
 
 
 def expert(kind: str, config: SACConfig, report: Report) -> History:
-    """The undisturbed expert of the problem's nominal task, from the cache or of a training."""
+    """The undisturbed expert of the problem's nominal task, from the cache or newly trained."""
     variation = Variation(domains.task(kind))
     found = cache.any_kept(variation, config, 0)
     if found is None:
-        report(f"{kind}: an expert trains for {config.steps:,} steps")
+        report(f"{kind}: training an expert for {config.steps:,} steps")
         found = next(iter(trained(kind, (variation,), config, report)), None)
     if found is None:
-        raise ConfigError(
-            f"sac.cache = {config.cache!r}: the expert that was trained is not there; name a folder that keeps it"
-        )
+        raise ConfigError(f"sac.cache = {config.cache!r}: the trained expert is not there; set it to a writable folder")
     return found
 
 
 def trained(kind: str, variations: tuple[Variation, ...], config: SACConfig, report: Report) -> list[History]:
-    """Undisturbed experts, one a task, from the cache or of a training; those that the cache does not keep are missing."""
-    told = itertools.count(1)
+    """Undisturbed experts, one per variation, from the cache or newly trained; without a cache they are missing."""
+    messages = itertools.count(1)
 
-    def tell(text: str, note: bool = False, reached: int = 0) -> None:
-        if note or next(told) % 10 == 0:
+    def progress(text: str, note: bool = False, reached: int = 0) -> None:
+        if note or next(messages) % 10 == 0:
             report(f"{kind}: {text}")
 
-    asked = (*cache.settings(config), ("decoy_fraction", 0.0), ("queries", 1), ("window", 1), ("windows", 0))
-    for _ in train_expert(Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, asked, len(variations)), "bench", tell):
-        pass  # what is wanted is in the cache
-    return [history for one in variations if (history := cache.any_kept(one, config, 0)) is not None]
+    settings = (*cache.settings(config), ("decoy_fraction", 0.0), ("queries", 1), ("window", 1), ("windows", 0))
+    job = Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, settings, len(variations))
+    for _ in train_expert(job, "bench", progress):
+        pass  # the trajectories are not needed: the histories are read from the cache
+    return [history for variation in variations if (history := cache.any_kept(variation, config, 0)) is not None]
 
 
-class ToldTheGoal:
-    """Meta-World's scripted policy: it acts by what it is shown of hand and object, and the true goal."""
+class ScriptedWithGoal:
+    """Meta-World's scripted policy, with the observed hand and object and the true goal."""
 
     def __init__(self, env: Any) -> None:
         self._env = env
         self.succeeded: Bool[np.ndarray, " B"] = np.zeros(env.batch, bool)
-        """Where the object was at the goal once."""
+        """True where the object has reached the goal."""
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
-        """What it does if what is shown were true."""
+        """The scripted actions for the observed state and the true goal."""
         from icrl_dist.problems.metaworld.environment import expert as scripted
 
-        seen = observation.astype(np.float64)
-        seen[:, 36:] = self._env.truth[:, 36:]
-        return scripted(seen)
+        state = observation.astype(np.float64)
+        state[:, 36:] = self._env.truth[:, 36:]
+        return scripted(state)
 
     def observe(self, *transition: object) -> None:
-        """Remember who has succeeded."""
+        """Record successes."""
         self.succeeded = self.succeeded | self._env.success
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Measured:
-    """C episodes under each of R adversaries."""
+class MeasuredReturns:
+    """Returns of C episodes under each of R adversaries."""
 
     returns: Float[np.ndarray, "C R"]
     broken: int
-    """Episodes in which a simulation broke down, and earned nothing from then on."""
+    """Episodes in which the simulation diverged; rewards after that are 0."""
     succeeded: Float[np.ndarray, " R"] | None
-    """Share of the tasks that succeeded, where the game knows success."""
+    """Share of the tasks that succeeded; None if the environment does not report success."""
 
 
-def measure(rows: Sequence[Variation], make: Make, episodes: int, tasks: int) -> Measured:
-    """So many episodes in every row, each begun alike under every adversary of a task.
+def measure(rows: Sequence[Variation], make: Make, episodes: int, tasks: int) -> MeasuredReturns:
+    """Run ``episodes`` in every row.  Episodes of a task have the same initial states under all adversaries.
 
     ``rows`` are the R variations of each task, task by task: C = episodes x tasks.
     """
     env = registry.batch(rows)
-    acting, adversaries = make(env), len(rows) // tasks
-    chance = ([_chance(number, row // adversaries) for row in range(len(rows))] for number in range(episodes))
-    ran = list(deploy_online(env, acting, chance))
-    returns = np.stack([one.returns for one in ran]).reshape(episodes * tasks, adversaries)
-    broken = sum(int(one.diverged.sum()) for one in ran if one.diverged is not None)
-    succeeded = getattr(acting, "succeeded", None)
+    policy, adversaries = make(env), len(rows) // tasks
+    rngs = ([_episode_rng(number, row // adversaries) for row in range(len(rows))] for number in range(episodes))
+    ran = list(deploy_online(env, policy, rngs))
+    returns = np.stack([episode.returns for episode in ran]).reshape(episodes * tasks, adversaries)
+    broken = sum(int(episode.diverged.sum()) for episode in ran if episode.diverged is not None)
+    succeeded = getattr(policy, "succeeded", None)
     shares = None if succeeded is None else succeeded.reshape(tasks, adversaries).mean(axis=0)
-    return Measured(returns, broken, shares)
+    return MeasuredReturns(returns, broken, shares)
 
 
-def _chance(episode: int, task: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_CHANCE, episode, task)))
+def _episode_rng(episode: int, task: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_EPISODES, episode, task)))
 
 
-def variations(one: Setting, sizes: Sizes) -> tuple[list[Variation], int]:
-    """The null adversary and K of strength 1 in each task, task by task; and how many tasks."""
-    tasks: tuple[Task, ...] = (one.task,)
-    if one.task.kind == pick_place.KIND:
+def variations(setting: Setting, sizes: DisturbanceSizes) -> tuple[list[Variation], int]:
+    """The null adversary and K adversaries of strength 1 in each task, task by task; and the number of tasks."""
+    tasks: tuple[Task, ...] = (setting.task,)
+    if setting.task.kind == pick_place.KIND:
         from icrl_dist.problems.metaworld.environment import ml1_tasks
 
         tasks = ml1_tasks(sizes.tasks)
-    return [Variation(task, push) for task in tasks for push in pushes(one, sizes.adversaries)], len(tasks)
+    return [Variation(task, push) for task in tasks for push in adversaries(setting, sizes.adversaries)], len(tasks)
 
 
-def pushes(one: Setting, count: int, strength: float = 1.0) -> tuple[Adversary, ...]:
-    """The null adversary and ``count`` others, at every strength the same ones."""
+def adversaries(setting: Setting, count: int, strength: float = 1.0) -> tuple[Adversary, ...]:
+    """The null adversary and ``count`` networks, which are the same at every strength."""
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_ADVERSARIES,)))
-    return networks(rng, count + 1, registry.spec(one.task), one.outputs, strength)
+    return networks(rng, count + 1, registry.spec(setting.task), setting.outputs, strength)
 
 
 def lost(returns: Float[np.ndarray, "C R"]) -> dict[str, float | None]:
-    """What R - 1 adversaries cost, of returns under the null adversary (first) and each of them.
+    """The loss under R - 1 adversaries, from returns under the null adversary (first column) and each of them.
 
-    Shares of the mean undisturbed return: ``lost_mean`` over adversaries, ``lost_worst`` under the
-    worst; ``lost_error`` is the first's standard error over episodes, each with its own undisturbed
-    one.  Standard errors are None of a single episode, shares where nothing is earned.
+    Relative to the mean undisturbed return: ``lost_mean`` is the mean loss over adversaries, ``lost_worst``
+    the loss under the worst, ``lost_error`` the standard error of ``lost_mean`` over episodes, each paired
+    with its undisturbed episode.  Standard errors are None for a single episode, losses are None if the
+    undisturbed return is not positive.
     """
-    alone, under = returns[:, 0], returns[:, 1:]
-    base, apart = float(alone.mean()), _error(alone - under.mean(axis=1))
+    undisturbed, disturbed = returns[:, 0], returns[:, 1:]
+    base, paired_error = float(undisturbed.mean()), _error(undisturbed - disturbed.mean(axis=1))
     return {
         "undisturbed": base,
-        "undisturbed_error": _error(alone),
-        "mean": float(under.mean()),
-        "mean_error": _error(under.mean(axis=1)),
-        "worst": float(under.mean(axis=0).min()),
-        "lost_mean": 1 - float(under.mean()) / base if base > 0 else None,
-        "lost_worst": 1 - float(under.mean(axis=0).min()) / base if base > 0 else None,
-        "lost_error": apart / base if apart is not None and base > 0 else None,
+        "undisturbed_error": _error(undisturbed),
+        "mean": float(disturbed.mean()),
+        "mean_error": _error(disturbed.mean(axis=1)),
+        "worst": float(disturbed.mean(axis=0).min()),
+        "lost_mean": 1 - float(disturbed.mean()) / base if base > 0 else None,
+        "lost_worst": 1 - float(disturbed.mean(axis=0).min()) / base if base > 0 else None,
+        "lost_error": paired_error / base if paired_error is not None and base > 0 else None,
     }
 
 
 def _error(values: Float[np.ndarray, " C"]) -> float | None:
-    """Standard error of the mean; None of one value."""
+    """Standard error of the mean; None for a single value."""
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
 
-def _row(kind: str, one: Setting, make: Make, sizes: Sizes, config: SACConfig) -> dict[str, Any]:
-    """One problem under one disturbance, and what is to be said of it."""
-    rows, tasks = variations(one, sizes)
+def _row(kind: str, setting: Setting, make: Make, sizes: DisturbanceSizes, config: SACConfig) -> dict[str, Any]:
+    """The result row of one problem under one disturbance."""
+    rows, tasks = variations(setting, sizes)
     measured = measure(rows, make, 1 if kind == pick_place.KIND else sizes.episodes, tasks)
     found: dict[str, Any] = {name: None if value is None else round(value, 4) for name, value in lost(measured.returns).items()}
     if kind == pick_place.KIND:
-        about: dict[str, Any] = {"metres": pick_place.disturbance(one.task)}
+        about: dict[str, Any] = {"metres": pick_place.disturbance(setting.task)}
     else:
-        about = {"forces": one.forces, "newtons": domains.problem(kind).forces[one.forces].largest, "steps": config.steps}  # type: ignore[index]
+        newtons = domains.problem(kind).forces[setting.forces].largest  # type: ignore[index]
+        about = {"forces": setting.forces, "newtons": newtons, "steps": config.steps}
     if measured.succeeded is not None:
-        alone, *under = measured.succeeded.tolist()
-        about |= {"success": round(alone, 3), "success_disturbed": round(float(np.mean(under)), 3)}
-    return {"problem": kind, **about, "broken": measured.broken, **found, **verdict(found, registry.spec(one.task).horizon)}
+        undisturbed, *disturbed = measured.succeeded.tolist()
+        about |= {"success": round(undisturbed, 3), "success_disturbed": round(float(np.mean(disturbed)), 3)}
+    return {"problem": kind, **about, "broken": measured.broken, **found, **verdict(found, registry.spec(setting.task).horizon)}
 
 
 def verdict(found: dict[str, float | None], horizon: int) -> dict[str, Any]:
-    """``weak``, or ``untaught`` if the expert earns too little for a loss to mean anything, and a sentence of it."""
+    """``weak``, ``untaught`` (the return is too small for a relative loss to mean anything) and a sentence, ``said``."""
     base, share = found["undisturbed"], found["lost_mean"]
     if share is None or base is None or base < EARNS * horizon:
-        said = f"the expert earns {base or 0.0:.2f} in {horizon} steps, so there is nothing to lose: nothing is known of it"
+        said = f"the expert's return is {base or 0.0:.2f} in {horizon} steps, too small to measure a loss: train it longer"
         return {"weak": False, "untaught": True, "said": said}
     if share < WEAK:
-        said = f"weak: on average the default adversaries take {share:.1%} of the return, under {WEAK:.0%}"
+        said = f"weak: the default adversaries reduce the return by {share:.1%} on average, less than {WEAK:.0%}"
         error = found["lost_error"]
         if error is None or share + 2 * error >= WEAK:
-            said += "; these episodes are too few to tell it from more"
+            said += "; with so few episodes the loss may be larger"
         return {"weak": True, "untaught": False, "said": said}
     return {"weak": False, "untaught": False, "said": ""}
 
 
 def describe_row(row: dict[str, Any]) -> str:
-    """A problem in one line of the table."""
-    of = f"{row['metres'] * 100:g} cm" if "metres" in row else row["forces"]
+    """A row of the table."""
+    disturbance = f"{row['metres'] * 100:g} cm" if "metres" in row else row["forces"]
     error = "" if row["lost_error"] is None else f" +-{row['lost_error']:.1%}"
     shares = ("-", "-") if row["lost_mean"] is None else (f"{row['lost_mean']:.1%}{error}", f"{row['lost_worst']:.1%}")
     cells = f"{row['undisturbed']:>12.1f}{row['mean']:>9.1f}{row['worst']:>9.1f}{shares[0]:>16}{shares[1]:>12}"
-    return f"{row['problem']:<22}{of:<7}{cells}  {row['said']}".rstrip()
+    return f"{row['problem']:<22}{disturbance:<7}{cells}  {row['said']}".rstrip()
 
 
 def describe(result: dict[str, Any]) -> str:
     """The result as a table."""
     head = f"{'problem':<22}{'forces':<7}{'undisturbed':>12}{'mean':>9}{'worst':>9}{'lost, mean':>16}{'lost, worst':>12}"
-    of = f"returns of experts that never met a disturbance, under {result['adversaries']} default adversaries"
-    return "\n".join([of, head, *map(describe_row, result["problems"])])
+    title = f"returns of experts trained without disturbance, under {result['adversaries']} default adversaries"
+    return "\n".join([title, head, *map(describe_row, result["problems"])])

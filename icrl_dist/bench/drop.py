@@ -1,8 +1,8 @@
-"""The strength at which undisturbed experts lose a given share of their return, solved and kept (``drop:0.25``).
+"""Calibrates ``drop:SHARE``: finds and stores the strength at which undisturbed experts lose this share of their return.
 
 In DeepMind Control the tasks are those of the smallest training set, the central 2x2 of the grid, each with
-an undisturbed SAC expert of its own; in Meta-World the first training tasks with the scripted policy of
-``bench.disturbance``.  Losses at all strengths are of the same episodes, begun alike, under the same K networks.
+its own undisturbed SAC expert; in Meta-World they are the first training tasks, with the scripted policy of
+``bench.disturbance``.  All strengths are compared on the same episodes (same initial states) and networks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from icrl_dist.bench import disturbance
-from icrl_dist.bench.disturbance import Make, Report, Setting, Sizes, lost, measure, settings
+from icrl_dist.bench.disturbance import DisturbanceSizes, Make, Report, Setting, lost, measure, settings
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.toml import nearest
@@ -30,51 +30,51 @@ from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Task, Variation
 
 KNOWN = ("dmc-cartpole-balance", pick_place.KIND)
-"""Problems whose experts are known to be competent with their laptop numbers."""
+"""Problems whose experts are known to be competent with the settings of the laptop run file."""
 COMPETENT = 0.25
-"""Mean reward a step, of at most 1, that experts must earn undisturbed: a drop of a worse one says nothing."""
+"""Mean reward per step (at most 1) that experts need without disturbance: the drop of a worse expert means nothing."""
 FIRST, MOST = 2.0**-3, 2.0**14
-"""The strengths between which the drop is searched, each twice the one before; then within 2% by bisection."""
-SIZES = Sizes(episodes=3)
+"""The smallest and the largest strength tried; strengths are doubled, then bisected to 2%."""
+SIZES = DisturbanceSizes(episodes=3)
 
 Loss = Callable[[float], float]
-"""Share of the return that is lost at a strength; the same chance at every call."""
+"""The relative loss of return at a strength, with the same random draws at every call."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Solved:
-    """The smallest strength found that takes the share asked for."""
+    """The smallest strength found whose loss is at least the given share."""
 
     strength: float
     lost: float
-    """At this strength."""
+    """The loss at this strength."""
     reached: bool
-    """False: not even ``strength``, the largest that was tried, takes as much."""
+    """False if the loss is smaller even at ``strength``, the largest strength tried."""
     tried: tuple[tuple[float, float], ...]
-    """Every strength and what it took, smallest first."""
+    """Every strength tried and its loss, smallest strength first."""
 
 
 def solve(loss: Loss, drop: float, first: float = FIRST, most: float = MOST, tolerance: float = 0.02) -> Solved:
-    """The smallest strength at which ``loss`` is at least ``drop``, to ``tolerance`` of itself from above.
+    """The smallest strength at which ``loss`` is at least ``drop``, exceeded by at most the relative ``tolerance``.
 
-    The loss need not be monotone: strengths are tried upwards, each twice the one before, and the first
-    that takes ``drop`` ends the ladder; bisection then keeps an upper end that does.  What rises and
-    falls again between two rungs is not seen.
+    The loss need not be monotone: strengths are doubled until the first with a loss of at least ``drop``;
+    bisection then keeps an upper end with such a loss.  A loss that rises and falls again between two
+    tried strengths is missed.
     """
     tried: dict[float, float] = {}
 
-    def ask(strength: float) -> bool:
+    def reaches(strength: float) -> bool:
         tried[strength] = loss(strength)
         return tried[strength] >= drop
 
     low, high = 0.0, first
-    while not ask(high):
+    while not reaches(high):
         if high >= most:
             return Solved(high, tried[high], False, tuple(sorted(tried.items())))
         low, high = high, min(2 * high, most)
     while high - low > tolerance * high:
         middle = (low + high) / 2
-        low, high = (low, middle) if ask(middle) else (middle, high)
+        low, high = (low, middle) if reaches(middle) else (middle, high)
     return Solved(high, tried[high], True, tuple(sorted(tried.items())))
 
 
@@ -82,13 +82,13 @@ def run(
     drop: float,
     problem: str | None = None,
     steps: int | None = None,
-    report: Report = lambda said: None,
-    sizes: Sizes | None = None,
+    report: Report = lambda text: None,
+    sizes: DisturbanceSizes | None = None,
 ) -> dict[str, Any]:
-    """Solve ``drop`` for a problem, or for those with experts known to be competent, and keep it in the user's own table.
+    """Calibrate ``drop`` for a problem, or for all of ``KNOWN``, and store it in the user's table.
 
-    ``steps`` of SAC for a problem's experts, instead of those of ``bench disturbance``.  Raises ConfigError
-    for an unknown problem, and for experts that are not competent.
+    ``steps`` of SAC for the experts; default: those of ``bench disturbance``.  Raises ConfigError for an
+    unknown problem and for experts that are not competent.
     """
     calibrated_strength.share(f"drop:{drop:g}")
     known = (*domains.PROBLEMS, pick_place.KIND)
@@ -100,7 +100,7 @@ def run(
     torch.set_num_threads(1)
     try:
         for kind in KNOWN if problem is None else (problem,):
-            rows += _solved(kind, drop, steps, report, sizes or SIZES)
+            rows += _calibrate(kind, drop, steps, report, sizes or SIZES)
     finally:
         torch.set_num_threads(threads)
     return {
@@ -111,56 +111,58 @@ def run(
     }
 
 
-def _solved(kind: str, drop: float, steps: int | None, report: Report, sizes: Sizes) -> list[dict[str, Any]]:
-    """One problem under each of its disturbances."""
-    config = disturbance.numbers(kind)
+def _calibrate(kind: str, drop: float, steps: int | None, report: Report, sizes: DisturbanceSizes) -> list[dict[str, Any]]:
+    """The rows of one problem, one per disturbance."""
+    config = disturbance.sac_config(kind)
     config = config if steps is None else dataclasses.replace(config, steps=steps)
     make = _expert(kind, config, report)
     rows: list[dict[str, Any]] = []
-    for one in settings(kind):
-        row = _row(kind, one, make, drop, config, report, sizes)
+    for setting in settings(kind):
+        row = _row(kind, setting, make, drop, config, report, sizes)
         row["command"] = f"icrl-dist bench disturbance --problem {kind} --drop {drop:g}" + (
             f" --steps {steps}" if steps else ""
         )
         if row["reached"]:
-            _keep(row)
+            _store(row)
         rows.append(row)
         report(describe_row(row))
     return rows
 
 
-def _row(kind: str, one: Setting, make: Make, drop: float, config: SACConfig, report: Report, sizes: Sizes) -> dict[str, Any]:
-    chosen = _tasks(kind, one, sizes)
+def _row(
+    kind: str, setting: Setting, make: Make, drop: float, config: SACConfig, report: Report, sizes: DisturbanceSizes
+) -> dict[str, Any]:
+    tasks = _tasks(kind, setting, sizes)
     found: dict[float, dict[str, float | None]] = {}
     episodes = 1 if kind == pick_place.KIND else sizes.episodes
 
     def loss(strength: float) -> float:
-        pushed = disturbance.pushes(one, sizes.adversaries, strength)
-        rows = [Variation(task, push) for task in chosen for push in pushed]
-        measured = measure(rows, make, episodes, len(chosen))
-        found[strength] = cost = {**lost(measured.returns), "broken": measured.broken}
-        earned, share = cost["undisturbed"], cost["lost_mean"]
-        if share is None or earned is None or earned < _needed(kind, one):
+        adversaries = disturbance.adversaries(setting, sizes.adversaries, strength)
+        rows = [Variation(task, adversary) for task in tasks for adversary in adversaries]
+        measured = measure(rows, make, episodes, len(tasks))
+        found[strength] = losses = {**lost(measured.returns), "broken": measured.broken}
+        earned, share = losses["undisturbed"], losses["lost_mean"]
+        if share is None or earned is None or earned < _competent_return(kind, setting):
             remedy = "its scripted policy has failed" if kind == pick_place.KIND else "train longer with --steps"
-            needed = f"earn {earned:.1f} undisturbed, not {_needed(kind, one):g}"
+            needed = f"have a return of {earned:.1f} undisturbed, below {_competent_return(kind, setting):g}"
             raise ConfigError(f"bench disturbance --drop {drop:g}: the experts of {kind} {needed}: {remedy}")
-        report(f"{kind} {one.forces}: strength {strength:g} takes {share:.1%}")
+        report(f"{kind} {setting.forces}: at strength {strength:g} the return drops by {share:.1%}")
         return share
 
     answer = solve(loss, drop)
-    preset = ["paper", "qarl"] if len(settings(kind)) == 1 else [one.forces]
+    presets = ["paper", "qarl"] if len(settings(kind)) == 1 else [setting.forces]
     scripted = kind == pick_place.KIND
     names = ("undisturbed", "undisturbed_error", "lost_mean", "lost_worst", "lost_error", "broken")
     return {
         "problem": kind,
-        "forces": [] if scripted else preset,
+        "forces": [] if scripted else presets,
         "metres": pick_place.DISTURBANCE if scripted else 0.0,
         "drop": drop,
         "strength": answer.strength,
         "reached": answer.reached,
         **{name: found[answer.strength][name] for name in names},
         "expert": "scripted" if scripted else f"SAC, {config.steps:,} steps, {'-'.join(map(str, config.hidden))}",
-        "tasks": len(chosen),
+        "tasks": len(tasks),
         "adversaries": sizes.adversaries,
         "episodes": episodes,
         "tried": [[strength, round(share, 4)] for strength, share in answer.tried],
@@ -169,31 +171,31 @@ def _row(kind: str, one: Setting, make: Make, drop: float, config: SACConfig, re
     }
 
 
-def _needed(kind: str, one: Setting) -> float:
-    return COMPETENT * registry.spec(one.task).horizon * (10 if kind == pick_place.KIND else 1)
+def _competent_return(kind: str, setting: Setting) -> float:
+    return COMPETENT * registry.spec(setting.task).horizon * (10 if kind == pick_place.KIND else 1)
 
 
-def _tasks(kind: str, one: Setting, sizes: Sizes) -> tuple[Task, ...]:
+def _tasks(kind: str, setting: Setting, sizes: DisturbanceSizes) -> tuple[Task, ...]:
     if kind != pick_place.KIND:
-        return tuple(task.replace(forces=one.forces) for task in domains.grid(kind, 2))
+        return tuple(task.replace(forces=setting.forces) for task in domains.grid(kind, 2))
     from icrl_dist.problems.metaworld.environment import ml1_tasks
 
     return ml1_tasks(sizes.tasks)
 
 
 def _expert(kind: str, config: SACConfig, report: Report) -> Make:
-    """Makes the tasks' experts, each in the rows of its own task; trains them first if they are not in the cache."""
+    """The function that makes the tasks' experts, each for the rows of its task; trains those that are not in the cache."""
     if kind == pick_place.KIND:
-        return disturbance.ToldTheGoal
+        return disturbance.ScriptedWithGoal
     variations = tuple(Variation(task) for task in domains.grid(kind, 2))
     found = disturbance.trained(kind, variations, config, report)
     if len(found) < len(variations):
-        raise ConfigError(f"sac.cache = {config.cache!r}: the experts that were trained are not there; name a folder")
-    return lambda env: ExpertPolicy([one for one in found for _ in range(env.batch // len(found))], config)
+        raise ConfigError(f"sac.cache = {config.cache!r}: the trained experts are not there; set it to a writable folder")
+    return lambda env: ExpertPolicy([history for history in found for _ in range(env.batch // len(found))], config)
 
 
-def _keep(row: dict[str, Any]) -> None:
-    """In the user's own table, in the place of what it held for the same."""
+def _store(row: dict[str, Any]) -> None:
+    """Store the row in the user's table; it replaces an earlier row for the same disturbance and drop."""
     key = ("problem", "forces", "metres", "drop")
     others = [old for old in calibrated_strength.own() if any(old[name] != row[name] for name in key)]
     file = calibrated_strength.own_file()
@@ -202,18 +204,20 @@ def _keep(row: dict[str, Any]) -> None:
 
 
 def describe_row(row: dict[str, Any]) -> str:
-    """A problem in one line of the table."""
-    of = f"{row['metres'] * 100:g} cm" if row["metres"] else "/".join(row["forces"])
+    """A row of the table."""
+    disturbance = f"{row['metres'] * 100:g} cm" if row["metres"] else "/".join(row["forces"])
     error = "" if row["lost_error"] is None else f" +-{row['lost_error']:.1%}"
-    said = "" if row["reached"] else f"  not {row['drop']:.0%}, even at the largest strength tried: not kept"
+    note = "" if row["reached"] else f"  less than {row['drop']:.0%} even at the largest strength tried: not stored"
     return (
-        f"{row['problem']:<22}{of:<12}{row['strength']:>10.4g}{row['lost_mean']:>9.1%}{error:<9}{row['lost_worst']:>8.1%}"
-        f"{row['undisturbed']:>12.1f}  {row['expert']}{said}"
+        f"{row['problem']:<22}{disturbance:<12}{row['strength']:>10.4g}{row['lost_mean']:>9.1%}{error:<9}{row['lost_worst']:>8.1%}"
+        f"{row['undisturbed']:>12.1f}  {row['expert']}{note}"
     )
 
 
 def describe(result: dict[str, Any]) -> str:
     """The result as a table."""
     head = f"{'problem':<22}{'forces':<12}{'strength':>10}{'lost':>9}{'':<9}{'worst':>8}{'undisturbed':>12}  expert"
-    of = f"smallest strength at which undisturbed experts lose {result['drop']:.0%} of their return; kept in {result['file']}"
-    return "\n".join([of, head, *map(describe_row, result["problems"])])
+    title = (
+        f"smallest strength at which undisturbed experts lose {result['drop']:.0%} of their return; stored in {result['file']}"
+    )
+    return "\n".join([title, head, *map(describe_row, result["problems"])])

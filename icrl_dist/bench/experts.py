@@ -1,6 +1,6 @@
-"""Updates of soft actor-critic: stable-baselines3, one expert at a time, beside N experts in lockstep.
+"""Updates of soft actor-critic per CPU-second: N experts in lockstep against one expert of stable-baselines3.
 
-Both on one core, taking turns, batches drawn from a full replay and noise included, in CPU-seconds.
+Both run on one core and alternate.  Drawing the batch from a full replay and the noise is included.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.sac.batched import Products, SACBatch
-from icrl_dist.experts.sac.draws import of_updates
+from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch
+from icrl_dist.experts.sac.draws import update_draws
 from icrl_dist.experts.sac.sb3_files import blank
 from icrl_dist.types import Spec
 
 SPEC = Spec((-np.inf,) * 17, (np.inf,) * 17, 6, 200, discrete=False)
-"""Cheetah's: 17 observation components, 6 action components."""
-REMEMBERED = 10_000
+"""The spec of cheetah: 17 observation components, 6 action components."""
+REPLAY = 10_000
 """Transitions in each replay."""
 LEAST = {"fp32": 1.35, "bf16": 2.4, "small": 4.5}
-"""Ratios below which the benchmark fails; that of bfloat16 only counts where the processor multiplies it."""
+"""Ratios below which the benchmark fails; ``bf16`` counts only on a processor with bfloat16 instructions."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Sizes:
-    """One comparison: N experts in lockstep, and one by stable-baselines3."""
+class ExpertSizes:
+    """One comparison: N experts in lockstep, and one of stable-baselines3."""
 
     experts: int
     config: SACConfig
     ours: int
-    """Updates a turn, of all experts."""
+    """Updates of every expert of ours per turn."""
     theirs: int
-    """Updates a turn, of the one expert."""
+    """Updates of the expert of stable-baselines3 per turn."""
 
 
-PAPER = Sizes(10, SACConfig(replay=REMEMBERED), 2, 12)
-SMALL = Sizes(20, SACConfig(hidden=(64, 64), batch=128, replay=REMEMBERED), 10, 40)
+PAPER = ExpertSizes(10, SACConfig(replay=REPLAY), 2, 12)
+SMALL = ExpertSizes(20, SACConfig(hidden=(64, 64), batch=128, replay=REPLAY), 10, 40)
 
 
-def run(quick: bool = False, paper: Sizes = PAPER, small: Sizes = SMALL) -> dict[str, Any]:
-    """Ratios of updates per CPU-second per expert, ours over stable-baselines3's; ``quick`` takes fewer turns.
+def run(quick: bool = False, paper: ExpertSizes = PAPER, small: ExpertSizes = SMALL) -> dict[str, Any]:
+    """Updates per CPU-second per expert, ours divided by those of stable-baselines3; ``quick`` takes fewer turns.
 
-    ``ok`` is false, and ``reasons`` says why, if one is below ``LEAST``.
+    ``ok`` is false if a ratio is below ``LEAST``; ``reasons`` lists these ratios.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        native, turns = multiplies_bfloat16(), 3 if quick else 15
-        # A processor that does not multiply bfloat16 takes seconds an update: one turn shows it.
-        few = turns if native else 1
+        native, turns = has_bfloat16(), 3 if quick else 15
+        # Without bfloat16 instructions an update takes seconds, so one turn is enough.
+        bf16_turns = turns if native else 1
         found = {
             "fp32": compare(paper, "float32", turns),
-            "bf16": compare(paper if native else dataclasses.replace(paper, ours=1), "bfloat16", few),
+            "bf16": compare(paper if native else dataclasses.replace(paper, ours=1), "bfloat16", bf16_turns),
             "small": compare(small, "float32", turns),
         }
     finally:
@@ -75,14 +75,14 @@ def run(quick: bool = False, paper: Sizes = PAPER, small: Sizes = SMALL) -> dict
     return result | {"ok": not reasons, "reasons": reasons}
 
 
-def compare(sizes: Sizes, products: Products, turns: int) -> tuple[float, float]:
-    """Updates per CPU-second per expert, ours and stable-baselines3's: medians over ``turns``, after one more."""
-    ours, theirs = lockstep(sizes, products), alone(sizes.config)
+def compare(sizes: ExpertSizes, matmul_dtype: MatmulDtype, turns: int) -> tuple[float, float]:
+    """Updates per CPU-second per expert, ours and those of stable-baselines3: medians over ``turns`` after a warm-up turn."""
+    ours, theirs = lockstep(sizes, matmul_dtype), alone(sizes.config)
     found = []
     for _ in range(turns + 1):
         found.append((sizes.experts * sizes.ours / _seconds(ours, sizes.ours), sizes.theirs / _seconds(theirs, sizes.theirs)))
-    mine, other = (statistics.median(rates) for rates in zip(*found[1:], strict=True))  # the first finds cold caches
-    return mine, other
+    our_rate, their_rate = (statistics.median(rates) for rates in zip(*found[1:], strict=True))
+    return our_rate, their_rate
 
 
 def _seconds(update: Callable[[int], None], count: int) -> float:
@@ -91,44 +91,44 @@ def _seconds(update: Callable[[int], None], count: int) -> float:
     return time.process_time() - began
 
 
-def lockstep(sizes: Sizes, products: Products, device: str = "cpu", graph: bool = True) -> Callable[[int], None]:
-    """So many updates of our experts."""
+def lockstep(sizes: ExpertSizes, matmul_dtype: MatmulDtype, device: str = "cpu", graph: bool = True) -> Callable[[int], None]:
+    """A function that makes ``count`` updates of our experts."""
     config = sizes.config
-    experts = SACBatch(range(sizes.experts), SPEC, config, device, products, None, graph)
-    remembered = [_remembered(np.random.default_rng((0, index)), config.replay) for index in range(sizes.experts)]
-    rows = np.stack([np.concatenate(columns, axis=1) for columns in remembered])
+    experts = SACBatch(range(sizes.experts), SPEC, config, device, matmul_dtype, None, graph)
+    replays = [_transitions(np.random.default_rng((0, index)), config.replay) for index in range(sizes.experts)]
+    rows = np.stack([np.concatenate(columns, axis=1) for columns in replays])
     experts.replay.load({"rows": rows, "added": np.array(config.replay)})
     episodes, shape = itertools.count(), (config.batch, SPEC.actions)
 
     def update(count: int) -> None:
-        for picks, noise in of_updates(range(sizes.experts), next(episodes), shape, count, experts.device):
-            experts.learn(picks, noise)
+        for picks, noise in update_draws(range(sizes.experts), next(episodes), shape, count, experts.device):
+            experts.update_from_replay(picks, noise)
 
     return update
 
 
 def alone(config: SACConfig) -> Callable[[int], None]:
-    """So many updates of an expert of stable-baselines3, in one call of its ``train``."""
+    """A function that makes ``count`` updates of an expert of stable-baselines3, in one call of its ``train``."""
     model = blank(SPEC, config)
     model.set_logger(configure(None, []))
-    memory = ReplayBuffer(config.replay, model.observation_space, model.action_space, "cpu")
-    observations, actions, rewards, following = _remembered(np.random.default_rng((0, 0)), config.replay)
-    memory.observations[:, 0], memory.actions[:, 0] = observations, actions
-    memory.rewards[:], memory.next_observations[:, 0] = rewards, following
-    memory.full = True
-    model.replay_buffer = memory
+    buffer = ReplayBuffer(config.replay, model.observation_space, model.action_space, "cpu")
+    observations, actions, rewards, next_observations = _transitions(np.random.default_rng((0, 0)), config.replay)
+    buffer.observations[:, 0], buffer.actions[:, 0] = observations, actions
+    buffer.rewards[:], buffer.next_observations[:, 0] = rewards, next_observations
+    buffer.full = True
+    model.replay_buffer = buffer
     return lambda count: model.train(count, config.batch)
 
 
-def _remembered(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Observations, actions, rewards and following observations, each (count, numbers)."""
-    seen, following = rng.standard_normal((2, count, SPEC.observation), dtype=np.float32)
-    acted = rng.uniform(-1, 1, (count, SPEC.actions)).astype(np.float32)
-    return seen, acted, rng.random((count, 1), dtype=np.float32), following
+def _transitions(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Random observations, actions, rewards and next observations, each ``(count, components)``."""
+    observations, next_observations = rng.standard_normal((2, count, SPEC.observation), dtype=np.float32)
+    actions = rng.uniform(-1, 1, (count, SPEC.actions)).astype(np.float32)
+    return observations, actions, rng.random((count, 1), dtype=np.float32), next_observations
 
 
-def multiplies_bfloat16(cpuinfo: Path = Path("/proc/cpuinfo")) -> bool:
-    """Whether the processor itself multiplies bfloat16 numbers (AVX512_BF16 or AMX)."""
+def has_bfloat16(cpuinfo: Path = Path("/proc/cpuinfo")) -> bool:
+    """Whether the processor has bfloat16 instructions (AVX512_BF16 or AMX)."""
     words = set(cpuinfo.read_text().split())
     return bool(words & {"avx512_bf16", "amx_bf16"})
 
@@ -137,7 +137,7 @@ def describe(result: dict[str, Any]) -> str:
     """The result as a small table."""
     named = {
         "fp32": "10 experts of 3x256, batch 256, float32",
-        "bf16": "the same, products of bfloat16",
+        "bf16": "the same, bfloat16 products",
         "small": "20 experts of 2x64, batch 128, float32",
     }
     rows = [f"{'updates per CPU-second per expert, one core':<46}{'ours':>10}{'SB3':>10}{'ratio':>8}"]
@@ -145,5 +145,5 @@ def describe(result: dict[str, Any]) -> str:
         ours, theirs, ratio = (result[f"{kind}_{name}"] for kind in ("updates_per_s", "sb3_updates_per_s", "ratio"))
         rows.append(f"{what:<46}{ours:>10.2f}{theirs:>10.2f}{ratio:>8.2f}")
     if not result["bf16_native"]:
-        rows.append("neither AVX512_BF16 nor AMX here: torch emulates products of bfloat16, and their ratio does not count")
+        rows.append("no AVX512_BF16 and no AMX on this processor: torch emulates bfloat16, so its ratio does not count")
     return "\n".join([*rows, *result["reasons"]])

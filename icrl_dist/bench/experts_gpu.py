@@ -1,7 +1,7 @@
-"""Updates of 160 experts in lockstep on a GPU, beside stable-baselines3 on one core; and one expert set of the paper.
+"""Updates of 160 experts in lockstep on a GPU against stable-baselines3 on one core; and one expert set of the paper.
 
-The GPU's time is by the clock, with nothing left to do before and after; stable-baselines3's is
-CPU-seconds of one thread.  Both take turns, batches drawn from a full replay and noise included.
+The GPU is timed by wall clock, synchronized before and after; stable-baselines3 in CPU-seconds of one
+thread.  Both alternate.  Drawing the batch from a full replay and the noise is included.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist.bench.experts import REMEMBERED, Sizes, alone, lockstep
+from icrl_dist.bench.experts import REPLAY, ExpertSizes, alone, lockstep
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.sac.batched import Products, SACBatch, pick, train
-from icrl_dist.experts.sac.draws import Chance
+from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch, pick, train
+from icrl_dist.experts.sac.draws import EpisodeDraws
+from icrl_dist.interfaces import Batch
 from icrl_dist.problems import registry, splits
-from icrl_dist.problems.registry import Batch
 
-SIZES = Sizes(160, SACConfig(replay=REMEMBERED), 60, 12)
+SIZES = ExpertSizes(160, SACConfig(replay=REPLAY), 60, 12)
 LEAST = 300.0
-"""Aggregate updates a second over stable-baselines3's on one core, below which the benchmark fails."""
+"""Updates per second of all experts, divided by those of stable-baselines3 on one core: a smaller ratio fails."""
 PAPER = "dmc-cartpole-balance"
-"""The run whose m x K experts are trained."""
+"""The run file whose m x K experts are trained."""
 STEPS = 1_500
-"""Steps of that training in which the experts learn."""
-_KINDS: dict[str, tuple[Products, bool]] = {
+"""Training steps after the warm-up that are measured."""
+_KINDS: dict[str, tuple[MatmulDtype, bool]] = {
     "fp32_no_graph": ("float32", False),
     "bf16_no_graph": ("bfloat16", False),
     "fp32": ("float32", True),
@@ -39,86 +39,86 @@ _KINDS: dict[str, tuple[Products, bool]] = {
 
 
 def present() -> bool:
-    """Whether there is a GPU to measure."""
+    """Whether there is a GPU."""
     return torch.cuda.is_available()
 
 
-def run(quick: bool = False, steps: int | None = None, device: str = "cuda", sizes: Sizes = SIZES) -> dict[str, Any]:
+def run(quick: bool = False, steps: int | None = None, device: str = "cuda", sizes: ExpertSizes = SIZES) -> dict[str, Any]:
     """Ratios, the gain of CUDA graphs, and the hours of an expert set; ``quick`` takes fewer turns and steps.
 
-    ``ok`` is false, and ``reasons`` says why, if a ratio is below ``LEAST`` or something could not be
-    measured; that is None.  Raises ConfigError if there is no GPU.
+    ``ok`` is false if a ratio is below ``LEAST`` or a part could not be measured (its value is then None);
+    ``reasons`` lists why.  Raises ConfigError if there is no GPU.
     """
     try:
-        on = pick(device)
+        torch_device = pick(device)
     except ValueError as error:
         raise ConfigError(f"bench experts: {error}") from None
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        result, reasons = updates(sizes, 3 if quick else 15, on)
+        result, reasons = updates(sizes, 3 if quick else 15, torch_device)
         try:
             env, config = paper_env()
-            paper = expert_set(env, config, steps or (STEPS // 2 if quick else STEPS), on)
+            paper = expert_set(env, config, steps or (STEPS // 2 if quick else STEPS), torch_device)
         except (ImportError, RuntimeError) as error:
             paper = None
-            reasons.append(f"no expert set: {_line(error)}")
+            reasons.append(f"no expert set: {_first_line(error)}")
     finally:
         torch.set_num_threads(threads)
-    name = torch.cuda.get_device_name(on) if on.type == "cuda" else "cpu"
+    name = torch.cuda.get_device_name(torch_device) if torch_device.type == "cuda" else "cpu"
     head = {"quick": quick, "device": name, "torch": torch.__version__, "experts": sizes.experts}
     hours = paper and paper["hours"]
     return head | result | {"paper_set": paper, "paper_set_hours": hours, "ok": not reasons, "reasons": reasons}
 
 
-def updates(sizes: Sizes, turns: int, device: torch.device) -> tuple[dict[str, Any], list[str]]:
-    """Aggregate updates/s of each kind and stable-baselines3's, medians over ``turns``; and what is wrong with them."""
-    theirs, other, rates, reasons = alone(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
-    theirs(sizes.theirs)  # finds cold caches
-    for kind, (numbers, graph) in _KINDS.items():
+def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[str, Any], list[str]]:
+    """Updates/s of all experts, of each kind, and of stable-baselines3 (medians over ``turns``); and reasons for a failure."""
+    theirs, their_rates, rates, reasons = alone(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
+    theirs(sizes.theirs)  # warms the caches
+    for kind, (matmul_dtype, graph) in _KINDS.items():
         try:
-            ours, found = lockstep(sizes, numbers, str(device), graph), []
+            ours, found = lockstep(sizes, matmul_dtype, str(device), graph), []
             _elapsed(ours, sizes.ours, device)  # loads kernels and records the graph
             for _ in range(turns):
                 began = time.process_time()
                 theirs(sizes.theirs)
-                other.append(sizes.theirs / (time.process_time() - began))
+                their_rates.append(sizes.theirs / (time.process_time() - began))
                 found.append(sizes.experts * sizes.ours / _elapsed(ours, sizes.ours, device))
             rates[kind] = statistics.median(found)
         except RuntimeError as error:  # out of memory, or a graph that cannot be recorded
-            reasons.append(f"{kind}: {_line(error)}")
-    alone_rate = statistics.median(other) if other else 0.0
-    result: dict[str, Any] = {"sb3_updates_per_s": round(alone_rate, 2), "gpu_least": LEAST}
+            reasons.append(f"{kind}: {_first_line(error)}")
+    their_rate = statistics.median(their_rates) if their_rates else 0.0
+    result: dict[str, Any] = {"sb3_updates_per_s": round(their_rate, 2), "gpu_least": LEAST}
     result |= {f"updates_per_s_{kind}": round(rate, 1) if rate else None for kind, rate in rates.items()}
-    for products in ("fp32", "bf16"):
-        rate, plain = rates[products], rates[f"{products}_no_graph"]
-        ratio = result[f"gpu_ratio_{products}"] = round(rate / alone_rate, 1) if rate else None
-        result[f"graph_gain_{products}"] = round(rate / plain, 2) if rate and plain else None
+    for kind in ("fp32", "bf16"):
+        rate, no_graph = rates[kind], rates[f"{kind}_no_graph"]
+        ratio = result[f"gpu_ratio_{kind}"] = round(rate / their_rate, 1) if rate else None
+        result[f"graph_gain_{kind}"] = round(rate / no_graph, 2) if rate and no_graph else None
         if ratio is not None and ratio < LEAST:
-            reasons.append(f"gpu_ratio_{products} is {ratio}, below {LEAST:g}")
+            reasons.append(f"gpu_ratio_{kind} is {ratio}, below {LEAST:g}")
     if device.type == "cuda":
         result["gpu_gib"] = round(torch.cuda.max_memory_allocated(device) / 2**30, 2)
     return result, reasons
 
 
 def paper_env() -> tuple[Batch, SACConfig]:
-    """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the numbers of its SAC."""
-    given = load(PAPER)
-    rows = [row for index, task in enumerate(splits.split(given).train) for row in splits.variations(given, index, task)]
-    return registry.batch(rows), given.sac
+    """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the settings of its SAC."""
+    paper = load(PAPER)
+    rows = [row for index, task in enumerate(splits.split(paper).train) for row in splits.variations(paper, index, task)]
+    return registry.batch(rows), paper.sac
 
 
 def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) -> dict[str, Any]:
-    """A training through its whole warm-up and ``steps`` more, three episodes at least: how long ``config.steps`` take.
+    """Train through the warm-up and ``steps`` more (at least three episodes), and project to ``config.steps``.
 
-    ``hours``: the warm-up's steps at their pace, the others at that of the episodes after the first
-    with updates.  ``ms_a_step``: what each part of a step takes with nothing beside it, updates
-    shared out over the steps between them; ``bound`` is the largest.
+    ``hours``: the warm-up's steps at their measured rate, and the others at the rate after the first
+    episode with updates.  ``ms_a_step``: milliseconds of each part of a step, measured separately, with
+    an update divided by the steps between updates; ``bound`` is the largest part.
     """
     began, marks, horizon = time.perf_counter(), [], env.spec.horizon
 
     def progress(experts: SACBatch, returns: np.ndarray) -> None:
-        _wait(device)
+        _synchronize(device)
         marks.append((experts.steps, time.perf_counter()))
 
     experts = train(env, config, config.warmup + max(steps, 3 * horizon), range(env.batch), progress, str(device))
@@ -142,7 +142,7 @@ def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) 
 
 
 def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.device) -> dict[str, float]:
-    """Seconds a step of each part of one more episode, the device idle before and after each."""
+    """Seconds per step of each part, in one more episode, with the device synchronized before and after each part."""
     spent = dict.fromkeys(("draw", "environment", "act", "remember", "update"), 0.0)
     count, horizon = -(-env.spec.horizon // config.update_every), env.spec.horizon
 
@@ -150,49 +150,49 @@ def _parts(env: Batch, experts: SACBatch, config: SACConfig, device: torch.devic
     def timed(part: str) -> Iterator[None]:
         began = time.perf_counter()
         yield
-        _wait(device)
+        _synchronize(device)
         spent[part] += time.perf_counter() - began
 
     with timed("draw"):
-        drawn = Chance(range(env.batch), experts.steps // horizon, env.spec, config, count, device)
-    updates = iter(drawn.updates)
-    seen = np.asarray(env.reset(drawn.starts), np.float32)
+        draws = EpisodeDraws(range(env.batch), experts.steps // horizon, env.spec, config, count, device)
+    updates = iter(draws.updates)
+    observation = np.asarray(env.reset(draws.starts), np.float32)
     for number in range(horizon):
         with timed("act"):
-            action = experts.act(seen, drawn.normal[number])
+            action = experts.act(observation, draws.normal[number])
         with timed("environment"):
             step = env.step(action)
         with timed("remember"):
-            experts.remember(seen, action, step)
+            experts.store(observation, action, step)
         if number % config.update_every == 0:
             with timed("update"):
-                experts.learn(*next(updates))
-        seen = step.observation
+                experts.update_from_replay(*next(updates))
+        observation = step.observation
     return {part: seconds / horizon for part, seconds in spent.items()}
 
 
 def _elapsed(update: Callable[[int], None], count: int, device: torch.device) -> float:
-    _wait(device)
+    _synchronize(device)
     began = time.perf_counter()
     update(count)
-    _wait(device)
+    _synchronize(device)
     return time.perf_counter() - began
 
 
-def _wait(device: torch.device) -> None:
+def _synchronize(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
-def _line(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"
 
 
 def describe(result: dict[str, Any]) -> str:
     """The result as a small table."""
-    named = {"fp32": "float32", "bf16": "products of bfloat16"}
-    said = f"{result['experts']} experts of 3x256, batch 256, {result['device']}"
-    rows = [f"{said:<58}{'updates/s':>11}{'no graph':>11}{'over SB3':>10}"]
+    named = {"fp32": "float32", "bf16": "bfloat16 products"}
+    title = f"{result['experts']} experts of 3x256, batch 256, {result['device']}"
+    rows = [f"{title:<58}{'updates/s':>11}{'no graph':>11}{'over SB3':>10}"]
     for kind, what in named.items():
         figures = (result[name] for name in (f"updates_per_s_{kind}", f"updates_per_s_{kind}_no_graph", f"gpu_ratio_{kind}"))
         with_graph, without, ratio = ("-" if figure is None else f"{figure:,.1f}" for figure in figures)
@@ -201,7 +201,7 @@ def describe(result: dict[str, Any]) -> str:
     if paper := result["paper_set"]:
         parts = ", ".join(f"{part} {ms:g}" for part, ms in paper["ms_a_step"].items())
         rows.append(
-            f"{paper['experts']} experts of {paper['problem']}: {paper['steps_per_s']:g} steps/s (ms a step alone: {parts})"
+            f"{paper['experts']} experts of {paper['problem']}: {paper['steps_per_s']:g} steps/s (ms per step: {parts})"
         )
-        rows.append(f"{paper['hours_of_steps']:,} steps take {paper['hours']:g} h; most of it: {paper['bound']}")
+        rows.append(f"{paper['hours_of_steps']:,} steps take {paper['hours']:g} h; largest part: {paper['bound']}")
     return "\n".join([*rows, *result["reasons"]])

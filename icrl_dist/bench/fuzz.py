@@ -1,6 +1,6 @@
-"""Hostile bytes into every reader of bytes: a value or a refusal, soon, and within a stated amount of memory.
+"""Fuzzing of every reader of external bytes: it must return a value or refuse, within bounds of time and memory.
 
-Input ``n`` of a seed is always the same one, so whatever is found can be made again.
+Input ``n`` of a seed is always the same, so every failure can be reproduced.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from icrl_dist.types import NULL, Job, Variation, Weights
 
 LIMIT = 1 << 20
 ALLOCATION = (16, 8 << 20)
-"""Reading may take so many times an input's length, and so many bytes besides."""
+"""The memory that reading may take: a multiple of the input's length, plus a number of bytes."""
 LIMIT_MS = 1000.0
-"""CPU time that one input may take; a thousandfold of what one should."""
+"""CPU time that one input may take, about a thousand times the expected time."""
 HANG_S = 120.0
-"""A thousand inputs that take so long end the process with a trace of where it is."""
+"""If a thousand inputs take longer, the process prints its stack and ends."""
 
 
-class _Query:
-    """A request that nobody waits for."""
+class _FakeQuery:
+    """A query whose replies are discarded."""
 
     key = "fuzz"
 
@@ -47,7 +47,7 @@ class _Query:
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A reader, what it may raise, and inputs that it takes."""
+    """A reader of bytes, the exception with which it refuses, and valid inputs."""
 
     read: Callable[[bytes], object]
     refusal: type[Exception]
@@ -55,66 +55,67 @@ class Target:
 
 
 def targets() -> dict[str, Target]:
-    """Every reader of bytes that come from elsewhere, each with a small and a large input where there is such a thing."""
-    one, names = example(), segment.Names()
+    """Every reader of external bytes by name, with valid inputs (a small and a large one where sizes differ)."""
+    trajectory, names = example(), segment.Names()
     small, large = (
         wire.encode_weights(Weights(3, arrays, wire.weights_digest(arrays)))
-        for arrays in ({"scale": np.array(2.0), "none": np.zeros((0, 3), np.int64)}, {"embed": one.observations})
+        for arrays in ({"scale": np.array(2.0), "none": np.zeros((0, 3), np.int64)}, {"embed": trajectory.observations})
     )
-    variations = (one.variation, Variation(one.variation.task, NULL))
+    variations = (trajectory.variation, Variation(trajectory.variation.task, NULL))
     job = Job("adapt", "adapt", 1, 2, variations, 4, 0, 2**40, (("beta", 1.0),))
-    many = dataclasses.replace(job, variations=variations * 200)
+    large_job = dataclasses.replace(job, variations=variations * 200)
     message = wire.encode_message("hello", a=[1, {"b": None}], c=b"x", d=1.5, e="worker", f=-(2**40))
-    steps, queries, taken = (len(array) for array in (one.actions, one.queries, one.taken))
+    steps, queries, taken = (len(array) for array in (trajectory.actions, trajectory.queries, trajectory.taken))
     shapes = {"actions": (steps, 4), "adversary": (steps, 2), "labels": (queries, 4), "taken": (taken, 4)}
     arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
-    vectors = dataclasses.replace(one, **arrays)
-    trajectory = wire.encode_trajectory(one)
+    vectors = dataclasses.replace(trajectory, **arrays)
+    encoded = wire.encode_trajectory(trajectory)
     answers = validation.pack("answers", {"reasons": ["", "busy"]})
-    name, frame = segment.encode(one, names)
+    name, frame = segment.encode(trajectory, names)
     frames = [frame[segment.HEADER_BYTES :], segment.encode(vectors, names)[1][segment.HEADER_BYTES :]]
-    first = name[segment.HEADER_BYTES :][: int.from_bytes(name[4:8], "little")]
+    name_record = name[segment.HEADER_BYTES :][: int.from_bytes(name[4:8], "little")]
     refusal = wire.WireError
     return {
         "trajectory": Target(
-            lambda data: wire.decode_trajectory(data, LIMIT), refusal, [trajectory, wire.encode_trajectory(vectors)]
+            lambda data: wire.decode_trajectory(data, LIMIT), refusal, [encoded, wire.encode_trajectory(vectors)]
         ),
         "weights": Target(lambda data: wire.decode_weights(data, LIMIT), refusal, [small, large]),
-        "job": Target(lambda data: wire.decode_job(data, LIMIT), refusal, [wire.encode_job(job), wire.encode_job(many)]),
+        "job": Target(lambda data: wire.decode_job(data, LIMIT), refusal, [wire.encode_job(job), wire.encode_job(large_job)]),
         "message": Target(
-            lambda data: wire.decode_message(data, LIMIT), refusal, [message, wire.encode_message("give", job=trajectory)]
+            lambda data: wire.decode_message(data, LIMIT), refusal, [message, wire.encode_message("give", job=encoded)]
         ),
         "batch": Target(
-            lambda data: batching.split(_Query(data), LIMIT), refusal, [batching.join([message] * 3), batching.join([large])]
+            lambda data: batching.split(_FakeQuery(data), LIMIT),
+            refusal,
+            [batching.join([message] * 3), batching.join([large])],
         ),
         "answers": Target(lambda data: batching.reasons(data, 2), refusal, [answers]),
         "frame": Target(lambda data: segment.decode(data, names), ValueError, frames),
-        "name": Target(lambda data: segment.Names().read(data), ValueError, [first]),
+        "name": Target(lambda data: segment.Names().read(data), ValueError, [name_record]),
     }
 
 
 def run(inputs: int = 100_000, seed: int = 0, folder: Path = Path("runs")) -> dict[str, Any]:
-    """Feed ``inputs`` to the readers in turn.  An input that breaks one is kept as a file under ``folder``.
+    """Give ``inputs`` mutated inputs to the readers in turn; failing inputs are written to files in ``folder``.
 
-    ``ok``: nothing but values and refusals, none slower than ``LIMIT_MS`` of CPU time, none
-    that took more memory than ``ALLOCATION`` allows.  ``worst_alloc_ratio`` is of what is allowed;
-    ``memory_growth_mb`` is of the process, from before the first input to the end.
-    Raises ConfigError for a number of inputs below 1.
+    ``ok``: every input is accepted or refused, takes at most ``LIMIT_MS`` of CPU time and at most the memory
+    of ``ALLOCATION``.  ``worst_alloc_ratio`` is relative to that memory; ``memory_growth_mb`` is the growth
+    of the process over all inputs.  Raises ConfigError for a number of inputs below 1.
     """
     if inputs < 1:
         raise ConfigError(f"bench fuzz: inputs = {inputs}: must be above 0")
     counts = dict.fromkeys(("accepted", "rejected", "crashes"), 0)
     worst_ms, worst_ratio = 0.0, 0.0
-    kept: list[str] = []
-    aims = list(targets().items())
-    outer = tracemalloc.is_tracing()
+    failing: list[str] = []
+    readers = list(targets().items())
+    traced_already = tracemalloc.is_tracing()
     tracemalloc.start()
-    began, memory = time.monotonic(), _most_memory()
+    began, memory = time.monotonic(), _peak_memory()
     try:
         for number in range(inputs):
             if number % 1000 == 0:
                 faulthandler.dump_traceback_later(HANG_S, exit=True, file=2)
-            name, target = aims[number % len(aims)]
+            name, target = readers[number % len(readers)]
             data = mutate(np.random.default_rng([seed, number]), target.valid)
             outcome, ms, ratio = attempt(target, data)
             counts[outcome] += 1
@@ -123,10 +124,10 @@ def run(inputs: int = 100_000, seed: int = 0, folder: Path = Path("runs")) -> di
                 folder.mkdir(parents=True, exist_ok=True)
                 file = folder / f"fuzz-{name}-{seed}-{number}.bin"
                 file.write_bytes(data)
-                kept.append(str(file))
+                failing.append(str(file))
     finally:
         faulthandler.cancel_dump_traceback_later()
-        if not outer:
+        if not traced_already:
             tracemalloc.stop()
     return {
         "inputs": inputs,
@@ -134,30 +135,30 @@ def run(inputs: int = 100_000, seed: int = 0, folder: Path = Path("runs")) -> di
         **counts,
         "worst_ms": round(worst_ms, 3),
         "worst_alloc_ratio": round(worst_ratio, 3),
-        "memory_growth_mb": round((_most_memory() - memory) / 1e6, 1),
+        "memory_growth_mb": round((_peak_memory() - memory) / 1e6, 1),
         "seconds": round(time.monotonic() - began, 1),
-        "kept": kept,
-        "ok": not kept,
+        "kept": failing,
+        "ok": not failing,
     }
 
 
 def describe(result: dict[str, Any]) -> str:
-    """The result in a line, and one for each input that was kept."""
+    """The result in one line, and a line per failing input."""
     line = (
         f"{result['inputs']:,} inputs: {result['accepted']:,} accepted, {result['rejected']:,} refused, {result['crashes']} "
-        f"crashes; the slowest took {result['worst_ms']:.1f} ms, the largest {result['worst_alloc_ratio']:.0%} of the memory "
-        "it may take"
+        f"crashes; the slowest took {result['worst_ms']:.1f} ms, the largest {result['worst_alloc_ratio']:.0%} of its memory "
+        "limit"
     )
-    return "\n".join([line, *(f"kept: {file}" for file in result["kept"])])
+    return "\n".join([line, *(f"failing input: {file}" for file in result["kept"])])
 
 
-def _most_memory() -> int:
-    """The most that this process ever had resident, bytes."""
+def _peak_memory() -> int:
+    """The peak resident memory of this process, in bytes."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def attempt(target: Target, data: bytes) -> tuple[str, float, float]:
-    """What became of an input, CPU milliseconds, and its share of the memory that it may take.  Needs tracemalloc on."""
+    """The outcome of an input, CPU milliseconds, and memory relative to its limit.  tracemalloc must be started."""
     tracemalloc.reset_peak()
     before, began = tracemalloc.get_traced_memory()[0], time.thread_time()
     try:
@@ -168,5 +169,5 @@ def attempt(target: Target, data: bytes) -> tuple[str, float, float]:
     except Exception:
         outcome = "crashes"
     ms = 1e3 * (time.thread_time() - began)
-    times, besides = ALLOCATION
-    return outcome, ms, (tracemalloc.get_traced_memory()[1] - before) / (times * len(data) + besides)
+    factor, constant = ALLOCATION
+    return outcome, ms, (tracemalloc.get_traced_memory()[1] - before) / (factor * len(data) + constant)

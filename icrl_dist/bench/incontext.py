@@ -1,7 +1,7 @@
-"""In-context learning itself, beside the official DPT layout: deployment, time to quality, labels, long contexts.
+"""In-context learning against the official DPT layout: deployment, time to quality, labels, long contexts.
 
-Both sides run in this process on one core and are measured in CPU-seconds.  The peer is written
-anew in ``peer.py``; it must be as fast as the official code was, or the benchmark fails.
+Both run in this process on one core and are measured in CPU-seconds.  The peer is a new implementation
+(``peer.py``); if it is slower than the official code was, the benchmark fails.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from icrl_dist.bench import peer
 from icrl_dist.storage.files import atomic_write
 
 FLOORS = {"training": 600.0, "deployment": 1100.0}
-"""Contexts and environment steps (20 environments) a CPU-second that the official code reached."""
+"""Contexts, and environment steps in 20 environments, per CPU-second of the official code."""
 REFERENCE_GFLOPS = 90.0
-"""A product of float32 matrices on the machine of those floors; slower machines lower them."""
+"""Float32 matrix products on the machine of these floors; on a slower machine the floors are scaled down."""
 
 Report = Callable[[str], None]
 
@@ -31,9 +31,9 @@ Report = Callable[[str], None]
 def run(folder: Path = Path("runs"), quick: bool = False, report: Report = lambda text: None) -> dict[str, Any]:
     """Measure everything; ``quick`` takes one seed and fewer repeats.
 
-    ``folder`` takes ``incontext.png`` and ``incontext.json``, where each finished training is
-    kept: a benchmark that was interrupted goes on from there.  ``ok`` is false, and ``reasons``
-    says why, if the peer is below its floors or a training of ours did not arrive.
+    Writes ``incontext.png`` and ``incontext.json`` to ``folder``.  The JSON file stores each finished
+    training, so an interrupted benchmark continues with the next one.  ``ok`` is false if the peer is
+    below its floors or a training of ours did not reach the target loss; ``reasons`` lists why.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -62,12 +62,12 @@ def _run(folder: Path, quick: bool, report: Report) -> dict[str, Any]:
     trainings = _trainings(folder / "incontext.json", range(1 if quick else 3), report)
     result |= _time_to_quality(trainings)
     reasons = [
-        f"the peer's {name} is {found}/s, below {FLOORS[name] * scale:.0f}: it is not the official code's equal"
+        f"the peer's {name} is {found}/s, below {FLOORS[name] * scale:.0f}: it is slower than the official code"
         for name, found in (("training", result["peer_labels_per_s"]), ("deployment", result["peer_steps_per_s_20"]))
         if found < FLOORS[name] * scale
     ]
-    if not all(done["reached"] for side, done in trainings.items() if side.startswith("ours")):
-        reasons.append(f"a model of ours did not come within {quality.CLOSE} nats of the floor")
+    if not all(training["reached"] for name, training in trainings.items() if name.startswith("ours")):
+        reasons.append(f"a model of ours did not reach a loss within {quality.CLOSE} nats of the floor")
     figure = _plot(result, trainings, folder / "incontext.png")
     return result | {"figure": str(figure), "ok": not reasons, "reasons": reasons}
 
@@ -77,13 +77,13 @@ def describe(result: dict[str, Any]) -> str:
     rows = [f"{'per CPU-second, one core':<44}{'ours':>10}{'peer':>10}{'ratio':>8}"]
     for batch in (20, 512):
         ours, theirs = result[f"steps_per_s_{batch}"], result[f"peer_steps_per_s_{batch}"]
-        what = f"environment steps online, {batch} environments"
-        rows.append(f"{what:<44}{ours:>10,}{theirs:>10,}{result[f'deploy_ratio_{batch}']:>8.1f}")
+        label = f"environment steps online, {batch} environments"
+        rows.append(f"{label:<44}{ours:>10,}{theirs:>10,}{result[f'deploy_ratio_{batch}']:>8.1f}")
     ours, theirs = result["labels_per_s"], result["peer_labels_per_s"]
     rows.append(f"{'labelled queries in training':<44}{ours:>10,}{theirs:>10,}{result['labels_ratio']:>8.1f}")
     ratio = "" if result["time_to_quality_ratio"] is None else f"{result['time_to_quality_ratio']:>8.1f}"
-    what = f"CPU-seconds to {quality.CLOSE} nats above the floor"
-    rows.append(f"{what:<44}{result['quality_cpu_s']:>10,.0f}{result['peer_quality_cpu_s']:>10,.0f}{ratio}")
+    label = f"CPU-seconds to {quality.CLOSE} nats above the floor"
+    rows.append(f"{label:<44}{result['quality_cpu_s']:>10,.0f}{result['peer_quality_cpu_s']:>10,.0f}{ratio}")
     if result["time_to_quality_is_a_bound"]:
         rows.append(f"the peer was stopped after {quality.PEER_CONTEXTS:,} contexts: its time and the ratio are lower bounds")
     rows.append(
@@ -99,10 +99,10 @@ def describe(result: dict[str, Any]) -> str:
 
 
 def _trainings(path: Path, seeds: range, report: Report) -> dict[str, Any]:
-    """Outcome of ``ours/SEED`` and ``peer/SEED``; those that the file holds for the same settings are not run again."""
+    """Results of the trainings ``ours/SEED`` and ``peer/SEED``; results stored for the same settings are reused."""
     settings = json.loads(json.dumps(_settings()))
-    kept = json.loads(path.read_text()) if path.exists() else {}
-    done: dict[str, Any] = kept["done"] if kept.get("settings") == settings else {}
+    stored = json.loads(path.read_text()) if path.exists() else {}
+    done: dict[str, Any] = stored["done"] if stored.get("settings") == settings else {}
     for seed in seeds:
         for side, train in (("ours", quality.ours), ("peer", quality.theirs)):
             if (name := f"{side}/{seed}") not in done:
@@ -111,29 +111,31 @@ def _trainings(path: Path, seeds: range, report: Report) -> dict[str, Any]:
     return {f"{side}/{seed}": done[f"{side}/{seed}"] for side in ("ours", "peer") for seed in seeds}
 
 
-def _save(path: Path, kept: dict[str, Any]) -> None:
-    atomic_write(path, lambda file: file.write(json.dumps(kept, indent=1).encode()))
+def _save(path: Path, content: dict[str, Any]) -> None:
+    atomic_write(path, lambda file: file.write(json.dumps(content, indent=1).encode()))
 
 
 def _settings() -> dict[str, Any]:
-    """All that the outcome of a training depends on."""
+    """Everything that the result of a training depends on."""
     constants = {name: getattr(module, name) for module in (quality, peer) for name in vars(module) if name.isupper()}
-    simple = {name: value for name, value in constants.items() if isinstance(value, (int, float))}
+    numbers = {name: value for name, value in constants.items() if isinstance(value, (int, float))}
     machine = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability()}
-    return simple | {"model": asdict(quality.MODEL), "optim": asdict(quality.OPTIM)} | machine
+    return numbers | {"model": asdict(quality.MODEL), "optim": asdict(quality.OPTIM)} | machine
 
 
 def _time_to_quality(trainings: dict[str, Any]) -> dict[str, Any]:
-    """CPU-seconds of both sides, medians over seeds, and their ratio; None if ours did not arrive."""
-    sides = {side: [done for name, done in trainings.items() if name.startswith(side)] for side in ("ours", "peer")}
-    seconds = {side: statistics.median(done["cpu_s"] for done in found) for side, found in sides.items()}
-    arrived = all(done["reached"] for done in sides["ours"])
+    """CPU-seconds of both sides (medians over seeds) and their ratio; None if ours did not reach the target loss."""
+    sides = {side: [training for name, training in trainings.items() if name.startswith(side)] for side in ("ours", "peer")}
+    seconds = {side: statistics.median(training["cpu_s"] for training in found) for side, found in sides.items()}
+    reached = all(training["reached"] for training in sides["ours"])
     return {
-        "time_to_quality_ratio": round(seconds["peer"] / seconds["ours"], 1) if arrived else None,
-        "time_to_quality_is_a_bound": not all(done["reached"] for done in sides["peer"]),
+        "time_to_quality_ratio": round(seconds["peer"] / seconds["ours"], 1) if reached else None,
+        "time_to_quality_is_a_bound": not all(training["reached"] for training in sides["peer"]),
         "quality_cpu_s": seconds["ours"],
         "peer_quality_cpu_s": seconds["peer"],
-        "trainings": {name: {k: v for k, v in done.items() if k != "curve"} for name, done in trainings.items()},
+        "trainings": {
+            name: {key: value for key, value in training.items() if key != "curve"} for name, training in trainings.items()
+        },
     }
 
 
@@ -144,10 +146,10 @@ def _plot(result: dict[str, Any], trainings: dict[str, Any], path: Path) -> Path
     from matplotlib import pyplot
 
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4.2))
-    for name, done in trainings.items():
+    for name, training in trainings.items():
         ours = name.startswith("ours")
         label = {"ours/0": "ours", "peer/0": "official layout"}.get(name)
-        left.plot(*zip(*done["curve"], strict=True), color="tab:blue" if ours else "tab:orange", label=label, linewidth=1.3)
+        left.plot(*zip(*training["curve"], strict=True), color="tab:blue" if ours else "tab:orange", label=label, linewidth=1.3)
     left.axhline(quality.CLOSE, color="black", linewidth=0.8)
     left.set(xlabel="CPU-seconds of training", ylabel="held-out loss above the exact floor, nats", xscale="log", yscale="log")
     left.legend(fontsize=8)

@@ -1,4 +1,4 @@
-"""What a decision and a label cost: the real deployment loop and the real training step, ours and the peer's."""
+"""The cost of a decision and of a label, ours and the peer's: the real deployment loop and the real training step."""
 
 from __future__ import annotations
 
@@ -12,31 +12,35 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from icrl_dist.bench import peer
-from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, SPEC, Law
-from icrl_dist.config.run import ContextConfig
+from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, SPEC, DPTData
+from icrl_dist.config.sections import ContextConfig
+from icrl_dist.interfaces import Policy
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import room
-from icrl_dist.rollout.deployment import InContextPolicy, Policy, RandomPolicy, episode
+from icrl_dist.rollout.deployment import InContextPolicy
+from icrl_dist.rollout.episode import episode
+from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.training import fit
 from icrl_dist.types import NULL, Variation
 
 LENGTHS = tuple(range(0, 4001, 500))
-"""Contexts at which a decision is timed, and how many at once."""
+"""Context lengths at which a decision is timed."""
 ROWS = 20
+"""Environments of these decisions."""
 
 
 def matmul_gflops(size: int = 1024, repeats: int = 9, device: str = "cpu") -> float:
-    """What a product of two float32 matrices reaches: how fast this machine is."""
+    """GFLOP/s of a product of two float32 matrices: the speed of this machine."""
     a = torch.ones(size, size, device=device)
     return 2e-9 * size**3 / statistics.median(_times(lambda: a @ a, repeats, device))
 
 
 def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
-    """Environment steps a CPU-second of whole online episodes, each begun with a context of 100 transitions.
+    """Environment steps per CPU-second of whole online episodes, each with a context of 100 transitions.
 
-    Both sides run ``rollout.episode`` in the same environments, in turns, and take the episode
-    that ended for their next context, as the official code does.
+    Both sides run ``rollout.episode`` in the same environments and alternate.  The context is the previous
+    episode, as in the official code.
     """
     rng = np.random.default_rng(0)
     env = registry.batch([Variation(room.task(goal), NULL) for goal in rng.integers(0, 10, size=(batch, 2)).tolist()])
@@ -44,14 +48,16 @@ def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
     torch.manual_seed(0)
     ours = InContextPolicy(PretrainedTransformer(env.spec, MODEL).eval(), batch, ContextConfig(keep="last"))
     theirs = peer.PeerPolicy(peer.Peer(env.spec).eval())
-    first = episode(env, RandomPolicy(env.spec.actions), rngs)
+    initial = episode(env, RandomPolicy(env.spec.actions), rngs)
     for policy in (ours, theirs):
-        policy.append(first.observations[:, :-1], first.actions.astype(np.int64), first.observations[:, 1:], first.rewards)
+        policy.append(
+            initial.observations[:, :-1], initial.actions.astype(np.int64), initial.observations[:, 1:], initial.rewards
+        )
 
     def rates(policy: Policy, episodes: int) -> list[float]:
-        return [batch * LENGTH / taken for taken in _times(lambda: episode(env, policy, rngs), episodes)]
+        return [batch * LENGTH / seconds for seconds in _times(lambda: episode(env, policy, rngs), episodes)]
 
-    rates(ours, 1)  # finds cold caches
+    rates(ours, 1)  # warms the caches
     measured: dict[str, list[float]] = {"ours": [], "peer": []}
     for _ in range(pairs):
         measured["ours"] += rates(ours, 4)
@@ -60,16 +66,16 @@ def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
 
 
 def training(rounds: int) -> dict[str, float]:
-    """Contexts and labelled queries a CPU-second through forward, backward and optimizer, in turns."""
-    law = Law(0)
+    """Labelled queries per CPU-second through forward, backward and optimizer; both sides alternate."""
+    data = DPTData(0)
     torch.manual_seed(0)
-    step, labels = _our_step(law, "cpu", OPTIM.batch)
+    step, labels = _our_step(data, "cpu", OPTIM.batch)
     model = peer.Peer(SPEC)
-    opt, drawn = peer.optimizer(model), law.draw(0, 0, peer.BATCH, 1).tensors()
+    optimizer, batch = peer.optimizer(model), data.draw(0, 0, peer.BATCH, 1).tensors()
     ours, theirs = [], []
     for turn in range(rounds + 1):
-        measured = _times(step, 8), _times(lambda: peer.train_step(model, opt, *drawn), 5)
-        if turn:  # the first finds cold caches
+        measured = _times(step, 8), _times(lambda: peer.train_step(model, optimizer, *batch), 5)
+        if turn:  # the first one has cold caches
             ours += measured[0]
             theirs += measured[1]
     return {
@@ -79,48 +85,49 @@ def training(rounds: int) -> dict[str, float]:
 
 
 def by_length(repeats: int = 25) -> dict[str, Any]:
-    """CPU time of a decision in ``ROWS`` environments at once as their contexts grow, and its exponents.
+    """CPU time of a decision in ``ROWS`` environments by context length, and exponents of its growth.
 
-    ``length_exponent`` is the slope of log time against log length over all contexts but the empty
-    one, ``length_exponent_long`` over the longer half, which no longer fits into every processor's cache.
+    ``length_exponent`` is the slope of log time against log length over all non-empty contexts,
+    ``length_exponent_long`` over the longer half, which does not fit into the cache of every processor.
     """
-    law = Law(0)
+    data = DPTData(0)
     torch.manual_seed(0)
     policy = InContextPolicy(PretrainedTransformer(SPEC, MODEL).eval(), ROWS, ContextConfig(max=max(LENGTHS)))
     state = np.zeros((ROWS, SPEC.observation), np.float32)
-    taken: list[float] = []
+    microseconds: list[float] = []
     for number, length in enumerate(LENGTHS):
         while policy.length < length:
-            drawn = law.draw(number, policy.length, ROWS, 1)
-            data = drawn.batch(np.zeros(drawn.query.shape, np.int64))
-            policy.append(data.observations, data.actions, data.next_observations, data.rewards)
+            contexts = data.draw(number, policy.length, ROWS, 1)
+            batch = contexts.batch(np.zeros(contexts.query.shape, np.int64))
+            policy.append(batch.observations, batch.actions, batch.next_observations, batch.rewards)
         policy.probabilities(state)
-        taken.append(1e6 * statistics.median(_times(lambda: policy.probabilities(state), repeats)))
-    slope = [float(np.polyfit(np.log(LENGTHS[first:]), np.log(taken[first:]), 1)[0]) for first in (1, len(LENGTHS) // 2)]
+        microseconds.append(1e6 * statistics.median(_times(lambda: policy.probabilities(state), repeats)))
+    slope = [float(np.polyfit(np.log(LENGTHS[first:]), np.log(microseconds[first:]), 1)[0]) for first in (1, len(LENGTHS) // 2)]
     return {
         "length": list(LENGTHS),
-        "decision_us": [round(t) for t in taken],
+        "decision_us": [round(t) for t in microseconds],
         "length_exponent": round(slope[0], 3),
         "length_exponent_long": round(slope[1], 3),
     }
 
 
 def on_device(device: str, batch: int = 1024, environments: int = 4096, size: int = 8192) -> dict[str, Any]:
-    """Labels and decisions a second on an accelerator, and their shares of its own limits.
+    """Labels and decisions per second on an accelerator, and their shares of its limits.
 
-    A label's limit is the rate of a float32 product of two matrices ``(size, size)``, a decision's
-    that of copying one, both measured here: a decision reads its context once a layer.
+    The limit of labels is the rate of a float32 product of two ``(size, size)`` matrices.  That of decisions
+    is the rate of copying such a matrix, because a decision reads its context once per layer.  Both are
+    measured here.
     """
-    law = Law(0)
+    draws = DPTData(0)
     torch.manual_seed(0)
-    step, labels = _our_step(law, device, batch)
+    step, labels = _our_step(draws, device, batch)
     step()
     with FlopCounterMode(display=False) as counter:
         step()
     label_s = statistics.median(_times(step, 9, device)) / labels
     model = PretrainedTransformer(SPEC, MODEL).to(device).eval()
     policy = InContextPolicy(model, environments, ContextConfig())
-    data = law.draw(0, 0, environments, 1).batch(np.zeros((environments, 1), np.int64))
+    data = draws.draw(0, 0, environments, 1).batch(np.zeros((environments, 1), np.int64))
     policy.append(data.observations, data.actions, data.next_observations, data.rewards)
     state = data.queries[:, 0]
     policy.probabilities(state)
@@ -136,30 +143,30 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     }
 
 
-def _our_step(law: Law, device: str, batch: int) -> tuple[Callable[[], object], int]:
-    """A training step on one drawn batch, and its labelled queries."""
+def _our_step(data: DPTData, device: str, batch: int) -> tuple[Callable[[], object], int]:
+    """A training step on one drawn batch, and its number of labelled queries."""
     model = PretrainedTransformer(SPEC, MODEL).to(device).train()
-    opt = fit.Optimizer(model, OPTIM)
-    drawn = law.draw(0, 0, batch, OPTIM.queries)
-    data = drawn.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=drawn.query.shape))
+    optimizer = fit.Optimizer(model, OPTIM)
+    contexts = data.draw(0, 0, batch, OPTIM.queries)
+    examples = contexts.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=contexts.query.shape))
 
     def step() -> None:
-        value = fit.batch_loss(model, data)
-        value.backward()  # type: ignore[no-untyped-call]
+        loss = fit.batch_loss(model, examples)
+        loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), OPTIM.clip)
-        opt.step(OPTIM.learning_rate)
+        optimizer.step(OPTIM.learning_rate)
 
-    return step, drawn.query.size
+    return step, contexts.query.size
 
 
 def _times(call: Callable[[], object], repeats: int, device: str = "cpu") -> list[float]:
-    """Seconds of each call: the processor's, or the clock's where another device works."""
+    """Seconds of each call: CPU time, or wall time on another device."""
     clock = time.process_time if device == "cpu" else time.perf_counter
-    taken = []
+    seconds = []
     for _ in range(repeats):
         began = clock()
         call()
         if device != "cpu":
             torch.cuda.synchronize()
-        taken.append(clock() - began)
-    return taken
+        seconds.append(clock() - began)
+    return seconds

@@ -1,7 +1,7 @@
-"""Durable trajectories a second: one worker process, the learner's own ingest and store, with and without fsync.
+"""Durable trajectories per second: one worker process, the learner's inbox and store, with and without fsync.
 
-Everything of a run but the learning: the worker encodes and sends on credit, the ingest decodes,
-checks, appends to the store, and answers once the store says that it is on disk.
+The whole path of a run except training: the worker encodes and sends with credits; the inbox decodes,
+checks and appends to the store, and replies after the store has written to disk.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from typing import Any
 import psutil
 
 from icrl_dist.bench.stream import KEYS, LIMIT, example
-from icrl_dist.config.run import ConfigError, StreamConfig
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import StreamConfig
 from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
@@ -34,22 +35,22 @@ from icrl_dist.types import Job, Spec, Trajectory
 from learner.ingest import Ingest
 
 CREDITS = StreamConfig().credits
-"""A run's own default."""
+"""The default of a run."""
 
 IN_MEMORY = ("tmpfs", "ramfs", "devtmpfs")
-"""File systems on which an fsync does nothing."""
+"""File systems in memory, where an fsync has no effect."""
 
 
 def work(endpoint: str) -> None:
-    """The worker process: ask for seconds of work, send for so long, until told to send for none."""
-    one, trials = example(), itertools.count()
+    """The worker process: request a number of seconds and send for that long, until the number is 0."""
+    trajectory, trials = example(), itertools.count()
     with ZenohLink.connect(endpoint, 10.0) as link:
         sender = CreditSender(link, KEYS.data, CREDITS, 10.0)
         while seconds := float(link.request(KEYS.work, b"", 600.0)):
             end = time.monotonic() + seconds
             while True:
-                identity = one.identity._replace(trial=next(trials))
-                sender.send(wire.encode_trajectory(dataclasses.replace(one, identity=identity)))
+                identity = trajectory.identity._replace(trial=next(trials))
+                sender.send(wire.encode_trajectory(dataclasses.replace(trajectory, identity=identity)))
                 if time.monotonic() > end:
                     break
             sender.drain(60.0)
@@ -57,11 +58,11 @@ def work(endpoint: str) -> None:
 
 
 def run(folder: Path = Path("runs"), seconds: float = 20.0, pairs: int = 5) -> dict[str, Any]:
-    """Measure for ``seconds`` in all, with and without fsync by turns; medians over the turns.
+    """Measure for ``seconds`` in total, alternating with and without fsync; rates are medians over turns.
 
-    Each turn has a store of its own, in a temporary folder under ``folder`` that is removed
-    afterwards.  ``ratio`` is the median over pairs of turns.  Raises ConfigError for a folder
-    whose file system is in memory, and for a time or a number of pairs that is not above 0.
+    Each turn has its own store, in a temporary folder under ``folder`` that is removed afterwards.
+    ``ratio`` is the median over pairs of turns.  Raises ConfigError for a folder on a file system in
+    memory, and for a time or a number of pairs that is not above 0.
     """
     if not seconds > 0:
         raise ConfigError(f"bench ingest: seconds = {seconds}: must be above 0")
@@ -70,16 +71,16 @@ def run(folder: Path = Path("runs"), seconds: float = 20.0, pairs: int = 5) -> d
     kind = file_system(folder)
     if kind in IN_MEMORY:
         raise ConfigError(
-            f"bench ingest: {folder} lies on {kind}, where an fsync does nothing: name a folder on a disk by --folder"
+            f"bench ingest: {folder} is on {kind}, where an fsync has no effect: choose a folder on a disk with --folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
     turn = seconds / (2 * pairs)
     with tempfile.TemporaryDirectory(dir=folder, prefix="ingest-") as name, _learner(Path(name)) as learner:
         before = fsync_p50_ms(Path(name))
-        learner.turn(turn / 2, durable=True)  # finds cold caches
+        learner.turn(turn / 2, durable=True)  # warms the caches
         turns = []
         for pair in range(pairs):
-            first = bool(pair % 2)  # what comes second finds the disk busy with the first's bytes, so they change places
+            first = bool(pair % 2)  # the order alternates: during the second turn the disk is still busy with the first
             rates = {durable: learner.turn(turn, durable) for durable in (first, not first)}
             turns.append((rates[True], rates[False]))
         after = fsync_p50_ms(Path(name))
@@ -104,34 +105,34 @@ def describe(result: dict[str, Any]) -> str:
     rows += [f"{'median':<8}{result['durable_per_s']:>9.0f}{result['volatile_per_s']:>8.0f}"]
     rows += [
         f"with / without fsync: {result['ratio']:.2f}; {result['file_system']}, fsync p50 {result['fsync_p50_ms']:.2f} ms, "
-        f"{result['trajectories_an_fsync']:.1f} trajectories each"
+        f"{result['trajectories_an_fsync']:.1f} trajectories per fsync"
     ]
     return "\n".join(rows)
 
 
 def file_system(folder: Path) -> str:
-    """The name of the file system that ``folder`` lies on, or would: ``ext4``, ``tmpfs``."""
-    where = folder.absolute().resolve()
-    mounts = [m for m in psutil.disk_partitions(all=True) if where.is_relative_to(m.mountpoint)]
-    # Of two mounts in one place, the later one covers the earlier.
+    """The type of the file system of ``folder``, which need not exist: ``ext4``, ``tmpfs``."""
+    path = folder.absolute().resolve()
+    mounts = [m for m in psutil.disk_partitions(all=True) if path.is_relative_to(m.mountpoint)]
+    # Of two mounts at one path, the later one hides the earlier.
     return max(enumerate(mounts), key=lambda m: (len(Path(m[1].mountpoint).parts), m[0]))[1].fstype if mounts else "unknown"
 
 
 def fsync_p50_ms(folder: Path, count: int = 60) -> float:
-    """Median of what it takes to append eight trajectories' bytes to a file and fsync it, milliseconds."""
-    block, taken = os.urandom(8 * len(wire.encode_trajectory(example()))), []
+    """Median milliseconds to append the bytes of eight trajectories to a file and fsync it."""
+    block, seconds = os.urandom(8 * len(wire.encode_trajectory(example()))), []
     with (folder / "fsync").open("ab") as file:
         for _ in range(count):
             began = time.perf_counter()
             file.write(block)
             file.flush()
             os.fsync(file.fileno())
-            taken.append(time.perf_counter() - began)
-    return 1e3 * statistics.median(taken)
+            seconds.append(time.perf_counter() - began)
+    return 1e3 * statistics.median(seconds)
 
 
-class _Learner:
-    """The learner's side of the stream: an ingest, and a store of its own for every turn."""
+class _LearnerSide:
+    """The learner's side of the stream: an inbox, and a separate store for every turn."""
 
     def __init__(self, link: ZenohLink, folder: Path, worker: subprocess.Popen[bytes]) -> None:
         self._folder, self._worker = folder, worker
@@ -140,13 +141,13 @@ class _Learner:
         self._failure: BaseException | None = None
         self._idle: queue.SimpleQueue[Query] = queue.SimpleQueue()
         self.stored = self.commits = 0
-        """Trajectories of the turns with fsync, and how many fsyncs they took."""
+        """Trajectories and fsyncs of the turns with fsync."""
         link.serve(KEYS.data, self._put)
         link.serve(KEYS.work, self._idle.put)
         self._waiting = self._next_request()
 
     def turn(self, seconds: float, durable: bool) -> float:
-        """Trajectories a second into a fresh store, until the last one that was sent is stored."""
+        """Trajectories per second into a new store, until the last one sent is stored."""
         folder = self._folder / f"turn-{next(self._numbers)}"
         stored: list[float] = []
         with contextlib.closing(Store(folder, durable=durable)) as store:
@@ -154,10 +155,10 @@ class _Learner:
             began = time.monotonic()
             self._waiting.reply(b"%f" % seconds)
             self._waiting = self._next_request()
-            ingest.close()
-        shutil.rmtree(folder)  # what was not fsynced need not be written either, in the next one's time
-        if ingest.drops:
-            raise RuntimeError(f"the ingest dropped {dict(ingest.drops)}: this measures nothing")
+            inbox.close()
+        shutil.rmtree(folder)  # so that unsynced data is not written to disk during the next turn
+        if inbox.drops:
+            raise RuntimeError(f"the inbox dropped {dict(inbox.drops)}: the rate would be wrong")
         if durable:
             self.stored += len(stored)
             self.commits += ingest.commits
@@ -167,15 +168,15 @@ class _Learner:
         self._waiting.reply(b"0")
 
     def _open(self, store: Store, stored: list[float]) -> Ingest:
-        one = example()
-        size, actions = one.observations.shape[1], one.labels.shape[1]
-        spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))
-        job = Job("adapt", *one.identity[:3], (one.variation,), 1, one.policy_version, seed=0)
+        trajectory = example()
+        size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
+        spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))
+        job = Job("adapt", *trajectory.identity[:3], (trajectory.variation,), 1, trajectory.policy_version, seed=0)
 
         def note(_: Trajectory) -> None:
             stored.append(time.monotonic())
 
-        return Ingest(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, self._fail)
+        return Ingest(store, spec, LIMIT, lambda _: job, lambda _: trajectory.weights_digest, note, self._fail)
 
     def _put(self, query: Query) -> None:
         assert self._ingest is not None
@@ -192,16 +193,18 @@ class _Learner:
                 if self._failure is not None:
                     raise self._failure from None
                 if self._worker.poll() is not None:
-                    raise RuntimeError(f"the bench's worker process died: exit code {self._worker.returncode}") from None
+                    raise RuntimeError(
+                        f"the worker process of the benchmark ended: exit code {self._worker.returncode}"
+                    ) from None
 
 
 @contextlib.contextmanager
-def _learner(folder: Path) -> Iterator[_Learner]:
+def _learner(folder: Path) -> Iterator[_LearnerSide]:
     with ZenohLink.listen("tcp/127.0.0.1:0") as link:
         command = [sys.executable, "-c", "import sys; from icrl_dist.bench.ingest import work; work(sys.argv[1])"]
         with subprocess.Popen([*command, link.endpoints[0]]) as worker:
             try:
-                learner = _Learner(link, folder, worker)
+                learner = _LearnerSide(link, folder, worker)
                 yield learner
                 learner.stop()
                 worker.wait(10)

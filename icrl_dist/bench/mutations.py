@@ -1,4 +1,4 @@
-"""Changes to valid messages, such as a broken or a hostile sender might make."""
+"""Mutations of valid messages, like those of a defective or malicious sender.  docs/decisions/fuzz.md: why not hypothesis."""
 
 from __future__ import annotations
 
@@ -10,87 +10,87 @@ import numpy as np
 
 
 def mutate(rng: np.random.Generator, valid: Sequence[bytes]) -> bytes:
-    """An input: one to three changes to a valid one, or nothing but noise."""
+    """One to three mutations of a valid input."""
     data = valid[int(rng.integers(len(valid)))]
     for _ in range(rng.integers(1, 4)):
-        change = _CHANGES[rng.integers(len(_CHANGES))]
-        data = change(rng, data, valid)
+        mutation = _MUTATIONS[rng.integers(len(_MUTATIONS))]
+        data = mutation(rng, data, valid)
     return data
 
 
-def _flip(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+def _flip_bits(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
     changed = bytearray(data or b"\0")
     for _ in range(min(len(data), int(rng.integers(1, 9)))):
-        changed[_near(rng, data)] ^= 1 << int(rng.integers(8))
+        changed[_position(rng, data)] ^= 1 << int(rng.integers(8))
     return bytes(changed)
 
 
-def _cut(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+def _truncate(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
     return data[: rng.integers(len(data) + 1)]
 
 
-def _drop(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
-    start = _near(rng, data)
+def _delete(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+    start = _position(rng, data)
     return data[:start] + data[start + int(rng.integers(1, 9)) :]
 
 
 def _repeat(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
-    start = _near(rng, data)
+    start = _position(rng, data)
     part = data[start : start + int(rng.integers(1, 64))]
     return data[:start] + part * int(rng.integers(2, 50)) + data[start:]
 
 
 def _splice(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
     other = valid[int(rng.integers(len(valid)))]
-    return data[: _near(rng, data)] + other[_near(rng, other) :]
+    return data[: _position(rng, data)] + other[_position(rng, other) :]
 
 
-def _lie(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
-    """A length that need not be true, over or between what was there."""
-    start, lie = _near(rng, data), _head(rng, len(data))
-    return data[:start] + lie + data[start + int(rng.integers(2)) * len(lie) :]
+def _false_length(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+    """Insert or overwrite a msgpack header with a possibly false length."""
+    start, header = _position(rng, data), _header(rng, len(data))
+    return data[:start] + header + data[start + int(rng.integers(2)) * len(header) :]
 
 
-def _head(rng: np.random.Generator, size: int) -> bytes:
-    """The first bytes of a value for msgpack, with a length about which it may lie; perhaps many within each other."""
+def _header(rng: np.random.Generator, size: int) -> bytes:
+    """The header of a msgpack value with a possibly false length; sometimes repeated, which nests it."""
     width = int(rng.choice([0, 1, 2, 4]))
     kind = _KINDS[width][int(rng.integers(len(_KINDS[width])))]
     length = int(rng.choice([0, 1, 127, size // 2, size, 1 << 14, 2**16 - 1, 2**31, 2**32 - 1]))
-    head = bytes([kind]) + min(length, 256**width - 1).to_bytes(width)
-    return head * int(rng.choice([1, 1, 10, 500]))
+    header = bytes([kind]) + min(length, 256**width - 1).to_bytes(width)
+    return header * int(rng.choice([1, 1, 10, 500]))
 
 
 def _noise(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
     return rng.bytes(int(rng.integers(200)))
 
 
-def _strange(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
-    """The same message with one of its values, wherever it lies, replaced by a strange one, renamed or left out."""
-    message, place = _somewhere(rng, data)
+def _replace_value(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+    """Replace, rename or remove one value of the message, at any depth."""
+    message, place = _parse_and_pick(rng, data)
     if place is None:
-        return _plain(rng, data, valid)
+        return _random_value(rng, data, valid)
     holder, key = place
-    chance = rng.random()
-    if isinstance(holder, dict) and chance < 0.1:
+    choice = rng.random()
+    if isinstance(holder, dict) and choice < 0.1:
         holder[_scalar(rng)] = holder.pop(key)
-    elif chance < 0.2:
+    elif choice < 0.2:
         holder.pop(key)
     else:
         holder[key] = _value(rng, 3)
     return _pack(message)
 
 
-def _claim(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
-    """The same message with lengths that need not be true, perhaps within each other, in a value's place."""
-    message, place = _somewhere(rng, data)
+def _nested_false_length(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+    """Replace one value of the message by headers with possibly false lengths."""
+    message, place = _parse_and_pick(rng, data)
     if place is None:
-        return _lie(rng, data, valid)
+        return _false_length(rng, data, valid)
     place[0][place[1]] = _MARK
-    return _pack(message).replace(_pack(_MARK), _head(rng, len(data)))
+    return _pack(message).replace(_pack(_MARK), _header(rng, len(data)))
 
 
-def _somewhere(rng: np.random.Generator, data: bytes) -> tuple[Any, tuple[Any, Any] | None]:
-    """The message, and a container in it with a key or an index; None if it is none, for an earlier change broke it."""
+def _parse_and_pick(rng: np.random.Generator, data: bytes) -> tuple[Any, tuple[Any, Any] | None]:
+    """The parsed message and a random (container, key) in it; None if an earlier mutation made it unreadable."""
     try:
         message = msgpack.unpackb(data, strict_map_key=False)
     except Exception:
@@ -98,19 +98,19 @@ def _somewhere(rng: np.random.Generator, data: bytes) -> tuple[Any, tuple[Any, A
     return message, _place(rng, message)
 
 
-def _plain(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
+def _random_value(rng: np.random.Generator, data: bytes, valid: Sequence[bytes]) -> bytes:
     return _pack(_value(rng, 4))
 
 
-def _near(rng: np.random.Generator, data: bytes) -> int:
-    """A place in the data; half of the time near its start or its end, where there is more than numbers."""
+def _position(rng: np.random.Generator, data: bytes) -> int:
+    """A position in the data; half of the time near the start or the end, where there are fields other than array data."""
     last = max(0, len(data) - 1)
     close = min(last, int(rng.integers(400)))
     return int(rng.choice([close, last - close, int(rng.integers(last + 1)), int(rng.integers(last + 1))]))
 
 
 def _place(rng: np.random.Generator, value: Any) -> tuple[Any, Any] | None:
-    """A container somewhere within a value, and a key or an index of it."""
+    """A random container within a value, and a key or an index of it."""
     found = None
     while isinstance(value, (dict, list)) and len(value) and (found is None or rng.random() < 0.7):
         keys = list(value) if isinstance(value, dict) else range(len(value))
@@ -152,4 +152,18 @@ _KINDS = {
 }
 """Type bytes of msgpack, by the width of the length that follows."""
 
-_CHANGES = (_flip, _cut, _drop, _repeat, _splice, _lie, _claim, _claim, _noise, _strange, _strange, _strange, _plain)
+_MUTATIONS = (
+    _flip_bits,
+    _truncate,
+    _delete,
+    _repeat,
+    _splice,
+    _false_length,
+    _nested_false_length,
+    _nested_false_length,
+    _noise,
+    _replace_value,
+    _replace_value,
+    _replace_value,
+    _random_value,
+)

@@ -30,7 +30,8 @@ from icrl_dist.config.run import Run
 from icrl_dist.diagnostics.estimate import PhaseRates, Rates
 from icrl_dist.experts.cache import sac_of
 from icrl_dist.methods.recipes import METHODS, Phase
-from icrl_dist.models.dpt import PretrainedTransformer, weights_of
+from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry, splits
 from icrl_dist.results import evaluate
 from icrl_dist.storage.dataset import Store
@@ -170,7 +171,7 @@ def _training(job: Job, budget_s: float) -> float:
             raise _EnoughSeen
 
     with contextlib.suppress(_EnoughSeen):
-        train(env, short, 20 * horizon, range(env.batch), progress, by=trained_by(env.batch))
+        train(env, short, 20 * horizon, range(env.batch), progress, backend=trained_by(env.batch))
     return float(np.median(np.diff(times))) * config.steps / horizon  # the first episode is over before they learn
 
 

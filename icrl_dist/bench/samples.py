@@ -10,7 +10,7 @@ import numpy as np
 from icrl_dist.methods.recipes import Key
 from icrl_dist.problems import registry
 from icrl_dist.results import evaluate
-from icrl_dist.rollout.deployment import episode
+from icrl_dist.rollout.episode import episode
 from icrl_dist.types import Job, Trajectory
 
 

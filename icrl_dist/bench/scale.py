@@ -30,7 +30,8 @@ import psutil
 
 from icrl_dist.bench import ingest
 from icrl_dist.bench.stream import KEYS, LIMIT, example
-from icrl_dist.config.run import ConfigError, StreamConfig
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import StreamConfig
 from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender

@@ -28,7 +28,7 @@ from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, sav
 from icrl_dist.types import Job, Trajectory, Variation
 
 if TYPE_CHECKING:
-    from icrl_dist.experts.sac.batched import By, SACBatch
+    from icrl_dist.experts.sac.batched import Backend, SACBatch
 
 _log = logging.getLogger(__name__)
 
@@ -67,21 +67,21 @@ def _histories(job: Job, problem: Problem, config: SACConfig, progress: Progress
     return [found[variation] for variation in job.variations]
 
 
-def trained_by(experts: int) -> By:
+def trained_by(experts: int) -> Backend:
     """stable-baselines3, the reference, trains a job's expert that is alone; several train in lockstep, and one on a GPU."""
     from icrl_dist.experts.sac.batched import pick
 
     return "stable-baselines3" if experts == 1 and pick("auto").type == "cpu" else "lockstep"
 
 
-def _trainer(by: By) -> Trainer:
+def _trainer(by: Backend) -> Trainer:
     from icrl_dist.experts.sac.batched import pick
 
     return "lockstep, cuda" if by == "lockstep" and pick("auto").type == "cuda" else by
 
 
 def _train(
-    job: Job, problem: Problem, variations: Sequence[Variation], by: By, config: SACConfig, progress: Progress
+    job: Job, problem: Problem, variations: Sequence[Variation], by: Backend, config: SACConfig, progress: Progress
 ) -> list[History]:
     from icrl_dist.experts.sac.batched import train
 
@@ -103,7 +103,7 @@ def _train(
             save_checkpoint(part, Checkpoint(arrays, {}))
             written = time.monotonic()
 
-    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, by=by)
+    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, backend=by)
     columns, led = labelled(recorder.columns(), problem, experts.act), lead(env, problem, experts.act, seeds, range(env.batch))
     made = assembled(job, variations, columns, led, experts.arrays["actor"].cpu().numpy(), progress)
     if part is not None:

@@ -19,11 +19,11 @@ def batch_loss(model: PretrainedTransformer, batch: TrainingBatch) -> Float[Tens
 
     context = Transitions(*map(put, (batch.observations, batch.actions, batch.next_observations, batch.rewards)))
     cache = model.encode(context)
-    total = model.reads.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
+    total = model.action_head.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
     if batch.windows is not None:
         states, taken, gained, labels = batch.windows
-        followed = model.follow(Windows(put(states), put(taken), put(gained)), cache, put(batch.window_prefix))
+        followed = model.decide_windows(Windows(put(states), put(taken), put(gained)), cache, put(batch.window_prefix))
         count = states.shape[1] * states.shape[2]
         share = count / (count + batch.prefix.shape[1])
-        total = (1 - share) * total + share * model.reads.loss(followed, put(labels))
+        total = (1 - share) * total + share * model.action_head.loss(followed, put(labels))
     return total

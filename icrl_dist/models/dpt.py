@@ -1,7 +1,7 @@
-"""T_theta of DPT, ICAG and ICAA: transitions in, a distribution over actions out.
+"""T_theta of DPT, ICAG and ICAA: a context of transitions in, a distribution over actions out.
 
-Every transition (s, a, s', r) of the context is one token (appendix B.2); a query state is
-one token.  Observations are scaled to [-1, 1] by the spec, so nothing here knows a game.
+Every transition (s, a, s', r) of the context is one token (appendix B.2); a query state is one
+token.  Observations are scaled to [-1, 1] by the spec, so the model depends on no environment.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from torch.nn import functional as F
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.models import heads
-from icrl_dist.models.gpt import GPT, Cache, Decoder, copied
+from icrl_dist.models.decoder import Decoder, weight_and_bias
+from icrl_dist.models.gpt import GPT, KVCache
 from icrl_dist.types import Spec
 
 
@@ -29,11 +30,11 @@ class Transitions(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """R windows of each of B contexts: L states in a row, the action taken at each, and its reward (zeta of eq. 6)."""
+    """R action windows of each of B contexts (zeta of eq. 6): L consecutive states, and the action and reward at each."""
 
     states: Float[Tensor, "B R L S"]
-    taken: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
-    gained: Float[Tensor, "B R L"]
+    actions: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
+    rewards: Float[Tensor, "B R L"]
 
 
 class PretrainedTransformer(nn.Module):
@@ -45,7 +46,7 @@ class PretrainedTransformer(nn.Module):
 
     def __init__(self, spec: Spec, config: ModelConfig) -> None:
         super().__init__()
-        self.spec, self.config, self.reads = spec, config, heads.head(spec)
+        self.spec, self.config, self.action_head = spec, config, heads.action_head(spec)
         low, high = torch.tensor(spec.low), torch.tensor(spec.high)
         for name, buffer in (("low", low), ("scale", 2 / (high - low)), ("shift", -(high + low) / (high - low))):
             self.register_buffer(name, buffer, persistent=False)
@@ -55,17 +56,17 @@ class PretrainedTransformer(nn.Module):
         if config.window > 1:
             self.embed_taken = nn.Linear(features + spec.actions + 1, config.width)
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
-        self.head = nn.Linear(config.width, self.reads.outputs)
+        self.head = nn.Linear(config.width, self.action_head.outputs)
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
-                # Variance 1 / fan-in, for 0.02 is GPT-2's at widths near 1000; what is added to
-                # the residual stream, less by depth.
-                added = 2 * config.layers if name.endswith((".out", ".feed.2")) else 1
-                nn.init.normal_(module.weight, std=(module.in_features * added) ** -0.5)
+                # Variance 1 / fan-in: GPT-2's 0.02 suits widths near 1000.  Layers that add to the
+                # residual stream are smaller by the square root of their number, as in GPT-2.
+                residual = 2 * config.layers if name.endswith((".out", ".feed.2")) else 1
+                nn.init.normal_(module.weight, std=(module.in_features * residual) ** -0.5)
                 nn.init.zeros_(module.bias)
 
     def features(self, observations: Float[Tensor, "*B S"]) -> Float[Tensor, "*B F"]:
-        """Observations scaled to [-1, 1], with ``fourier`` sine and cosine pairs of each."""
+        """Observations scaled to [-1, 1], with ``fourier`` sine and cosine pairs of each component."""
         x = torch.addcmul(self.shift, observations, self.scale)
         if not self.config.fourier:
             return x
@@ -73,11 +74,11 @@ class PretrainedTransformer(nn.Module):
         return torch.cat([x, *waves], dim=-1)
 
     def tokens(self, context: Transitions) -> Float[Tensor, "B T D"]:
-        """The embedded tokens of a context, one a transition."""
+        """The embedded tokens of a context, one per transition."""
         token = torch.cat(
             [
                 self.features(context.observations),
-                self.reads.features(context.actions),
+                self.action_head.features(context.actions),
                 self.features(context.next_observations),
                 context.rewards.unsqueeze(-1),
             ],
@@ -86,35 +87,39 @@ class PretrainedTransformer(nn.Module):
         embedded: Tensor = self.embed_transition(token)
         return embedded
 
-    def window_tokens(self, of: Windows) -> Float[Tensor, "B R L D"]:
-        """The embedded tokens of windows: a state, and what was done in the state before it and gained by it."""
-        states = self.features(of.states)
-        before = torch.cat([states, self.reads.features(of.taken), of.gained.unsqueeze(-1)], dim=-1)[..., :-1, :]
-        tokens: Tensor = self.embed_query(states) + F.pad(self.embed_taken(before), (0, 0, 1, 0))
+    def window_tokens(self, windows: Windows) -> Float[Tensor, "B R L D"]:
+        """The embedded tokens of windows: each state, plus the previous state of the window with its action and reward."""
+        states = self.features(windows.states)
+        actions = self.action_head.features(windows.actions)
+        # Without the last step: its action is the one to predict.
+        previous = torch.cat([states, actions, windows.rewards.unsqueeze(-1)], dim=-1)[..., :-1, :]
+        # Shift by one position: the first state of a window has no previous one, and gets zeros.
+        tokens: Tensor = self.embed_query(states) + F.pad(self.embed_taken(previous), (0, 0, 1, 0))
         return tokens
 
-    def encode(self, context: Transitions) -> Cache:
+    def encode(self, context: Transitions) -> KVCache:
         """Keys and values of a context."""
         return self.trunk.encode(self.tokens(context))
 
     def decide(
-        self, queries: Float[Tensor, "B Q S"], cache: Cache, prefix: Int[Tensor, "B Q"] | None = None
+        self, queries: Float[Tensor, "B Q S"], cache: KVCache, prefix: Int[Tensor, "B Q"] | None = None
     ) -> Float[Tensor, "B Q O"]:
         """Outputs of T_theta (``models.heads``) at query states, each given its own prefix of the context.
 
-        ``prefix`` is the number of transitions that a query sees; None shows it all of them.
+        ``prefix`` is the number of transitions that each query sees; None: all of them.
         """
-        seen = None if prefix is None else _seen(prefix, cache)
-        logits: Tensor = self.head(self.trunk.query(self.embed_query(self.features(queries)), cache, seen))
-        return logits
+        visible = None if prefix is None else _prefix_mask(prefix, cache)
+        outputs: Tensor = self.head(self.trunk.query(self.embed_query(self.features(queries)), cache, visible))
+        return outputs
 
-    def follow(self, of: Windows, cache: Cache, prefix: Int[Tensor, "B R"]) -> Float[Tensor, "B R L O"]:
-        """Outputs at every state of windows, given a prefix of the context and what was done before in the window."""
-        length = of.states.shape[2]
-        seen = _seen(prefix.repeat_interleave(length, dim=1), cache)
-        states = self.trunk.query(self.window_tokens(of).flatten(1, 2), cache, seen, length)
-        logits: Tensor = self.head(states).unflatten(1, (-1, length))
-        return logits
+    def decide_windows(self, windows: Windows, cache: KVCache, prefix: Int[Tensor, "B R"]) -> Float[Tensor, "B R L O"]:
+        """Outputs at every state of the windows, given a prefix of the context and the earlier steps of the window."""
+        length = windows.states.shape[2]
+        visible = _prefix_mask(prefix.repeat_interleave(length, dim=1), cache)
+        # The trunk takes one axis of tokens, (B, R * L); its argument ``length`` keeps the windows apart.
+        states = self.trunk.query(self.window_tokens(windows).flatten(1, 2), cache, visible, length)
+        outputs: Tensor = self.head(states).unflatten(1, (-1, length))
+        return outputs
 
     def forward(
         self, context: Transitions, queries: Float[Tensor, "B Q S"], prefix: Int[Tensor, "B Q"]
@@ -122,22 +127,22 @@ class PretrainedTransformer(nn.Module):
         return self.decide(queries, self.encode(context), prefix)
 
 
-def _seen(prefix: Int[Tensor, "B Q"], cache: Cache) -> Bool[Tensor, "B Q T"]:
-    """Which context tokens each query sees: those of its prefix."""
+def _prefix_mask(prefix: Int[Tensor, "B Q"], cache: KVCache) -> Bool[Tensor, "B Q T"]:
+    """True at the context tokens that each query sees: the first ``prefix`` ones."""
     return torch.arange(cache[0][0].shape[2], device=prefix.device) < prefix.unsqueeze(-1)
 
 
-class Deployed:
-    """T_theta beside a growing context in each of B environments: one token a decision.
+class DeployedTransformer:
+    """T_theta with one growing context per environment (B of them): a decision costs one token.
 
-    Make it anew when the model has learned something: weights are copied.
+    Weights are copied: after more training of the model, make a new one.
     """
 
     def __init__(self, model: PretrainedTransformer, batch: int) -> None:
         self._model, self._decoder = model, Decoder(model.trunk, batch)
-        self._embed, self._head = copied(model.embed_query), copied(model.head)
+        self._embed, self._head = weight_and_bias(model.embed_query), weight_and_bias(model.head)
         self.state: Float[Tensor, "B D"] | None = None
-        """Final states of the trunk at the last decision."""
+        """Final states of the trunk at the last decision; None before the first."""
 
     @property
     def length(self) -> int:
@@ -145,7 +150,7 @@ class Deployed:
         return self._decoder.length
 
     def clear(self) -> None:
-        """Forget every context."""
+        """Empty every context."""
         self._decoder.clear()
 
     @torch.inference_mode()
@@ -154,23 +159,26 @@ class Deployed:
         self._decoder.append(self._model.tokens(transitions))
 
     @torch.inference_mode()
-    def follow(self, of: Windows, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
-        """Outputs at the last state of one window a context, given the whole context; one transition may arrive before."""
-        joined = None if arrived is None else self._model.tokens(arrived)[:, 0]
-        self.state = self._decoder.window(self._model.window_tokens(of)[:, 0], joined)
-        return F.linear(self.state, *self._head)
-
-    @torch.inference_mode()
     def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B O"]:
-        """Logits of T_theta at a query state of each context, given the whole of it."""
+        """Outputs of T_theta at one query state per context, given the whole context."""
         self.state = self._decoder.query(F.linear(self._model.features(states), *self._embed))
         return F.linear(self.state, *self._head)
 
     @torch.inference_mode()
-    def peek(self, row: int, states: Float[Tensor, "Q S"], arrived: Transitions) -> Float[Tensor, "Q O"]:
-        """Outputs at any query states given the whole context ``row`` and E transitions (of one context) more.
+    def decide_window(self, windows: Windows, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
+        """Outputs at the last state of one window per context, given the whole context.
 
-        The same as ``decide`` for each state, and later decisions are as if nobody had asked.
+        One transition per context may join the context first (``arrived``).
+        """
+        token = None if arrived is None else self._model.tokens(arrived)[:, 0]
+        self.state = self._decoder.window(self._model.window_tokens(windows)[:, 0], token)
+        return F.linear(self.state, *self._head)
+
+    @torch.inference_mode()
+    def decide_row(self, row: int, states: Float[Tensor, "Q S"], appended: Transitions) -> Float[Tensor, "Q O"]:
+        """Outputs at Q query states, given the whole context ``row`` and E more transitions (of this context).
+
+        Equal to ``decide`` for each state.  Nothing changes: later decisions are as without this call.
         """
         queries = F.linear(self._model.features(states), *self._embed)
-        return F.linear(self._decoder.peek(row, queries, self._model.tokens(arrived)[0]), *self._head)
+        return F.linear(self._decoder.query_row(row, queries, self._model.tokens(appended)[0]), *self._head)

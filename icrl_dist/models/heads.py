@@ -1,7 +1,6 @@
-"""What T_theta's outputs say of an action: a law over the discrete ones, or a Gaussian over vectors in [-1, 1].
+"""Action heads: T_theta's outputs as a distribution over discrete actions, or a Gaussian over vectors in [-1, 1].
 
-One pair of functions for each, chosen by the spec, so that nothing else of the model and its
-deployment knows which kind of actions a game has.
+The spec chooses the head.  No other part of the model or its deployment depends on the kind of actions.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ FLOOR = 0.05
 """Smallest standard deviation of a Gaussian: without a floor, eq. (1) has no minimum where labels are certain."""
 
 
-class Head(Protocol):
-    """How outputs are read."""
+class ActionHead(Protocol):
+    """Turns the model's outputs into a loss, likelihoods and actions."""
 
     outputs: int
-    """Numbers that the model must give."""
-    numbers: int
-    """Uniform numbers that an action takes."""
+    """Outputs of the model per query."""
+    uniforms: int
+    """Uniform random numbers per action (U)."""
 
     def features(self, actions: Tensor) -> Float[Tensor, "*B A"]:
-        """Actions as the model reads them."""
+        """Actions as inputs of the model: one-hot, or as they are."""
         ...
 
     def loss(self, outputs: Float[Tensor, "*B O"], labels: Float[Tensor, "*B A"]) -> Float[Tensor, ""]:
-        """-log T_theta(a* | ...) of eq. (1), in nats, averaged."""
+        """The mean of -log T_theta(a* | ...) of eq. (1), in nats."""
         ...
 
     def log_likelihood(self, outputs: Float[Tensor, "*B O"], actions: Tensor) -> Float[Tensor, "*B"]:
@@ -43,14 +42,14 @@ class Head(Protocol):
         ...
 
     def act(self, outputs: Float[Tensor, "B O"], u: Float[np.ndarray, "B U"]) -> np.ndarray:
-        """The action of each row that its uniform numbers in [0, 1) pick."""
+        """The action of each row, sampled by its uniform numbers in [0, 1)."""
         ...
 
 
 class Categorical:
-    """A law over ``actions`` discrete actions; a label is a law over them."""
+    """A distribution over ``actions`` discrete actions; a label is a distribution over them too."""
 
-    numbers = 1
+    uniforms = 1
 
     def __init__(self, actions: int) -> None:
         self.outputs = actions
@@ -69,10 +68,10 @@ class Categorical:
 
 
 class Gaussian:
-    """An independent Gaussian a component, clipped to [-1, 1]; a label is an action."""
+    """An independent Gaussian per action component, clipped to [-1, 1]; a label is an action."""
 
     def __init__(self, actions: int) -> None:
-        self.outputs, self.numbers = 2 * actions, actions
+        self.outputs, self.uniforms = 2 * actions, actions
 
     def features(self, actions: Tensor) -> Float[Tensor, "*B A"]:
         return actions
@@ -81,21 +80,21 @@ class Gaussian:
         return -self.log_likelihood(outputs, labels).mean()
 
     def log_likelihood(self, outputs: Float[Tensor, "*B O"], actions: Tensor) -> Float[Tensor, "*B"]:
-        mean, deviation = self._spread(outputs)
-        away = (actions - mean) / deviation
-        return (-0.5 * away**2 - deviation.log() - 0.5 * math.log(2 * math.pi)).sum(-1)
+        mean, deviation = self._mean_and_deviation(outputs)
+        error = (actions - mean) / deviation
+        return (-0.5 * error**2 - deviation.log() - 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def act(self, outputs: Float[Tensor, "B O"], u: Float[np.ndarray, "B U"]) -> Float[np.ndarray, "B A"]:
-        mean, deviation = (part.cpu().numpy() for part in self._spread(outputs))
+        mean, deviation = (part.cpu().numpy() for part in self._mean_and_deviation(outputs))
         normal = ndtri(np.clip(u, 1e-6, 1 - 1e-6))
         return np.clip(mean + deviation * normal, -1.0, 1.0).astype(np.float32)
 
-    def _spread(self, outputs: Float[Tensor, "*B O"]) -> tuple[Float[Tensor, "*B A"], Float[Tensor, "*B A"]]:
-        """Mean and standard deviation, the latter at least ``FLOOR``."""
+    def _mean_and_deviation(self, outputs: Float[Tensor, "*B O"]) -> tuple[Float[Tensor, "*B A"], Float[Tensor, "*B A"]]:
+        """Mean and standard deviation; the deviation is at least ``FLOOR``."""
         mean, raw = outputs.chunk(2, dim=-1)
         return mean, FLOOR + F.softplus(raw)
 
 
-def head(spec: Spec) -> Head:
-    """The head of this spec's actions."""
+def action_head(spec: Spec) -> ActionHead:
+    """The head for this spec's actions."""
     return Categorical(spec.actions) if spec.discrete else Gaussian(spec.actions)

@@ -1,8 +1,8 @@
-"""What T_theta expects to happen: a linear readout of its own states, fitted once they no longer change.
+"""The OOD score: a linear readout of T_theta's states predicts outcomes, and its loss is compared with training's.
 
-From its final state at a decision and the action then taken, it predicts how the observation
-changes and what reward comes.  How badly it does so, held against training tasks that the readout
-was not fitted to, says how unlike pretraining a context is.
+From the final state at a decision and the action taken, the readout predicts the change of the
+observation and the reward.  Its loss, relative to its loss in held-out training tasks, measures how
+far a context is from those of pretraining.  It is fitted after training, to fixed weights.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrl_dist.types import Spec
 
 WINDOWS = (1, 2, 5, 10, 20, 50, 100)
-"""Transitions that a loss is averaged over: the most that there are, up to the last."""
+"""Lengths of the moving average of the loss, in transitions: the longest one that fits the history is used."""
 RARE = 0.99
-"""The quantile of the held-out training tasks' losses at which surprise is 1."""
+"""The quantile of the losses in held-out training tasks at which the OOD score is 1."""
 
-_RIDGE = 1e-3  # over the mean square of the features
-_FLOOR = 1e-3  # smallest standard deviation, where the room is [-1, 1]: what never changes in training may not divide by 0
+_RIDGE = 1e-3  # relative to the mean square of the features
+_FLOOR = 1e-3  # smallest standard deviation, of observations in [-1, 1]: avoids division by 0 for a constant component
 
 Decisions = tuple[
     Float32[np.ndarray, "B D"],
@@ -32,83 +32,87 @@ Decisions = tuple[
     Float32[np.ndarray, " B"],
     Float32[np.ndarray, "B S"],
 ]
-"""Of B environments: T_theta's final state, the observation, the action, the reward and the next observation."""
+"""One step of B environments: T_theta's final state, the observation, the action, the reward and the next observation."""
 
 
 @dataclass(frozen=True, eq=False)
 class OutcomeModel:
-    """Predicts a transition from T_theta's state before it, and knows what losses are usual."""
+    """A linear prediction of transitions from T_theta's states, and the distribution of its loss in training tasks."""
 
     readout: Float32[np.ndarray, "F O"]
-    """Features (state and 1, times action and 1) to outcome: the change of each observation
-    component, of which the spec's range is 2, and the reward."""
+    """Features, the outer product of (state, 1) and (action, 1), to outcome: the change of each observation
+    component, scaled so that the spec's range is 2, and the reward."""
     deviation: Float32[np.ndarray, " O"]
-    """Standard deviation of what the readout leaves of each."""
+    """Standard deviation of the readout's error in each outcome."""
     typical: Float32[np.ndarray, " W"]
-    """Median loss over each of ``WINDOWS`` in held-out training tasks."""
+    """Median of the mean loss over each of ``WINDOWS`` transitions in held-out training tasks."""
     rare: Float32[np.ndarray, " W"]
-    """The loss there that one window in a hundred has (``RARE``)."""
+    """The ``RARE`` quantile of the same."""
 
     @classmethod
     def fit(cls, spec: Spec, decisions: Iterable[Decisions], heldout: Iterable[Decisions]) -> Self:
-        """By ridge regression to ``decisions``, calibrated on ``heldout``: step by step, B environments each."""
+        """Fit by ridge regression to ``decisions`` and calibrate on ``heldout``; both yield one step of B environments."""
         count, gram, cross, squares = 0, np.zeros(()), np.zeros(()), np.zeros(())
-        for one in decisions:
-            x, y = _features(spec, one).astype(np.float64), _outcome(spec, one).astype(np.float64)
+        for step in decisions:
+            x, y = _features(spec, step).astype(np.float64), _outcome(spec, step).astype(np.float64)
             count, gram, cross, squares = count + len(x), gram + x.T @ x, cross + x.T @ y, squares + (y * y).sum(axis=0)
         penalty = _RIDGE * np.trace(gram) / len(gram)
         readout = np.linalg.solve(gram + penalty * np.eye(len(gram)), cross)
-        left = squares - 2 * (readout * cross).sum(axis=0) + (readout * (gram @ readout)).sum(axis=0)
-        deviation = np.sqrt(np.maximum(left / count, _FLOOR**2))
+        residual = squares - 2 * (readout * cross).sum(axis=0) + (readout * (gram @ readout)).sum(axis=0)
+        deviation = np.sqrt(np.maximum(residual / count, _FLOOR**2))
         none = np.zeros(len(WINDOWS), np.float32)
-        made = cls(readout.astype(np.float32), deviation.astype(np.float32), none, none)
-        typical, rare = _usual(np.stack([made.loss(spec, one) for one in heldout], axis=1))
-        return cls(made.readout, made.deviation, typical, rare)
+        fitted = cls(readout.astype(np.float32), deviation.astype(np.float32), none, none)
+        typical, rare = _quantiles(np.stack([fitted.loss(spec, step) for step in heldout], axis=1))
+        return cls(fitted.readout, fitted.deviation, typical, rare)
 
-    def loss(self, spec: Spec, of: Decisions) -> Float32[np.ndarray, " B"]:
-        """Half the squared error in standard deviations, averaged over the outcome: -log N, up to what is constant."""
-        error = (_outcome(spec, of) - _features(spec, of) @ self.readout) / self.deviation
+    def loss(self, spec: Spec, decisions: Decisions) -> Float32[np.ndarray, " B"]:
+        """Half the squared error in standard deviations, averaged over outcomes: a Gaussian -log N without constants."""
+        error = (_outcome(spec, decisions) - _features(spec, decisions) @ self.readout) / self.deviation
         loss: np.ndarray = 0.5 * (error * error).mean(axis=1)
         return loss
 
     def surprise(self, losses: Float[np.ndarray, "B T"]) -> Float[np.ndarray, " B"]:
-        """How unusual the latest losses are: 0 is typical of training, 1 is what one window in a hundred reaches there."""
-        seen = [number for number, length in enumerate(WINDOWS) if length <= losses.shape[1]]
-        if not seen:
+        """The OOD score of the latest losses: 0 at the median of training tasks, 1 at their ``RARE`` quantile.
+
+        It is 0 before the first transition.
+        """
+        fitting = [number for number, length in enumerate(WINDOWS) if length <= losses.shape[1]]
+        if not fitting:
             return np.zeros(len(losses))
-        window = seen[-1]
+        window = fitting[-1]
         mean = losses[:, -WINDOWS[window] :].mean(axis=1)
-        surprise: np.ndarray = (mean - self.typical[window]) / (self.rare[window] - self.typical[window])
-        return surprise
+        score: np.ndarray = (mean - self.typical[window]) / (self.rare[window] - self.typical[window])
+        return score
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """As a checkpoint keeps it."""
+        """The arrays by name, as stored in a checkpoint."""
         return {name: getattr(self, name) for name in ("readout", "deviation", "typical", "rare")}
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
-        """The inverse of ``arrays``; None if there are none.  Raises TypeError for others."""
+        """The inverse of ``arrays``; None without arrays.  Raises TypeError for unknown or missing names."""
         return cls(**arrays) if arrays else None
 
 
-def _features(spec: Spec, of: Decisions) -> Float32[np.ndarray, "B F"]:
-    state, action = of[0], of[2]
-    taken = np.eye(spec.actions, dtype=np.float32)[action] if spec.discrete else np.asarray(action, np.float32)
+def _features(spec: Spec, decisions: Decisions) -> Float32[np.ndarray, "B F"]:
+    state, action = decisions[0], decisions[2]
+    vector = np.eye(spec.actions, dtype=np.float32)[action] if spec.discrete else np.asarray(action, np.float32)
     one = np.ones((len(state), 1), np.float32)
-    both = np.concatenate([state, one], axis=1)[:, :, None] * np.concatenate([taken, one], axis=1)[:, None]
+    # Outer product of (state, 1) and (action, 1) per row, flattened: the readout depends on the action linearly.
+    both = np.concatenate([state, one], axis=1)[:, :, None] * np.concatenate([vector, one], axis=1)[:, None]
     return both.reshape(len(state), -1)
 
 
-def _outcome(spec: Spec, of: Decisions) -> Float32[np.ndarray, "B O"]:
-    _, before, _, reward, after = of
+def _outcome(spec: Spec, decisions: Decisions) -> Float32[np.ndarray, "B O"]:
+    _, before, _, reward, after = decisions
     half = (np.array(spec.high, np.float32) - np.array(spec.low, np.float32)) / 2
     return np.concatenate([(after - before) / half, reward[:, None]], axis=1)
 
 
-def _usual(losses: Float32[np.ndarray, "B T"]) -> tuple[Float32[np.ndarray, " W"], Float32[np.ndarray, " W"]]:
-    """Median and ``RARE`` quantile of the mean loss over windows of each length that fits, anywhere in a row.
+def _quantiles(losses: Float32[np.ndarray, "B T"]) -> tuple[Float32[np.ndarray, " W"], Float32[np.ndarray, " W"]]:
+    """Median and ``RARE`` quantile of the mean loss over every window of each length in ``WINDOWS``.
 
-    The longest that fits stands for those that do not.
+    Lengths that exceed the history get the values of the longest one that fits.
     """
     found = []
     for length in WINDOWS:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Int64
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
 from icrl_dist.interfaces import Actions, Watch
-from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, Windows
+from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Transitions, Windows
 
 
 def default_deployment(model: ModelConfig) -> Deployment:
@@ -30,7 +30,7 @@ class InContextPolicy:
         self.model, self.batch, self._config, self._watch = model, batch, context, watch
         self._episodes: list[Transitions] = []
         self._pending: list[tuple[np.ndarray, ...]] = []
-        self._deployed = Deployed(model, batch)
+        self._deployed = DeployedTransformer(model, batch)
 
     @property
     def length(self) -> int:
@@ -39,7 +39,7 @@ class InContextPolicy:
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
         """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
-        return self.model.reads.act(self._decide(observation), u)
+        return self.model.action_head.act(self._decide(observation), u)
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
         """The distribution over discrete actions."""
@@ -53,7 +53,7 @@ class InContextPolicy:
         """
         (queries,) = self._tensors(states)
         arrived = Transitions(*self._tensors(*(column[None] for column in self._stacked(self._arrived(), row))))
-        outputs = self._deployed.peek(row, queries, arrived)
+        outputs = self._deployed.decide_row(row, queries, arrived)
         return outputs.softmax(-1).cpu().numpy()
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
@@ -156,7 +156,7 @@ class CommittedPolicy(InContextPolicy):
         nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
         columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
         states, taken, _, gained = (np.stack(column, axis=1)[:, None] for column in columns)
-        return self._deployed.follow(Windows(*self._tensors(states, taken, gained)), arrived)
+        return self._deployed.decide_window(Windows(*self._tensors(states, taken, gained)), arrived)
 
     def _running(self) -> list[tuple[np.ndarray, ...]]:
         return self._pending

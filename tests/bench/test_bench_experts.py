@@ -1,4 +1,4 @@
-"""The benchmark of experts: both sides really update, and what it makes of what it measured."""
+"""The benchmark of experts: the updates of both sides, and ratios and verdicts from measured rates."""
 
 import json
 
@@ -7,18 +7,18 @@ import pytest
 import torch
 
 from icrl_dist.bench import experts, experts_gpu
-from icrl_dist.bench.experts import Sizes
+from icrl_dist.bench.experts import ExpertSizes
 from icrl_dist.cli import main
 from icrl_dist.config import run
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.problems import splits
 from icrl_dist.types import Spec, Step
 
-TINY = Sizes(2, SACConfig(hidden=(8, 8), batch=4, replay=50), 3, 2)
+TINY = ExpertSizes(2, SACConfig(hidden=(8, 8), batch=4, replay=50), 3, 2)
 
 
-def test_both_sides_are_measured_and_leave_threads_as_they_were(monkeypatch):
-    monkeypatch.setattr(experts, "multiplies_bfloat16", lambda: True)
+def test_both_sides_are_measured_and_threads_are_restored(monkeypatch):
+    monkeypatch.setattr(experts, "has_bfloat16", lambda: True)
     threads = torch.get_num_threads()
     result = experts.run(True, TINY, TINY)
     assert torch.get_num_threads() == threads
@@ -31,31 +31,31 @@ def test_both_sides_are_measured_and_leave_threads_as_they_were(monkeypatch):
     assert f"{result['ratio_small']:.2f}" in experts.describe(result)
 
 
-def test_each_side_makes_the_updates_it_is_timed_for_from_the_same_memory(monkeypatch):
+def test_each_side_makes_the_timed_updates_from_the_same_replay(monkeypatch):
     made = []
     engine, model = experts.SACBatch, experts.blank
-    monkeypatch.setattr(experts, "SACBatch", lambda *given: made.append(engine(*given)) or made[-1])
-    monkeypatch.setattr(experts, "blank", lambda *given: made.append(model(*given)) or made[-1])
+    monkeypatch.setattr(experts, "SACBatch", lambda *arguments: made.append(engine(*arguments)) or made[-1])
+    monkeypatch.setattr(experts, "blank", lambda *arguments: made.append(model(*arguments)) or made[-1])
     experts.lockstep(TINY, "float32")(3)
     experts.alone(TINY.config)(2)
     ours, theirs = made
     assert (ours.updates, ours.experts, theirs._n_updates) == (3, 2, 2)
     rows = ours.replay.state()["rows"]
-    memory = theirs.replay_buffer
-    columns = [memory.observations[:, 0], memory.actions[:, 0], memory.rewards, memory.next_observations[:, 0]]
+    buffer = theirs.replay_buffer
+    columns = [buffer.observations[:, 0], buffer.actions[:, 0], buffer.rewards, buffer.next_observations[:, 0]]
     np.testing.assert_array_equal(rows[0], np.concatenate(columns, axis=1))
-    assert not np.array_equal(rows[0], rows[1]) and memory.size() == 50 == len(ours.replay)
+    assert not np.array_equal(rows[0], rows[1]) and buffer.size() == 50 == len(ours.replay)
 
 
 def rates(fp32, bf16, small):
-    """In place of what is measured: our rate over theirs, of which the first turn is left out."""
-    told = {("float32", 10): fp32, ("bfloat16", 10): bf16, ("float32", 20): small}
-    return lambda sizes, products, turns: (told[products, sizes.experts], 1.0)
+    """Fake measured rates: ours relative to theirs."""
+    ratios = {("float32", 10): fp32, ("bfloat16", 10): bf16, ("float32", 20): small}
+    return lambda sizes, matmul_dtype, turns: (ratios[matmul_dtype, sizes.experts], 1.0)
 
 
 @pytest.mark.parametrize("native", [True, False])
-def test_a_ratio_below_its_least_fails_it_and_emulated_bfloat16_does_not_count(native, monkeypatch, capsys):
-    monkeypatch.setattr(experts, "multiplies_bfloat16", lambda: native)
+def test_a_ratio_below_its_bound_fails_and_emulated_bfloat16_does_not_count(native, monkeypatch, capsys):
+    monkeypatch.setattr(experts, "has_bfloat16", lambda: native)
     monkeypatch.setattr(experts, "compare", rates(1.36, 2.0, 4.6))
     assert main.main(["bench", "experts", "--json"]) == (1 if native else 0)
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -72,19 +72,19 @@ def test_a_rate_is_the_median_of_the_turns_after_the_first(monkeypatch):
     assert experts.compare(TINY, "float32", 3) == (2 * 3 / 2.0, 2 / 2.0)
 
 
-def test_what_the_processor_says_of_itself_is_read(tmp_path):
+def test_bfloat16_instructions_are_read_from_cpuinfo(tmp_path):
     for flags, native in (("fpu avx2 fma", False), ("avx512f avx512_bf16", True), ("amx_bf16 amx_tile", True)):
         (tmp_path / "cpuinfo").write_text(f"model name\t: AMD EPYC\nflags\t\t: {flags}\n")
-        assert experts.multiplies_bfloat16(tmp_path / "cpuinfo") is native
+        assert experts.has_bfloat16(tmp_path / "cpuinfo") is native
 
 
-def test_it_cannot_be_given_a_time(capsys):
+def test_seconds_are_refused(capsys):
     assert main.main(["bench", "experts", "--seconds", "3"]) == 2
     assert "it takes as long as it takes" in capsys.readouterr().err
 
 
 class Still:
-    """Two environments of which nothing is asked."""
+    """Two environments that do not change."""
 
     spec, batch = Spec((-1.0,) * 3, (1.0,) * 3, 2, 10, discrete=False), 2
 
@@ -99,7 +99,7 @@ STILL = SACConfig(hidden=(8,), batch=4, random_steps=5, warmup=20, update_every=
 
 
 def test_on_a_gpu_all_kinds_and_an_expert_set_are_measured(monkeypatch):
-    """On the CPU in its place: everything but the graph."""
+    """Runs on the CPU: everything except the graph."""
     monkeypatch.setattr(experts_gpu, "paper_env", lambda: (Still(), STILL))
     monkeypatch.setattr(experts_gpu, "LEAST", 1e-3)
     threads = torch.get_num_threads()
@@ -107,8 +107,8 @@ def test_on_a_gpu_all_kinds_and_an_expert_set_are_measured(monkeypatch):
     assert torch.get_num_threads() == threads
     assert result["ok"] and json.loads(json.dumps(result)) == result
     for kind in ("fp32", "bf16"):
-        rate, plain = result[f"updates_per_s_{kind}"], result[f"updates_per_s_{kind}_no_graph"]
-        assert rate > 0 and plain > 0 and result[f"graph_gain_{kind}"] == pytest.approx(rate / plain, abs=0.02)
+        rate, no_graph = result[f"updates_per_s_{kind}"], result[f"updates_per_s_{kind}_no_graph"]
+        assert rate > 0 and no_graph > 0 and result[f"graph_gain_{kind}"] == pytest.approx(rate / no_graph, abs=0.02)
         assert result[f"gpu_ratio_{kind}"] == pytest.approx(rate / result["sb3_updates_per_s"], abs=0.1)
     paper = result["paper_set"]
     assert (paper["experts"], paper["steps"], paper["updates"]) == (2, 20 + 40 + 10, (40 - 20) // 2 + 20 // 2 + 5)
@@ -116,11 +116,11 @@ def test_on_a_gpu_all_kinds_and_an_expert_set_are_measured(monkeypatch):
     assert "1,000 steps take" in experts_gpu.describe(result)
 
 
-def test_hours_are_the_warm_ups_steps_at_their_pace_and_the_rest_at_that_of_updates(monkeypatch):
+def test_hours_use_the_rate_of_the_warm_up_and_the_rate_with_updates(monkeypatch):
     now = [0.0]
 
     def made(env, config, steps, seeds, progress, device):
-        trained = experts.SACBatch(seeds, env.spec, run, device)
+        trained = experts.SACBatch(seeds, env.spec, config, device)
         for trained.steps in range(10, steps + 1, 10):
             now[0] += 1.0 if trained.steps <= 20 else 9.0 if trained.steps == 30 else 5.0
             progress(trained, np.zeros(2))
@@ -130,18 +130,18 @@ def test_hours_are_the_warm_ups_steps_at_their_pace_and_the_rest_at_that_of_upda
     monkeypatch.setattr(experts_gpu, "_parts", lambda *_: {"environment": 0.3, "update": 0.2})
     monkeypatch.setattr(experts_gpu.time, "perf_counter", lambda: now[0])
     found = experts_gpu.expert_set(Still(), STILL, 1, torch.device("cpu"))
-    assert found["steps"] == 50, "three episodes at least"
+    assert found["steps"] == 50, "at least three episodes"
     assert found["hours"] == pytest.approx((20 * 0.1 + 980 * 0.5) / 3600, abs=1e-3)
     assert (found["steps_per_s"], found["warmup_steps_per_s"], found["bound"]) == (2.0, 10.0, "environment")
 
 
-def test_what_cannot_be_measured_is_said_and_loses_nothing_else(monkeypatch):
+def test_a_part_that_cannot_be_measured_is_reported_and_the_others_are_measured(monkeypatch):
     real = experts_gpu.lockstep
 
-    def lockstep(sizes, products, device, graph):
+    def lockstep(sizes, matmul_dtype, device, graph):
         if graph:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing\nand more")
-        return real(sizes, products, device, graph)
+        return real(sizes, matmul_dtype, device, graph)
 
     def missing():
         raise ModuleNotFoundError("No module named 'dm_control'")
@@ -156,7 +156,7 @@ def test_what_cannot_be_measured_is_said_and_loses_nothing_else(monkeypatch):
     assert "No module named" in experts_gpu.describe(result)
 
 
-def test_a_gpu_that_gives_too_little_fails_it(monkeypatch):
+def test_a_ratio_below_the_bound_on_a_gpu_fails(monkeypatch):
     monkeypatch.setattr(experts_gpu, "paper_env", lambda: (Still(), STILL))
     assert experts_gpu.LEAST == 300
     monkeypatch.setattr(experts_gpu, "LEAST", 1e9)
@@ -165,36 +165,36 @@ def test_a_gpu_that_gives_too_little_fails_it(monkeypatch):
     assert result["reasons"][0] == f"gpu_ratio_fp32 is {result['gpu_ratio_fp32']}, below 1e+09"
 
 
-def test_the_expert_set_is_the_papers():
+def test_the_expert_set_is_that_of_the_paper():
     assert experts_gpu.SIZES.experts == 160 and experts_gpu.SIZES.config.hidden == (256, 256, 256)
-    given = run.load(experts_gpu.PAPER)
-    assert len(splits.split(given).train) * given.adversary.count == 160
-    assert (given.sac.steps, given.sac.update_every, given.sac.warmup, given.sac.hidden) == (200_000, 3, 5_000, (256,) * 3)
+    paper = run.load(experts_gpu.PAPER)
+    assert len(splits.split(paper).train) * paper.adversary.count == 160
+    assert (paper.sac.steps, paper.sac.update_every, paper.sac.warmup, paper.sac.hidden) == (200_000, 3, 5_000, (256,) * 3)
 
 
-def test_where_to_measure_is_asked_for(monkeypatch, capsys):
-    asked = []
+def test_the_device_selects_the_benchmark(monkeypatch, capsys):
+    calls = []
     monkeypatch.setattr(experts, "compare", rates(2.0, 3.0, 5.0))
-    monkeypatch.setattr(experts_gpu, "run", lambda *given: asked.append(given) or {"ok": True})
+    monkeypatch.setattr(experts_gpu, "run", lambda *arguments: calls.append(arguments) or {"ok": True})
     monkeypatch.setattr(experts_gpu, "describe", lambda result: "a table")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert main.main(["bench", "experts", "--device", "auto", "--steps", "7", "--quick"]) == 0
     assert main.main(["bench", "experts", "--device", "cuda"]) == 0
-    assert asked == [(True, 7), (False, None)]
+    assert calls == [(True, 7), (False, None)]
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main.main(["bench", "experts", "--device", "auto"]) == 0 and main.main(["bench", "experts"]) == 0
-    assert len(asked) == 2
+    assert len(calls) == 2
     capsys.readouterr()
-    for given, said in (
+    for arguments, message in (
         (["experts", "--steps", "3"], "bench experts --device cuda"),
         (["experts", "--device", "cuda", "--steps", "0"], "must be above 0"),
         (["env", "--device", "cuda"], "it belongs to `bench experts`"),
     ):
-        assert main.main(["bench", *given]) == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+        assert main.main(["bench", *arguments]) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
-def test_without_a_gpu_it_says_so(monkeypatch, capsys):
+def test_without_a_gpu_cuda_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main.main(["bench", "experts", "--device", "cuda"]) == 2
     assert "torch finds no GPU here" in " ".join(capsys.readouterr().err.split())

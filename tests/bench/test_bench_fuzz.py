@@ -1,4 +1,4 @@
-"""The fuzz benchmark: it passes our readers, finds a broken one, and keeps what broke it."""
+"""The fuzz benchmark: our readers pass, a defective reader is found, and its failing input is written."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from icrl_dist.cli.main import main
 from icrl_dist.config.run import ConfigError
 
 
-def test_our_readers_take_or_refuse_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuzz, "LIMIT_MS", float("inf"))  # checked types make the readers slow here
-    result = fuzz.run(inputs=160, folder=tmp_path / "kept")
-    assert result["ok"] and result["crashes"] == 0 and result["kept"] == [] and not (tmp_path / "kept").exists()
+def test_our_readers_accept_or_refuse_every_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "LIMIT_MS", float("inf"))  # the type checks of tests make the readers slow
+    result = fuzz.run(inputs=160, folder=tmp_path / "failing")
+    assert result["ok"] and result["crashes"] == 0 and result["kept"] == [] and not (tmp_path / "failing").exists()
     assert result["accepted"] + result["rejected"] == 160 and result["accepted"] > 0
     assert json.loads(json.dumps(result)) == result
 
@@ -29,12 +29,12 @@ def test_every_valid_input_is_accepted() -> None:
             assert data, name
 
 
-def hungry(data: bytes) -> None:
+def allocate_64_mb(data: bytes) -> None:
     np.zeros(64 << 20, np.uint8)
 
 
-@pytest.mark.parametrize(("read", "crashes"), [(lambda data: {}[data], 3), (hungry, 0)])
-def test_what_breaks_a_reader_is_kept(
+@pytest.mark.parametrize(("read", "crashes"), [(lambda data: {}[data], 3), (allocate_64_mb, 0)])
+def test_an_input_on_which_a_reader_fails_is_written(
     read: Callable[[bytes], object],
     crashes: int,
     tmp_path: Path,
@@ -46,7 +46,7 @@ def test_what_breaks_a_reader_is_kept(
     assert [Path(f).name for f in result["kept"]] == [f"fuzz-broken-7-{n}.bin" for n in range(3)]
     again = fuzz.mutate(np.random.default_rng([7, 2]), [b"valid"])
     assert Path(result["kept"][2]).read_bytes() == again
-    assert "kept: " in fuzz.describe(result)
+    assert "failing input: " in fuzz.describe(result)
 
 
 def test_a_failure_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,6 +57,6 @@ def test_a_failure_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert main(["bench", "fuzz", "--seconds", "1"]) == 2
 
 
-def test_no_inputs_are_refused() -> None:
+def test_zero_inputs_are_refused() -> None:
     with pytest.raises(ConfigError, match="inputs = 0"):
         fuzz.run(inputs=0)

@@ -1,4 +1,4 @@
-"""The in-context benchmark: its law of data, its exact floor, its peer, and what it makes of what it measured."""
+"""The in-context benchmark: its data distribution, exact floor and peer, and ratios and verdicts from measurements."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from icrl_dist.bench import incontext, peer
 from icrl_dist.bench import incontext_cost as cost
 from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.cli import main
-from icrl_dist.config.run import OptimConfig
+from icrl_dist.config.sections import OptimConfig
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.problems.darkroom.room import MOVES, cells
 
 
-def test_a_draw_is_dpts_law_and_the_same_whenever_it_is_drawn() -> None:
-    law = quality.Law(3)
-    drawn, again, other = (law.draw(0, step, 64, 5) for step in (7, 7, 8))
+def test_a_draw_follows_dpts_distribution_and_equal_arguments_give_equal_draws() -> None:
+    data = quality.DPTData(3)
+    drawn, again, other = (data.draw(0, step, 64, 5) for step in (7, 7, 8))
     for name, column in vars(drawn).items():
         assert (column == getattr(again, name)).all()
         assert column.shape == getattr(other, name).shape and not (column == getattr(other, name)).all()
-    assert len(set(law.hypotheses.goal.tolist())) == quality.GOALS and set(drawn.goal) <= set(law.hypotheses.goal)
+    assert len(set(data.hypotheses.goal.tolist())) == quality.GOALS and set(drawn.goal) <= set(data.hypotheses.goal)
     assert np.bincount(drawn.cell.ravel(), minlength=100).min() > 0 and np.bincount(drawn.action.ravel(), minlength=5).min() > 0
     for b in range(8):
         for t in range(quality.LENGTH):
@@ -40,22 +40,22 @@ def test_a_draw_is_dpts_law_and_the_same_whenever_it_is_drawn() -> None:
             assert reached == max(0, np.abs(here - goal).sum() - 1), "the label does not lead to the goal"
 
 
-def test_the_floor_is_that_of_counting_the_goals_that_are_left() -> None:
-    law = quality.Law(0)
-    drawn = law.draw(1, 0, 6, 1)
+def test_the_floor_equals_a_count_over_the_goals_consistent_with_the_context() -> None:
+    data = quality.DPTData(0)
+    drawn = data.draw(1, 0, 6, 1)
     total = 0.0
     for b in range(6):
-        left = set(range(quality.GOALS))
+        consistent = set(range(quality.GOALS))
         for t in range(quality.LENGTH):
             found = drawn.reward[b, t] > 0
-            left = {m for m in left if (law.hypotheses.goal[m] == drawn.arrived[b, t]) == found}
-            answers = [int(law.labels[m, drawn.query[b, 0]].argmax()) for m in left]
-            total -= math.log(answers.count(int(drawn.label[b, 0].argmax())) / len(left))
-    assert law.floor(drawn) == pytest.approx(total / (6 * quality.LENGTH), rel=1e-9)
+            consistent = {m for m in consistent if (data.hypotheses.goal[m] == drawn.arrived[b, t]) == found}
+            answers = [int(data.labels[m, drawn.query[b, 0]].argmax()) for m in consistent]
+            total -= math.log(answers.count(int(drawn.label[b, 0].argmax())) / len(consistent))
+    assert data.floor(drawn) == pytest.approx(total / (6 * quality.LENGTH), rel=1e-9)
 
 
-def busy(module: torch.nn.Module) -> torch.nn.Module:
-    """The module with every parameter far from zero."""
+def randomized(module: torch.nn.Module) -> torch.nn.Module:
+    """The module with random parameters, none of them zero."""
     torch.manual_seed(0)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -63,9 +63,9 @@ def busy(module: torch.nn.Module) -> torch.nn.Module:
     return module
 
 
-def test_the_peer_reads_the_query_first_and_no_transition_before_its_time() -> None:
-    model = busy(peer.Peer(quality.SPEC))
-    context, query, _ = quality.Law(0).draw(0, 0, 3, 1).tensors()
+def test_the_peer_has_the_query_first_and_is_causal() -> None:
+    model = randomized(peer.Peer(quality.SPEC))
+    context, query, _ = quality.DPTData(0).draw(0, 0, 3, 1).tensors()
     with torch.no_grad():
         before = model(context, query)
         assert before.shape == (3, quality.LENGTH + 1, 5)
@@ -76,12 +76,12 @@ def test_the_peer_reads_the_query_first_and_no_transition_before_its_time() -> N
             assert (moved[: at + 1] < 1e-6).all() and (moved[at + 1 :] > 1e-5).all()
         assert ((model(context, query + 1) - before).abs().amax(dim=(0, 2)) > 1e-5).all()
         swapped = Transitions(*(column.roll(1, dims=1) for column in context))
-        assert (model(swapped, query) - before)[:, -1].abs().amax() > 1e-5, "it knows no places"
+        assert (model(swapped, query) - before)[:, -1].abs().amax() > 1e-5, "positions have no effect"
 
 
-def test_a_step_of_the_peer_is_the_mean_over_all_prefixes_but_the_empty_one() -> None:
-    slow, fast = busy(peer.Peer(quality.SPEC)), busy(peer.Peer(quality.SPEC))
-    context, query, label = quality.Law(0).draw(0, 0, 2, 1).tensors()
+def test_a_step_of_the_peer_uses_the_mean_loss_over_all_non_empty_prefixes() -> None:
+    slow, fast = randomized(peer.Peer(quality.SPEC)), randomized(peer.Peer(quality.SPEC))
+    context, query, label = quality.DPTData(0).draw(0, 0, 2, 1).tensors()
     context = Transitions(*(column[:, :7] for column in context))
     total = torch.zeros(())
     for b in range(2):
@@ -96,15 +96,15 @@ def test_a_step_of_the_peer_is_the_mean_over_all_prefixes_but_the_empty_one() ->
 
 
 @torch.no_grad()
-def test_the_held_out_losses_are_over_the_same_prefixes() -> None:
-    drawn = quality.Law(0).draw(1, 0, 5, 1)
+def test_both_held_out_losses_are_over_the_same_prefixes() -> None:
+    drawn = quality.DPTData(0).draw(1, 0, 5, 1)
     context, query, label = drawn.tensors()
-    ours, theirs = busy(PretrainedTransformer(quality.SPEC, quality.MODEL)), busy(peer.Peer(quality.SPEC))
+    ours, theirs = randomized(PretrainedTransformer(quality.SPEC, quality.MODEL)), randomized(peer.Peer(quality.SPEC))
     slow = {"ours": 0.0, "theirs": 0.0}
     for b in range(5):
         for length in range(1, quality.LENGTH + 1):
-            seen = Transitions(*(c[b : b + 1, :length] for c in context))
-            logits = ours.decide(query[b : b + 1, None], ours.encode(seen))[0, 0], theirs(seen, query[b : b + 1])[0, -1]
+            prefix = Transitions(*(c[b : b + 1, :length] for c in context))
+            logits = ours.decide(query[b : b + 1, None], ours.encode(prefix))[0, 0], theirs(prefix, query[b : b + 1])[0, -1]
             for name, value in zip(slow, logits, strict=True):
                 slow[name] -= float(value.log_softmax(-1)[label[b].argmax()]) / (5 * quality.LENGTH)
     assert quality._our_loss(ours, drawn) == pytest.approx(slow["ours"], rel=1e-4)
@@ -112,22 +112,22 @@ def test_the_held_out_losses_are_over_the_same_prefixes() -> None:
 
 
 @pytest.mark.parametrize("close", [-1.0, 10.0])
-def test_a_training_ends_when_it_is_close_and_at_its_limit(close: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_ends_at_the_target_loss_or_at_its_limit(close: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "HELD_OUT", 4)
     monkeypatch.setattr(quality, "OPTIM", OptimConfig(batch=2, queries=3, warmup=1))
     monkeypatch.setattr(quality, "EVERY", 2)
     monkeypatch.setattr(quality, "PEER_EVERY", 2)
-    said: list[str] = []
-    done = quality.ours(0, said.append, 3, close), quality.theirs(0, said.append, 3 * peer.BATCH, close)
-    looks = 1 if close > 0 else 2
-    for outcome in done:
-        assert outcome["reached"] == (close > 0)
-        assert len(outcome["curve"]) == looks and outcome["cpu_s"] == outcome["curve"][-1][0] >= 0
-    assert done[0]["floor"] == done[1]["floor"] > 0
-    assert [line.split(",")[0] for line in said] == ["ours"] * looks + ["peer"] * looks
+    messages: list[str] = []
+    outcomes = quality.ours(0, messages.append, 3, close), quality.theirs(0, messages.append, 3 * peer.BATCH, close)
+    evaluations = 1 if close > 0 else 2
+    for result in outcomes:
+        assert result["reached"] == (close > 0)
+        assert len(result["curve"]) == evaluations and result["cpu_s"] == result["curve"][-1][0] >= 0
+    assert outcomes[0]["floor"] == outcomes[1]["floor"] > 0
+    assert [line.split(",")[0] for line in messages] == ["ours"] * evaluations + ["peer"] * evaluations
 
 
-def test_what_it_costs_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_costs_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost, "LENGTHS", (0, 100, 200, 300))
     monkeypatch.setattr(cost, "OPTIM", OptimConfig(batch=2, queries=3))
     monkeypatch.setattr(peer, "BATCH", 2)
@@ -146,8 +146,8 @@ def outcome(reached: bool, seconds: float) -> dict[str, Any]:
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the benchmark is told that it measured; change it to tell it something else."""
-    told: dict[str, Any] = {
+    """Fake measurements, which tests change."""
+    values: dict[str, Any] = {
         "gflops": incontext.REFERENCE_GFLOPS,
         "deployment": {"ours": [30000.0, 40000.0, 50000.0], "peer": [2000.0]},
         "training": {"labels_per_s": 32000.0, "peer_labels_per_s": 800.0},
@@ -157,19 +157,19 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     }
 
     def train(side: str) -> Any:
-        return lambda seed, report: told["trained"].append((side, seed)) or outcome(*told[side][seed])
+        return lambda seed, report: values["trained"].append((side, seed)) or outcome(*values[side][seed])
 
-    monkeypatch.setattr(cost, "matmul_gflops", lambda: told["gflops"])
-    monkeypatch.setattr(cost, "deployment", lambda batch, pairs: told["deployment"])
-    monkeypatch.setattr(cost, "training", lambda rounds: told["training"])
+    monkeypatch.setattr(cost, "matmul_gflops", lambda: values["gflops"])
+    monkeypatch.setattr(cost, "deployment", lambda batch, pairs: values["deployment"])
+    monkeypatch.setattr(cost, "training", lambda rounds: values["training"])
     monkeypatch.setattr(cost, "by_length", lambda: {"length": [0, 4000], "decision_us": [300, 9000], "length_exponent": 0.9})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(quality, "ours", train("ours"))
     monkeypatch.setattr(quality, "theirs", train("peer"))
-    return told
+    return values
 
 
-def test_ratios_are_of_medians(measured: dict[str, Any], tmp_path: Path) -> None:
+def test_ratios_are_computed_from_medians(measured: dict[str, Any], tmp_path: Path) -> None:
     threads = torch.get_num_threads()
     result = incontext.run(tmp_path)
     assert torch.get_num_threads() == threads
@@ -181,7 +181,7 @@ def test_ratios_are_of_medians(measured: dict[str, Any], tmp_path: Path) -> None
     assert "   40,000     2,000    20.0" in incontext.describe(result)
 
 
-def test_a_peer_below_its_floors_fails_it_and_a_slow_machine_lowers_them(measured: dict[str, Any], tmp_path: Path) -> None:
+def test_a_peer_below_its_floors_fails_and_a_slow_machine_lowers_the_floors(measured: dict[str, Any], tmp_path: Path) -> None:
     measured["training"]["peer_labels_per_s"], measured["deployment"]["peer"] = 590.0, [1090.0]
     result = incontext.run(tmp_path, quick=True)
     assert not result["ok"] and len(result["reasons"]) == 2
@@ -193,7 +193,7 @@ def test_a_peer_below_its_floors_fails_it_and_a_slow_machine_lowers_them(measure
     assert incontext.run(tmp_path, quick=True)["floor_scale"] == 1.0
 
 
-def test_a_stopped_peer_gives_a_bound_and_a_model_of_ours_that_never_arrives_gives_nothing(
+def test_a_stopped_peer_gives_a_bound_and_without_our_target_loss_there_is_no_ratio(
     measured: dict[str, Any], tmp_path: Path
 ) -> None:
     measured["peer"][0] = (False, 500.0)
@@ -203,10 +203,10 @@ def test_a_stopped_peer_gives_a_bound_and_a_model_of_ours_that_never_arrives_giv
     measured["ours"][0] = (False, 10.0)
     result = incontext.run(tmp_path / "nothing", quick=True)
     assert (result["time_to_quality_ratio"], result["ok"]) == (None, False)
-    assert "did not come within" in incontext.describe(result)
+    assert "did not reach a loss within" in incontext.describe(result)
 
 
-def test_finished_trainings_are_kept_for_the_same_settings_only(
+def test_finished_trainings_are_reused_for_the_same_settings_only(
     measured: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = incontext.run(tmp_path, quick=True)
@@ -222,12 +222,12 @@ def test_finished_trainings_are_kept_for_the_same_settings_only(
     assert measured["trained"] == [("ours", 0), ("peer", 0)]
 
 
-def test_cells_are_given_as_places() -> None:
-    drawn = quality.Law(0).draw(0, 0, 2, 1)
+def test_cells_become_coordinates() -> None:
+    drawn = quality.DPTData(0).draw(0, 0, 2, 1)
     data = drawn.batch(np.ones((2, 1), np.int64))
     assert (data.observations == cells(10)[drawn.cell]).all() and (data.next_observations == cells(10)[drawn.arrived]).all()
 
 
-def test_it_cannot_be_given_a_time(capsys: pytest.CaptureFixture[str]) -> None:
+def test_seconds_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main.main(["bench", "incontext", "--seconds", "3"]) == 2
     assert "it takes as long as it takes" in capsys.readouterr().err

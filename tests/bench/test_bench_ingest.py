@@ -1,4 +1,4 @@
-"""The ingest benchmark: what it counts went through the real ingest and store, and it refuses to measure nothing."""
+"""The ingest benchmark: it counts trajectories of the real inbox and store, and refuses invalid arguments."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "file_system", lambda folder: "ext4")
 
 
-def test_it_measures_both_ways_and_leaves_nothing_behind(
+def test_it_measures_with_and_without_fsync_and_removes_its_files(
     on_disk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = []
     real = ingest.Store
     monkeypatch.setattr(ingest, "Store", lambda folder, durable: opened.append(durable) or real(folder, durable=durable))
     result = ingest.run(tmp_path / "here", seconds=0.4, pairs=2)
-    assert opened == [True, False, True, True, False]  # to warm up, then by turns
+    assert opened == [True, False, True, True, False]  # the warm-up, then alternating
     assert result["durable_per_s"] > 0 and result["ratio"] > 0 and result["fsync_p50_ms"] > 0
     assert 1 <= result["trajectories_an_fsync"] <= result["credits"]
     assert len(result["pairs"]) == 2 and result["file_system"] == "ext4"
@@ -35,17 +35,17 @@ def test_it_measures_both_ways_and_leaves_nothing_behind(
 
 def test_a_file_system_in_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "file_system", lambda folder: "tmpfs")
-    with pytest.raises(ConfigError, match=r"lies on tmpfs, .* --folder"):
+    with pytest.raises(ConfigError, match=r"is on tmpfs, .* --folder"):
         ingest.run(tmp_path)
 
 
 @pytest.mark.parametrize(("wrong", "message"), [({"seconds": 0.0}, r"seconds = 0\.0"), ({"pairs": 0}, "pairs = 0")])
-def test_what_it_cannot_measure_is_refused(on_disk: None, tmp_path: Path, wrong: dict[str, float], message: str) -> None:
+def test_invalid_arguments_are_refused(on_disk: None, tmp_path: Path, wrong: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         ingest.run(tmp_path, **wrong)
 
 
-def test_a_folder_lies_on_the_mount_nearest_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_system_is_that_of_the_nearest_mount(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mount = namedtuple("mount", ["mountpoint", "fstype"])
     mounts = [
         mount("/", "ext4"),

@@ -13,7 +13,7 @@ from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.collect import jobs
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, ModelConfig, OptimConfig
-from icrl_dist.models.dpt import Deployed, PretrainedTransformer, Transitions, Windows
+from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Transitions, Windows
 from icrl_dist.models.heads import Gaussian
 from icrl_dist.problems import registry, splits
 from icrl_dist.problems.darkroom import room
@@ -65,10 +65,10 @@ def test_the_first_state_of_a_stretch_is_a_query_alone_and_stretches_do_not_see_
     model, whole, of = build(SPEC), transitions(), windows()
     prefix = torch.tensor([[0, 7], [3, T], [1, 2]])
     cache = model.encode(whole)
-    together = model.follow(of, cache, prefix)
+    together = model.decide_windows(of, cache, prefix)
     torch.testing.assert_close(together[:, :, 0], model.decide(of.states[:, :, 0], cache, prefix), atol=1e-5, rtol=1e-5)
     for r in range(R):
-        alone = model.follow(part(of, slice(None), slice(r, r + 1)), cache, prefix[:, r : r + 1])
+        alone = model.decide_windows(part(of, slice(None), slice(r, r + 1)), cache, prefix[:, r : r + 1])
         torch.testing.assert_close(alone, together[:, r : r + 1], atol=1e-5, rtol=1e-5)
     assert together.std(dim=2).min() > 1e-3, "the states all answer alike: this would prove nothing"
 
@@ -81,7 +81,7 @@ def test_what_happened_in_a_stretch_counts_for_what_comes_after_and_nothing_befo
     cache = model.encode(transitions())
     value = getattr(of, column).clone()
     value[:, :, at] = (value[:, :, at] + 1) % 5
-    one, two = (model.follow(s, cache, torch.full((B, R), T)) for s in (of, of._replace(**{column: value})))
+    one, two = (model.decide_windows(s, cache, torch.full((B, R), T)) for s in (of, of._replace(**{column: value})))
     moved = (one - two).abs().amax(dim=(0, 1, 3))
     first = at if column == "states" else at + 1
     assert (moved[:first] < 1e-6).all() and (moved[first:] > 1e-4).all()
@@ -93,13 +93,13 @@ def test_what_happened_in_a_stretch_counts_for_what_comes_after_and_nothing_befo
 def test_a_context_that_grows_one_by_one_decides_as_in_training(heads, together):
     """Whether transitions arrive with a decision or (``together``) several at once."""
     model, whole, of = build(SPEC, heads), transitions(), part(windows(), slice(None), slice(0, 1))
-    deployed, t = Deployed(model, B), 0
+    deployed, t = DeployedTransformer(model, B), 0
     while t < T:
-        expected = model.follow(of, model.encode(part(whole, slice(None), slice(0, t + 1))), torch.full((B, 1), t + 1))
+        expected = model.decide_windows(of, model.encode(part(whole, slice(None), slice(0, t + 1))), torch.full((B, 1), t + 1))
         arrived = part(whole, slice(None), slice(t, t + 1))
-        torch.testing.assert_close(deployed.follow(of, arrived), expected[:, 0, -1], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(deployed.decide_window(of, arrived), expected[:, 0, -1], atol=1e-5, rtol=1e-5)
         assert deployed.length == t + 1
-        torch.testing.assert_close(deployed.follow(of), expected[:, 0, -1], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(deployed.decide_window(of), expected[:, 0, -1], atol=1e-5, rtol=1e-5)
         if t in together:
             deployed.append(part(whole, slice(None), slice(t + 1, t + 4)))
             t += 3
@@ -124,7 +124,7 @@ def outputs_of(model, history, zeta, state):
         torch.tensor([float(z[2]) for z in zeta] + [0.0])[None, None],
     )
     with torch.no_grad():
-        found = model.follow(of, model.encode(seen), torch.tensor([[len(history)]]))
+        found = model.decide_windows(of, model.encode(seen), torch.tensor([[len(history)]]))
     return found[0, 0, -1].double().softmax(-1).numpy()
 
 
@@ -298,7 +298,7 @@ def test_every_label_counts_the_same(run):
     with torch.no_grad():
         law = model.decide(torch.tensor(queries), cache, torch.tensor(prefix)).log_softmax(-1).numpy()
         total -= (law * labels).sum()
-        law = model.follow(of, cache, torch.tensor(window_prefix)).log_softmax(-1).numpy()
+        law = model.decide_windows(of, cache, torch.tensor(window_prefix)).log_softmax(-1).numpy()
         total -= (law * followed_labels).sum()
         assert fit.batch_loss(model, batch).item() == pytest.approx(total / (B * (6 + R * LENGTH)), rel=1e-5)
 

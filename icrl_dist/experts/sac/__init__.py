@@ -1,1 +1,1 @@
-"""Learners of experts: soft actor-critic, one expert at a time and many in lockstep."""
+"""Soft actor-critic for experts: one expert by stable-baselines3, or many together in lockstep."""

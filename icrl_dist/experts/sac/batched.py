@@ -1,9 +1,9 @@
-"""Soft actor-critic for N experts of one shape in lockstep: one product a layer for all of them.
+"""Soft actor-critic for N experts of one shape in lockstep: one matrix product per layer for all of them.
 
-The mathematics, step for step, is that of ``stable_baselines3.SAC.train``; tests hold both together
-from the same weights, batches and noise.  Each expert has its own losses (their sum is descended,
-never their mean) and its own chance, so an expert becomes the same in any company; on a CPU to the bit,
-if batches are of a multiple of 16 transitions.
+The mathematics is that of ``stable_baselines3.SAC.train``, step by step; tests compare both from the
+same weights, batches and noise.  Each expert has its own losses (the sum over experts is minimized,
+not the mean) and its own random generators, so its training does not depend on the other experts; on a
+CPU this holds to the bit, if the batch is a multiple of 16 transitions.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from torch import Tensor
 
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac import draws, sb3_files
-from icrl_dist.experts.sac.draws import Chance
-from icrl_dist.experts.sac.graphed import Graphed
-from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED, Lockstep, apart
-from icrl_dist.experts.sac.reference import Reference
-from icrl_dist.experts.sac.replay import Replay, Transitions
+from icrl_dist.experts.sac.cuda_graph import GraphedCallable
+from icrl_dist.experts.sac.draws import EpisodeDraws
+from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED, Lockstep, in_own_cache_lines
+from icrl_dist.experts.sac.replay import Replay, ReplayBatch
+from icrl_dist.experts.sac.sb3_updater import SB3Updater
 from icrl_dist.experts.sac.stacked import Shape, outputs
 from icrl_dist.interfaces import Batch
 from icrl_dist.types import Spec, Step
 
-Products = Literal["float32", "bfloat16"]
-By = Literal["lockstep", "stable-baselines3"]
-"""What makes the updates."""
+MatmulDtype = Literal["float32", "bfloat16"]
+Backend = Literal["lockstep", "stable-baselines3"]
+"""The implementation of an update."""
 
 
 def pick(device: str) -> torch.device:
-    """``auto``: a GPU if there is one.  Raises ValueError for a GPU where there is none."""
+    """The torch device; ``auto`` is a GPU if there is one.  Raises ValueError for ``cuda`` without a GPU."""
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"device = {device!r}: torch finds no GPU here: choose 'auto' or 'cpu'")
+        raise ValueError(f"device = {device!r}: torch finds no GPU here; choose 'auto' or 'cpu'")
     return torch.device(device)
 
 
 class SACBatch:
-    """N experts: parameters, Adam's moments, temperatures, and what each remembers."""
+    """N experts: parameters, Adam's moments, temperatures, and one replay each."""
 
     def __init__(
         self,
@@ -51,132 +51,138 @@ class SACBatch:
         spec: Spec,
         config: SACConfig,
         device: str = "auto",
-        products: Products = "float32",
+        matmul_dtype: MatmulDtype = "float32",
         capacity: int | None = None,
         graph: bool = True,
-        by: By = "lockstep",
+        backend: Backend = "lockstep",
     ) -> None:
-        """An expert for each seed, which draws its first parameters; ``products`` are of float32 or
-        bfloat16 numbers, parameters and Adam of float32; ``capacity`` of the replay is ``config.replay``
-        if not given; on a GPU an update is a CUDA graph, unless ``graph`` is false.  ``by``
-        stable-baselines3 is one expert's, float32 on the CPU.  Raises ValueError for discrete
-        actions, no expert, or what stable-baselines3 has not.
+        """One expert per seed; the seed draws its initial parameters.
+
+        ``matmul_dtype`` is the precision of matrix products; parameters and Adam are always float32.
+        ``capacity`` of the replay defaults to ``config.replay``.  On a GPU an update is a CUDA graph,
+        unless ``graph`` is false.  The backend stable-baselines3 supports one expert in float32 on the
+        CPU.  Raises ValueError for discrete actions, for no expert, and for what the backend does not support.
         """
         experts = len(seeds)
         if spec.discrete or experts < 1:
             raise ValueError(f"SAC: {experts} experts, discrete = {spec.discrete}: at least 1, and actions in [-1, 1]^A")
         self.experts, self.spec, self.config, self.device = experts, spec, config, pick(device)
         self.steps = 0
-        """Environment steps that ``train`` has made in each expert's environment."""
+        """Environment steps of each expert so far."""
         self.updates = 0
+        """Updates of each expert so far."""
         S, A = spec.observation, spec.actions
         self.actor_shape = Shape((S, *config.hidden, 2 * A))
         self.critic_shape = Shape((S + A, *config.hidden, 1))
-        generators = [draws.generator(seed, draws.FIRST) for seed in seeds]
+        generators = [draws.generator(seed, draws.INITIALIZATION) for seed in seeds]
         critic = torch.stack([self.critic_shape.draw(2, own) for own in generators])
-        first = {
+        initial = {
             "actor": torch.cat([self.actor_shape.draw(1, own) for own in generators]),
             "critic": critic,
             "target": critic.clone(),
             "log_temperature": torch.full((experts,), config.temperature).log(),
         }
-        first |= {f"{name}/{moment}": torch.zeros_like(first[name]) for name in TRAINED for moment in MOMENTS}
-        placed = {name: array.to(self.device) for name, array in first.items()}
-        self.arrays: dict[str, Tensor] = {name: apart(one) if one.dim() == 1 else one for name, one in placed.items()}
-        """By name, the expert first: ``actor``, ``critic`` (the two of an expert), ``target``,
+        initial |= {f"{name}/{moment}": torch.zeros_like(initial[name]) for name in TRAINED for moment in MOMENTS}
+        placed = {name: array.to(self.device) for name, array in initial.items()}
+        self.arrays: dict[str, Tensor] = {
+            name: in_own_cache_lines(array) if array.dim() == 1 else array for name, array in placed.items()
+        }
+        """By name, with the expert as first axis: ``actor``, ``critic`` (two per expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        self._updater = updater = self._made_by(by, products)
+        self._updater = updater = self._make_updater(backend, matmul_dtype)
 
-        def step(*given: Tensor) -> None:
-            updater.update(Transitions(*given[:-1]), given[-1])
+        def step(*inputs: Tensor) -> None:
+            updater.update(ReplayBatch(*inputs[:-1]), inputs[-1])
 
         self._step: Callable[..., None] = step
         if graph and isinstance(updater, Lockstep) and self.device.type == "cuda":
-            self._step = Graphed(step, updater.changed())
+            self._step = GraphedCallable(step, updater.changed())
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
 
-    def _made_by(self, by: By, products: Products) -> Lockstep | Reference:
+    def _make_updater(self, backend: Backend, matmul_dtype: MatmulDtype) -> Lockstep | SB3Updater:
         shapes = self.actor_shape, self.critic_shape
-        if by == "lockstep":
-            return Lockstep(self.arrays, *shapes, self.config, getattr(torch, products))
-        if (self.experts, products, self.device.type) == (1, "float32", "cpu"):
-            return Reference(self.arrays, shapes, self.spec, self.config)
-        what = f"{self.experts} experts, {products} products, {self.device}"
-        raise ValueError(f"stable-baselines3: {what}: it has one expert, float32, here on the CPU; take lockstep")
+        if backend == "lockstep":
+            return Lockstep(self.arrays, *shapes, self.config, getattr(torch, matmul_dtype))
+        if (self.experts, matmul_dtype, self.device.type) == (1, "float32", "cpu"):
+            return SB3Updater(self.arrays, shapes, self.spec, self.config)
+        found = f"{self.experts} experts, {matmul_dtype} products, {self.device}"
+        raise ValueError(f"stable-baselines3: {found}: it supports one expert in float32 on the CPU; use lockstep")
 
     @torch.no_grad()
     def act(
         self, observations: Float[np.ndarray, "N *E S"], normal: Float32[np.ndarray, "N *E A"] | None = None
     ) -> Float32[np.ndarray, "N *E A"]:
-        """Actions in [-1, 1] of each expert in its environment, or in its E environments: the mean squashed.
+        """Actions in [-1, 1] of each expert, in one or E environments: the squashed mean, or a sample.
 
-        With standard ``normal`` noise an action that is drawn.
+        A sample is drawn with the standard ``normal`` noise, if given.
         """
         flat = np.array(observations, np.float32).reshape(self.experts, -1, self.spec.observation)
-        given = torch.from_numpy(flat).to(self.device)
-        mean, spread = outputs(self.actor_shape, self.arrays["actor"], given).chunk(2, dim=2)
+        inputs = torch.from_numpy(flat).to(self.device)
+        mean, log_deviation = outputs(self.actor_shape, self.arrays["actor"], inputs).chunk(2, dim=2)
         if normal is not None:
             noise = torch.from_numpy(normal.reshape(mean.shape)).to(self.device)
-            mean = mean + noise * spread.clamp(-20.0, 2.0).exp()
-        chosen: np.ndarray = mean.tanh().cpu().numpy()
-        return chosen.reshape(*np.shape(observations)[:-1], self.spec.actions)
+            mean = mean + noise * log_deviation.clamp(-20.0, 2.0).exp()
+        actions: np.ndarray = mean.tanh().cpu().numpy()
+        return actions.reshape(*np.shape(observations)[:-1], self.spec.actions)
 
-    def update(self, batch: Transitions, noise: Float[Tensor, "2 N B A"]) -> None:
-        """One update of every expert by ``config.batch`` transitions of its own.
+    def update(self, batch: ReplayBatch, noise: Float[Tensor, "2 N B A"]) -> None:
+        """One update of every expert, each with its own ``config.batch`` transitions.
 
-        ``noise`` is standard normal: the actions' at the observations, then at the following ones.
+        ``noise`` is standard normal: of the actions at the observations, then at the next observations.
         """
         self._step(*batch, noise)
         self.updates += 1
 
-    def remember(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
-        """One step of every expert's environment, for its replay; a simulation that has broken down teaches nothing."""
+    def store(self, observations: Float32[np.ndarray, "N S"], actions: Float32[np.ndarray, "N A"], step: Step) -> None:
+        """Store one step of every expert's environment in its replay; steps of a diverged simulation are left out."""
         columns = (observations, actions, step.reward, step.observation, *(() if step.diverged is None else (step.diverged,)))
         self.replay.add(*(torch.from_numpy(np.array(column)) for column in columns))
         self.steps += 1
 
-    def learn(self, picks: Int[Tensor, "N B"], noise: Float[Tensor, "2 N B A"]) -> None:
-        """One update from the replay: by the transitions with these numbers."""
+    def update_from_replay(self, picks: Int[Tensor, "N B"], noise: Float[Tensor, "2 N B A"]) -> None:
+        """One update with the transitions of the replay that have these numbers."""
         self.update(self.replay.take(picks), noise)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that further training depends on, as plain arrays."""
-        own = {name: array.cpu().numpy().copy() for name, array in self.arrays.items()}
+        """Everything that further training depends on, as numpy arrays."""
+        arrays = {name: array.cpu().numpy().copy() for name, array in self.arrays.items()}
         counts = {"steps": np.array(self.steps), "updates": np.array(self.updates)}
-        return own | counts | {f"replay/{name}": array for name, array in self.replay.state().items()}
+        return arrays | counts | {f"replay/{name}": array for name, array in self.replay.state().items()}
 
     def load(self, state: Mapping[str, np.ndarray]) -> None:
-        """The inverse of ``state``.  Raises ValueError if it is another shape's."""
+        """The inverse of ``state``.  Raises ValueError if shapes differ."""
         self.replay.load({name: state[f"replay/{name}"] for name in ("rows", "added")})
-        self._take({name: torch.from_numpy(np.array(state[name])) for name in self.arrays}, int(state["updates"]))
+        self._set_arrays({name: torch.from_numpy(np.array(state[name])) for name in self.arrays}, int(state["updates"]))
         self.steps = int(state["steps"])
 
     def save_sb3(self, index: int, path: Path) -> None:
-        """Expert ``index`` as a file that ``stable_baselines3.SAC.load`` opens and can train on."""
-        one = {name: array[index].cpu() for name, array in self.arrays.items()}
-        sb3_files.save(path, self.spec, self.config, (self.actor_shape, self.critic_shape), one, self.updates)
+        """Write expert ``index`` to a file that ``stable_baselines3.SAC.load`` opens and can continue to train."""
+        expert = {name: array[index].cpu() for name, array in self.arrays.items()}
+        sb3_files.save(path, self.spec, self.config, (self.actor_shape, self.critic_shape), expert, self.updates)
 
     def load_sb3(self, paths: Sequence[Path]) -> None:
-        """Take expert i's parameters and moments from file i; the replays stay as they are.
+        """Load expert i's parameters and moments from file i; the replays do not change.
 
-        Raises ValueError unless there is a file for each expert, all of this shape and with the
-        same number of updates.
+        Raises ValueError unless there is one file per expert, all of this shape and with the same
+        number of updates.
         """
         if len(paths) != self.experts:
-            raise ValueError(f"{len(paths)} files for {self.experts} experts: give one for each")
+            raise ValueError(f"{len(paths)} files for {self.experts} experts: give one per expert")
         shapes = (self.actor_shape, self.critic_shape)
         found = [sb3_files.load(path, self.spec, self.config, shapes) for path in paths]
         updates = sorted({count for _, count in found})
         if len(updates) != 1:
-            raise ValueError(f"experts after {updates} updates cannot go on in lockstep: load those of one length together")
-        self._take({name: torch.stack([one[name] for one, _ in found]) for name in self.arrays}, updates[0])
+            raise ValueError(
+                f"experts after {updates} updates cannot continue in lockstep: load only experts with equal numbers of updates"
+            )
+        self._set_arrays({name: torch.stack([expert[name] for expert, _ in found]) for name in self.arrays}, updates[0])
 
-    def _take(self, arrays: Mapping[str, Tensor], updates: int) -> None:
+    def _set_arrays(self, arrays: Mapping[str, Tensor], updates: int) -> None:
         for name, array in self.arrays.items():
             if arrays[name].shape != array.shape:
                 raise ValueError(
                     f"{name} has the shape {tuple(arrays[name].shape)}, not {tuple(array.shape)}: "
-                    "load it into as many experts, of the same spec and hidden layers"
+                    "load it into the same number of experts, of the same spec and hidden layers"
                 )
         for name, array in self.arrays.items():
             array.copy_(arrays[name])
@@ -191,54 +197,54 @@ def train(
     seeds: Sequence[int],
     progress: Callable[[SACBatch, Float[np.ndarray, " N"]], None] = lambda experts, returns: None,
     device: str = "auto",
-    products: Products = "float32",
+    matmul_dtype: MatmulDtype = "float32",
     state: Mapping[str, np.ndarray] | None = None,
-    by: By = "lockstep",
+    backend: Backend = "lockstep",
 ) -> SACBatch:
-    """An expert for each of the N environments of ``env``, after ``steps`` steps in it.
+    """Train one expert in each of the N environments of ``env`` for ``steps`` steps, and return them.
 
-    ``progress`` hears the experts and their returns after every episode.  All draws are keyed by an
-    expert's seed and the episode: from a ``state`` that was taken in ``progress`` training goes on as if
-    it had never stopped.  On a CPU give torch one thread: two are slower.  Raises ValueError for another
-    number of seeds and for a state within an episode, FloatingPointError if an expert's weights stop being
-    numbers.
+    ``progress`` is called after every episode with the experts and their returns.  All draws are keyed
+    by an expert's seed and the episode, so training that continues from a ``state`` taken in ``progress``
+    gives the same result as training without interruption.  On a CPU set torch to one thread: two are
+    slower.  Raises ValueError for another number of seeds and for a state taken within an episode,
+    FloatingPointError if an expert's actions or weights become NaN or infinite.
     """
     horizon = env.spec.horizon
     if len(seeds) != env.batch:
-        raise ValueError(f"{len(seeds)} seeds for {env.batch} environments: give one for each")
-    experts = SACBatch(seeds, env.spec, config, device, products, min(config.replay, steps), by=by)
+        raise ValueError(f"{len(seeds)} seeds for {env.batch} environments: give one per environment")
+    experts = SACBatch(seeds, env.spec, config, device, matmul_dtype, min(config.replay, steps), backend=backend)
     if state is not None:
         experts.load(state)
 
-    def learns(step: int) -> bool:
+    def has_update(step: int) -> bool:
         return step > config.warmup and step % config.update_every == 0
 
     if experts.steps % horizon:
-        raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon}: take it in `progress`")
+        raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon} steps: take it in `progress`")
     while experts.steps < steps:
         first, total = experts.steps, np.zeros(experts.experts)
         last = min(first + horizon, steps)
-        count = sum(map(learns, range(first + 1, last + 1)))
-        drawn = Chance(seeds, first // horizon, env.spec, config, count, experts.device)
-        updates = iter(drawn.updates)
-        seen = np.asarray(env.reset(drawn.starts), np.float32)
+        count = sum(map(has_update, range(first + 1, last + 1)))
+        episode = EpisodeDraws(seeds, first // horizon, env.spec, config, count, experts.device)
+        updates = iter(episode.updates)
+        observation = np.asarray(env.reset(episode.starts), np.float32)
         for number in range(last - first):
             if experts.steps < config.random_steps:
-                action = drawn.uniform[number].astype(np.float32)
+                action = episode.uniform[number].astype(np.float32)
             else:
-                action = experts.act(seen, drawn.normal[number])
-                _need_numbers(action, experts.steps)
+                action = experts.act(observation, episode.normal[number])
+                _require_finite(action, experts.steps)
             step = env.step(action)
-            experts.remember(seen, action, step)
-            if learns(experts.steps):
-                experts.learn(*next(updates))
-            seen, total = step.observation, total + step.reward
-        _need_numbers(experts.arrays["actor"].cpu().numpy(), experts.steps)
+            experts.store(observation, action, step)
+            if has_update(experts.steps):
+                experts.update_from_replay(*next(updates))
+            observation, total = step.observation, total + step.reward
+        _require_finite(experts.arrays["actor"].cpu().numpy(), experts.steps)
         progress(experts, total)
     return experts
 
 
-def _need_numbers(of: Float32[np.ndarray, "N *_"], steps: int) -> None:
-    lost = [number for number, own in enumerate(of) if not np.isfinite(own).all()]
-    if lost:
-        raise FloatingPointError(f"weights of experts {lost} are not numbers at step {steps}: lower the learning rates")
+def _require_finite(values: Float32[np.ndarray, "N *_"], steps: int) -> None:
+    diverged = [number for number, row in enumerate(values) if not np.isfinite(row).all()]
+    if diverged:
+        raise FloatingPointError(f"weights of experts {diverged} are NaN or infinite at step {steps}: lower the learning rates")

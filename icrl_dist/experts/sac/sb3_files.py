@@ -1,4 +1,4 @@
-"""Experts as files of stable-baselines3: each row of stacked parameters is one of its networks, and back."""
+"""Experts as files of stable-baselines3: copies stacked parameters to its networks and back."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from torch import Tensor, nn
 
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED
-from icrl_dist.experts.sac.one import Expert, expert
+from icrl_dist.experts.sac.sb3_expert import Expert, expert
 from icrl_dist.experts.sac.stacked import Shape
 from icrl_dist.types import Spec
 
 Shapes = tuple[Shape, Shape]
-"""The actor's and a critic's."""
+"""Shapes of the actor and of one critic."""
 
 
-class _Spaces(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A game's spaces without a game."""
+class _SpacesOnly(gymnasium.Env[np.ndarray, np.ndarray]):
+    """The spaces of an environment, without dynamics: stable-baselines3 needs an environment to build networks."""
 
     def __init__(self, spec: Spec) -> None:
         self.observation_space = gymnasium.spaces.Box(np.array(spec.low, np.float32), np.array(spec.high, np.float32))
@@ -31,16 +31,16 @@ class _Spaces(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def blank(spec: Spec, config: SACConfig) -> Expert:
-    """An expert on the CPU with weights of no meaning; the global generators stay as they are."""
+    """An untrained expert on the CPU, to be filled with weights.  The global generators do not change."""
     with torch.random.fork_rng(devices=[]):
-        return expert(_Spaces(spec), config, None, "cpu")
+        return expert(_SpacesOnly(spec), config, None, "cpu")
 
 
 def save(path: Path, spec: Spec, config: SACConfig, shapes: Shapes, arrays: Mapping[str, Tensor], updates: int) -> None:
-    """Write one expert's ``arrays`` (names as in ``SACBatch.arrays``), with Adam's state after ``updates``."""
+    """Write one expert's ``arrays`` (named as in ``SACBatch.arrays``) with Adam's state after ``updates`` updates."""
     model = blank(spec, config)
     if updates:
-        _begin(model, updates)
+        _init_adam(model, updates)
     with torch.no_grad():
         for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
             theirs.copy_(ours)
@@ -49,21 +49,24 @@ def save(path: Path, spec: Spec, config: SACConfig, shapes: Shapes, arrays: Mapp
 
 
 def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dict[str, Tensor], int]:
-    """One expert's arrays, and after how many updates.  Raises ValueError for another shape."""
+    """One expert's arrays and its number of updates.
+
+    Raises ValueError for another shape, activation, action range or a fixed temperature.
+    """
     with torch.random.fork_rng(devices=[]):
         model = stable_baselines3.SAC.load(path, device="cpu", custom_objects={"buffer_size": 1})
     found = (model.observation_space.shape, model.action_space.shape, model.policy.net_arch)
     if found != ((spec.observation,), (spec.actions,), list(config.hidden)):
         raise ValueError(
             f"{path} holds an expert of {found[0]} observations, {found[1]} actions and hidden layers {found[2]}, "
-            f"not {spec.observation}, {spec.actions} and {config.hidden}: load it into its own shape"
+            f"not {spec.observation}, {spec.actions} and {config.hidden}: load it with its own spec and hidden layers"
         )
-    acts: Any = model.action_space
-    bounds, between = (acts.low, acts.high), model.policy.activation_fn
-    if between is not nn.ReLU or (bounds[0] != -1).any() or (bounds[1] != 1).any():
+    actions: Any = model.action_space
+    bounds, activation = (actions.low, actions.high), model.policy.activation_fn
+    if activation is not nn.ReLU or (bounds[0] != -1).any() or (bounds[1] != 1).any():
         raise ValueError(
-            f"{path} holds an expert with {between.__name__} between its layers and actions from {bounds[0].tolist()} to "
-            f"{bounds[1].tolist()}: only ReLU and actions in [-1, 1] can go on here"
+            f"{path} holds an expert with activation {activation.__name__} and actions from {bounds[0].tolist()} to "
+            f"{bounds[1].tolist()}: only ReLU and actions in [-1, 1] are supported"
         )
     actor, critic = (torch.zeros(shape.parameters) for shape in shapes)
     arrays = {"actor": actor, "critic": torch.stack([critic, critic]), "log_temperature": torch.zeros(())}
@@ -78,21 +81,21 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
 
 
 def share(model: Expert, shapes: Shapes, arrays: Mapping[str, Tensor]) -> None:
-    """From now on ``model`` trains one expert's ``arrays``: its parameters and Adam's moments become views of them."""
-    _begin(model, 0)
+    """Make the parameters and Adam's moments of ``model`` views of one expert's ``arrays``, so that it trains these."""
+    _init_adam(model, 0)
     for ours, theirs in _pairs(model, shapes, arrays, moments=True):
         theirs.data = ours
 
 
-def count(model: Expert, updates: int) -> None:
-    """Adam has made so many steps."""
+def set_updates(model: Expert, updates: int) -> None:
+    """Set Adam's step count."""
     for name in TRAINED:
         for state in _optimizer(model, name).state.values():
             state["step"].fill_(updates)
 
 
-def _begin(model: Expert, updates: int) -> None:
-    """Adam's state after so many steps, with moments of zero."""
+def _init_adam(model: Expert, updates: int) -> None:
+    """Create Adam's state after ``updates`` steps, with moments of zero."""
     for name in TRAINED:
         optimizer = _optimizer(model, name)
         for parameter in optimizer.param_groups[0]["params"]:
@@ -103,8 +106,11 @@ def _begin(model: Expert, updates: int) -> None:
 def _pairs(
     model: stable_baselines3.SAC, shapes: Shapes, arrays: Mapping[str, Tensor], moments: bool
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Views of the same numbers, ours and theirs: every parameter and, if asked for, Adam's moments of it."""
-    heads: list[Any] = [model.actor.mu, model.actor.log_std]  # side by side in our last layer
+    """Pairs of views of the same values, ours and stable-baselines3's: parameters and, with ``moments``, Adam's moments.
+
+    Ours are (in, out), torch's linear layers (out, in).
+    """
+    heads: list[Any] = [model.actor.mu, model.actor.log_std]  # one layer of ours holds both, side by side
     networks: dict[str, tuple[Shape, list[list[list[nn.Linear]]]]] = {
         "actor": (shapes[0], [[*_linear(model.actor.latent_pi), heads]]),
         "critic": (shapes[1], [_linear(part) for part in model.critic.q_networks]),
@@ -120,24 +126,24 @@ def _pairs(
                     at = 0
                     for part in parts:
                         columns = slice(at, at := at + part.out_features)
-                        yield weights[row, :, columns].T, _of(model, name, part.weight, moment)
-                        yield bias[row, 0, columns], _of(model, name, part.bias, moment)
+                        yield weights[row, :, columns].T, _values(model, name, part.weight, moment)
+                        yield bias[row, 0, columns], _values(model, name, part.bias, moment)
         theirs = _optimizer(model, "log_temperature").param_groups[0]["params"][0]
-        yield arrays["log_temperature" + suffix].view(1), _of(model, "log_temperature", theirs, moment)
+        yield arrays["log_temperature" + suffix].view(1), _values(model, "log_temperature", theirs, moment)
 
 
 def _linear(layers: Any) -> list[list[nn.Linear]]:
     return [[layer] for layer in layers if isinstance(layer, nn.Linear)]
 
 
-def _of(model: stable_baselines3.SAC, name: str, parameter: Tensor, moment: str | None) -> Tensor:
-    """A parameter's numbers, or a moment of it; torch keeps weights as (out, in)."""
+def _values(model: stable_baselines3.SAC, name: str, parameter: Tensor, moment: str | None) -> Tensor:
+    """A parameter, or one of Adam's moments of it."""
     return parameter if moment is None else _optimizer(model, name).state[parameter][moment]
 
 
 def _optimizer(model: stable_baselines3.SAC, name: str) -> torch.optim.Optimizer:
-    """Adam of one of ``TRAINED``.  Raises ValueError for a temperature that is fixed."""
+    """The Adam of one of ``TRAINED``.  Raises ValueError for a fixed temperature."""
     found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "log_temperature": model.ent_coef_optimizer}
     if (optimizer := found[name]) is None:
-        raise ValueError("the temperature is fixed: only experts that tune it can go on here")
+        raise ValueError("the temperature is fixed: only experts with an automatic temperature (ent_coef='auto') are supported")
     return optimizer

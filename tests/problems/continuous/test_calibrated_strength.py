@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.bench import disturbance, drop
-from icrl_dist.bench.disturbance import Setting, Sizes
+from icrl_dist.bench.disturbance import DisturbanceSizes, Setting
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps, load, override, parse
 from icrl_dist.problems import splits
@@ -128,17 +128,17 @@ def test_solving_keeps_the_strength_for_runs_that_ask_for_it(own, monkeypatch, c
     monkeypatch.setattr(drop, "_tasks", lambda kind, one, sizes: (one.task,))
     monkeypatch.setattr(drop, "_expert", lambda kind, config, report: Balances)
     monkeypatch.setattr(drop, "solve", functools.partial(drop.solve, first=0.5, most=8.0, tolerance=0.4))
-    monkeypatch.setattr(drop, "SIZES", Sizes(adversaries=1, episodes=1))
+    monkeypatch.setattr(drop, "SIZES", DisturbanceSizes(adversaries=1, episodes=1))
     assert main.main(["bench", "disturbance", "--problem", KIND, "--drop", "0.01", "--json"]) == 0
     out = capsys.readouterr().out
     (solved,) = json.loads(out.splitlines()[-1])["problems"]
     assert solved["lost_mean"] >= 0.01 and solved["reached"] and len(solved["tried"]) > 1
     kept = calibrated_strength.own()
     assert kept == [solved]
-    slow = disturbance.pushes(settings[0], 1, solved["strength"])
+    slow = disturbance.adversaries(settings[0], 1, solved["strength"])
     measured = disturbance.measure([drop.Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
     assert disturbance.lost(measured.returns)["lost_mean"] == pytest.approx(solved["lost_mean"])
-    drop._keep(solved)
+    drop._store(solved)
     assert calibrated_strength.own() == kept, "in its own place"
 
 
@@ -151,9 +151,9 @@ def test_an_incompetent_expert_is_not_asked_what_bites_it(own, monkeypatch):
     monkeypatch.setattr(drop, "_tasks", lambda kind, one, sizes: (one.task,))
     monkeypatch.setattr(drop, "settings", lambda kind: [settings])
     monkeypatch.setattr(drop, "_expert", lambda kind, config, report: Idle)
-    with pytest.raises(ConfigError, match=r"earn .* undisturbed, not 19: train longer"):
+    with pytest.raises(ConfigError, match=r"have a return of .* undisturbed, below 19: train longer"):
         monkeypatch.setattr(drop, "COMPETENT", 0.95)
-        drop.run(0.25, KIND, sizes=Sizes(adversaries=1, episodes=1))
+        drop.run(0.25, KIND, sizes=DisturbanceSizes(adversaries=1, episodes=1))
     assert not calibrated_strength.own_file().exists()
     with pytest.raises(ConfigError, match="did you mean 'dmc-hopper-hop'"):
         drop.run(0.25, "dmc-hoper-hop")

@@ -1,4 +1,4 @@
-"""One expert by stable-baselines3: the paper's numbers reach it, and a time limit is no end."""
+"""One expert by stable-baselines3: it has the paper's settings, and a time limit is not a terminal state."""
 
 import gymnasium
 import numpy as np
@@ -7,13 +7,13 @@ import stable_baselines3
 import torch
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.sac.one import Expert, expert
+from icrl_dist.experts.sac.sb3_expert import Expert, expert
 
 CONFIG = SACConfig(hidden=(8, 4), batch=6, random_steps=10, warmup=20, replay=100, update_every=3)
 
 
 class Corridor(gymnasium.Env):
-    """Three steps along a line, rewarded 1 each; then the time limit."""
+    """Three steps along a line with reward 1 each, then the time limit."""
 
     observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float32)
     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
@@ -33,7 +33,7 @@ def rates(model):
     return tuple(optimizer.param_groups[0]["lr"] for optimizer in optimizers)
 
 
-def test_an_expert_has_the_papers_numbers():
+def test_an_expert_has_the_papers_settings():
     model = expert(Corridor(), SACConfig(replay=100), 0, "cpu")
     assert [m.out_features for m in model.actor.latent_pi if isinstance(m, torch.nn.Linear)] == [256] * 3
     for critic in model.critic.q_networks:
@@ -52,35 +52,37 @@ def test_each_part_keeps_its_own_learning_rate_through_training_and_a_file(tmp_p
     again = Expert.load(tmp_path / "expert.zip", Corridor(), device="cpu")
     again.learn(30)
     assert rates(again) == (1e-4, 3e-4, 3e-4)
-    plain = stable_baselines3.SAC.load(tmp_path / "expert.zip", device="cpu")
-    seen = np.array([[1, 0.5], [-3, 1]], np.float32)
-    np.testing.assert_array_equal(plain.predict(seen, deterministic=True)[0], model.predict(seen, deterministic=True)[0])
+    loaded = stable_baselines3.SAC.load(tmp_path / "expert.zip", device="cpu")
+    observations = np.array([[1, 0.5], [-3, 1]], np.float32)
+    np.testing.assert_array_equal(
+        loaded.predict(observations, deterministic=True)[0], model.predict(observations, deterministic=True)[0]
+    )
 
 
-def test_actions_are_uniform_first_and_updates_begin_after_the_warm_up(monkeypatch):
+def test_first_actions_are_uniform_and_updates_begin_after_the_warm_up(monkeypatch):
     model = expert(Corridor(), CONFIG, 0, "cpu")
-    asked = []
+    steps = []
     predict = type(model).predict
     monkeypatch.setattr(
-        type(model), "predict", lambda self, *a, **k: asked.append(self.num_timesteps) or predict(self, *a, **k)
+        type(model), "predict", lambda self, *a, **k: steps.append(self.num_timesteps) or predict(self, *a, **k)
     )
     model.learn(30)
-    assert asked == list(range(10, 30))
+    assert steps == list(range(10, 30))
     assert model._n_updates == 4  # after the steps 21, 24, 27 and 30
 
 
-def test_the_time_limit_is_stored_as_no_end_and_with_what_was_seen_at_it():
+def test_the_time_limit_is_stored_as_not_terminal_with_the_observation_at_it():
     model = expert(Corridor(), CONFIG, 0, "cpu")
     model.learn(9)
-    memory = model.replay_buffer
-    assert memory.dones[:9, 0].tolist() == [0, 0, 1] * 3
-    assert memory.next_observations[:9, 0, 0].tolist() == [1, 2, 3] * 3
-    assert not memory._get_samples(np.arange(9)).dones.any()
+    buffer = model.replay_buffer
+    assert buffer.dones[:9, 0].tolist() == [0, 0, 1] * 3
+    assert buffer.next_observations[:9, 0, 0].tolist() == [1, 2, 3] * 3
+    assert not buffer._get_samples(np.arange(9)).dones.any()
 
 
 @pytest.mark.parametrize(
     "wrong", [{"batch": 0}, {"hidden": (64, 0)}, {"tau": 1.5}, {"gamma": 1.0}, {"warmup": 0}, {"replay": -1}]
 )
-def test_numbers_that_cannot_be_are_refused_by_name(wrong):
+def test_settings_out_of_range_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=rf"{next(iter(wrong))} = .*must be"):
         SACConfig(**wrong)

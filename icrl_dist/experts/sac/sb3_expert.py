@@ -1,7 +1,7 @@
-"""Soft actor-critic by stable-baselines3, with the paper's numbers: the reference, and the default for one expert.
+"""Soft actor-critic by stable-baselines3 with the paper's settings: the reference, and the default for a single expert.
 
-stable-baselines3 has one learning rate and one number for both random steps and warm-up; ``Expert``
-has the paper's own for each.
+stable-baselines3 has one learning rate, and one setting for both random steps and warm-up; ``Expert``
+has separate ones, as in the paper.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from icrl_dist.config.sac import SACConfig
 
 
 class Expert(stable_baselines3.SAC):
-    """``stable_baselines3.SAC`` with a learning rate for each part, and random steps apart from the warm-up.
+    """``stable_baselines3.SAC`` with a learning rate per part, and random steps separate from the warm-up.
 
-    What it saves, ``stable_baselines3.SAC.load`` opens too.
+    ``stable_baselines3.SAC.load`` also opens its files.
     """
 
     rates: tuple[float, float, float] = (SACConfig.actor_rate, SACConfig.critic_rate, SACConfig.temperature_rate)
@@ -39,12 +39,12 @@ class Expert(stable_baselines3.SAC):
 
 
 def expert(env: gymnasium.Env[Any, Any], config: SACConfig, seed: int | None, device: str = "auto") -> Expert:
-    """An expert that has learned nothing yet: ``expert(...).learn(steps)``, then ``save(path)``.
+    """An untrained expert: call ``expert(...).learn(steps)``, then ``save(path)``.
 
-    An episode that ends by ``truncated`` has met its time limit: the target bootstraps through it.
-    With a ``seed`` stable-baselines3 seeds torch's, numpy's and Python's global generators.
+    The target bootstraps through ``truncated`` ends of episodes, which are time limits.  With a
+    ``seed``, stable-baselines3 seeds torch's, numpy's and Python's global generators.
     """
-    made = Expert(
+    model = Expert(
         "MlpPolicy",
         env,
         learning_rate=config.critic_rate,
@@ -59,6 +59,6 @@ def expert(env: gymnasium.Env[Any, Any], config: SACConfig, seed: int | None, de
         seed=seed,
         device=device,
     )
-    made.rates = (config.actor_rate, config.critic_rate, config.temperature_rate)
-    made.random_steps = config.random_steps
-    return made
+    model.rates = (config.actor_rate, config.critic_rate, config.temperature_rate)
+    model.random_steps = config.random_steps
+    return model

@@ -1,4 +1,4 @@
-"""An expert that trains alone is trained by stable-baselines3, on the engine's parameters, batches and noise."""
+"""A single expert is trained by stable-baselines3, with the engine's parameters, batches and noise."""
 
 import dataclasses
 
@@ -10,51 +10,51 @@ import torch
 from icrl_dist.collect import jobs
 from icrl_dist.experts import train as experts
 from icrl_dist.experts.sac.batched import SACBatch, train
-from icrl_dist.experts.sac.one import Expert
+from icrl_dist.experts.sac.sb3_expert import Expert
 from icrl_dist.experts.sac.sb3_files import load
-from tests.experts.test_batched import LINE, SMALL, SPEC, Line, by_sb3, drawn
+from tests.experts.sac_cases import LINE, SMALL, SPEC, Line, random_updates, updated_by_sb3
 from tests.experts.test_train import KilledError, asked, digests, run  # noqa: F401
 
-BY = "stable-baselines3"
+BACKEND = "stable-baselines3"
 
 
-def test_its_updates_are_stable_baselines3s_own_and_the_engines_up_to_rounding(tmp_path, monkeypatch):
-    alone, engine = SACBatch([0], SPEC, SMALL, "cpu", by=BY), SACBatch([0], SPEC, SMALL, "cpu")
+def test_updates_are_those_of_stable_baselines3_and_those_of_the_engine_up_to_rounding(tmp_path, monkeypatch):
+    alone, engine = SACBatch([0], SPEC, SMALL, "cpu", backend=BACKEND), SACBatch([0], SPEC, SMALL, "cpu")
     alone.save_sb3(0, tmp_path / "before.zip")
-    for batch, noise in drawn(SMALL, 10, experts=1):
+    for batch, noise in random_updates(SMALL, 10, experts=1):
         alone.update(batch, noise)
         engine.update(batch, noise)
-    by_sb3(Expert.load(tmp_path / "before.zip", device="cpu"), 0, drawn(SMALL, 10, experts=1), monkeypatch).save(
-        tmp_path / "after.zip"
-    )
+    updated_by_sb3(
+        Expert.load(tmp_path / "before.zip", device="cpu"), 0, random_updates(SMALL, 10, experts=1), monkeypatch
+    ).save(tmp_path / "after.zip")
     theirs, updates = load(tmp_path / "after.zip", SPEC, SMALL, (alone.actor_shape, alone.critic_shape))
     assert updates == alone.updates == 10
     for name, array in alone.arrays.items():
         torch.testing.assert_close(array[0], theirs[name], atol=1e-6, rtol=1e-4, msg=name)
         torch.testing.assert_close(array, engine.arrays[name], atol=2e-5, rtol=1e-3, msg=name)
-    moved = SACBatch([0], SPEC, SMALL, "cpu")
-    assert all(not torch.equal(alone.arrays[name], array) for name, array in moved.arrays.items())
+    untrained = SACBatch([0], SPEC, SMALL, "cpu")
+    assert all(not torch.equal(alone.arrays[name], array) for name, array in untrained.arrays.items())
 
 
-def test_its_training_goes_on_from_a_state_and_leaves_the_global_generators_alone():
-    kept = {}
+def test_training_continues_from_a_state_and_does_not_change_the_global_generators():
+    states = {}
     torch.manual_seed(3)
     before = torch.get_rng_state(), np.random.get_state()[1].tolist()
-    whole = train(Line(1), LINE, 35, [5], lambda e, _: kept.update({e.steps: e.state()}), "cpu", by=BY).state()
+    whole = train(Line(1), LINE, 35, [5], lambda e, _: states.update({e.steps: e.state()}), "cpu", backend=BACKEND).state()
     assert torch.equal(before[0], torch.get_rng_state()) and before[1] == np.random.get_state()[1].tolist()
-    again = train(Line(1), LINE, 35, [5], device="cpu", state=kept[21], by=BY).state()
-    assert whole["updates"] == 8 and not np.array_equal(kept[21]["actor"], whole["actor"])
+    again = train(Line(1), LINE, 35, [5], device="cpu", state=states[21], backend=BACKEND).state()
+    assert whole["updates"] == 8 and not np.array_equal(states[21]["actor"], whole["actor"])
     for name, array in whole.items():
         np.testing.assert_array_equal(again[name], array, err_msg=name)
 
 
-@pytest.mark.parametrize("more", [{"seeds": [0, 1]}, {"products": "bfloat16"}])
-def test_what_stable_baselines3_has_not_is_refused(more):
-    with pytest.raises(ValueError, match=r"stable-baselines3: . experts.*take lockstep"):
-        SACBatch(**{"seeds": [0], "spec": SPEC, "config": SMALL, "device": "cpu", "by": BY, **more})
+@pytest.mark.parametrize("more", [{"seeds": [0, 1]}, {"matmul_dtype": "bfloat16"}])
+def test_settings_that_stable_baselines3_does_not_support_are_refused(more):
+    with pytest.raises(ValueError, match=r"stable-baselines3: . experts.*use lockstep"):
+        SACBatch(**{"seeds": [0], "spec": SPEC, "config": SMALL, "device": "cpu", "backend": BACKEND, **more})
 
 
-def test_a_job_of_one_expert_is_its_and_resumes_to_the_same_bytes_and_one_of_two_is_not(run, monkeypatch):  # noqa: F811
+def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_bytes(run, monkeypatch):  # noqa: F811
     trained, real = [], stable_baselines3.SAC.train
     monkeypatch.setattr(stable_baselines3.SAC, "train", lambda self, *given: trained.append(type(self)) or real(self, *given))
     whole = asked(run)[0]
@@ -79,4 +79,4 @@ def test_a_job_of_one_expert_is_its_and_resumes_to_the_same_bytes_and_one_of_two
     with pytest.raises(KilledError):
         list(jobs.do(one, None, "w"))
     assert digests(jobs.do(one, None, "w")) == undisturbed
-    assert len(trained) == 2 * updates, "no episode was trained twice"
+    assert len(trained) == 2 * updates, "an episode was trained twice"

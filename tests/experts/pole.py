@@ -1,6 +1,6 @@
-"""An expert learns to balance the pole: in a process of its own, for checked shapes make every update much slower.
+"""Trains one expert to balance the pole, in a separate process: the shape checks of tests make updates much slower.
 
-Prints, every 1,000 steps, the mean return of its mean action in ten episodes that it does not learn from, until 190.
+Prints every 1,000 steps the mean return of its mean action over ten evaluation episodes, until 190.
 """
 
 import sys
@@ -22,20 +22,20 @@ def main():
     rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
     config = SACConfig(hidden=(64, 64), batch=64, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
 
-    def look(experts, _):
+    def evaluate(experts, _):
         if experts.steps % 1000:
             return
         total = 0.0
         for episode in range(10):
-            seen = env.reset([np.random.default_rng((1, episode))])
+            observation = env.reset([np.random.default_rng((1, episode))])
             for _ in range(200):
-                seen, reward, *_ = env.step(experts.act(seen))
+                observation, reward, *_ = env.step(experts.act(observation))
                 total += float(reward[0])
         print(total / 10, flush=True)
         if total / 10 >= 190:
             sys.exit("torch's compiler was imported" if "torch._dynamo" in sys.modules else 0)
 
-    train(registry.batch(pole), config, 12_000, [2], look, "cpu")
+    train(registry.batch(pole), config, 12_000, [2], evaluate, "cpu")
 
 
 if __name__ == "__main__":
