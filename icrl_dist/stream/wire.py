@@ -219,7 +219,7 @@ _JOB = _ALWAYS | {
     "trials",
     "policy_version",
     "seed",
-    "settings",
+    "payload",
     "tasks",
     "first",
 }
