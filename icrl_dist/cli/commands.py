@@ -211,13 +211,13 @@ def monitor(arguments: Monitor, console: Console) -> int:
 
 def tap(arguments: Tap, console: Console) -> int:
     """``icrl-dist tap``: a JSON line a trajectory."""
-    from icrl_dist.monitor.tap import Tapped
+    from icrl_dist.monitor.tap import TapWriter
     from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
     endpoint, certificates, run = _learner(arguments.what, arguments.connect, arguments.certificates)
     over = threading.Event()
-    tapped = Tapped(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, over.set)
+    tapped = TapWriter(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, over.set)
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: over.set())
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from icrl_dist.monitor.lines import ACCENT, BOLD, DIM, GOOD, PLAIN, SPARK, TITLE, TROUBLE, WARNING, Line, cell
-from icrl_dist.monitor.seen import number, summary, told
 from icrl_dist.monitor.spark import bounds, plot, room
+from icrl_dist.monitor.view_state import number, summary, told
 
 _HEIGHT = 6
 """Lines of a plot."""
@@ -16,7 +16,7 @@ _MARKS = {"goal": GOOD + BOLD, "start": ACCENT + BOLD, "moved": TROUBLE, "path":
 
 
 def lines(known: dict[str, Any], width: int) -> tuple[list[Line], list[Line]]:
-    """A heading and the lines under it; ``known`` as ``Picture.variation`` tells it."""
+    """A heading and the lines under it; ``known`` as ``RunState.variation`` tells it."""
     row = summary(known)
     head: list[Line] = [[(f" VARIATION {row['name']}", TITLE), (f"  {row['problem']}  {row['played']}", BOLD)]]
     body: list[Line] = [_field("parameters", told(row["parameters"])), _field("adversary", told(row["adversary"], "kind"))]

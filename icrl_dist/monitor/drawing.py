@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from icrl_dist.monitor import validation
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_values
 from icrl_dist.problems.dmc import domains
 from icrl_dist.problems.metaworld import pick_place
@@ -30,18 +30,18 @@ _HAND, _OBJECT = slice(0, 2), slice(4, 6)
 
 
 def of(message: dict[str, Any]) -> dict[str, Any]:
-    """The drawing of an ``episode`` message.  Raises Odd for one that is not what docs/tap.md says."""
+    """The drawing of an ``episode`` message.  Raises InvalidMessageError for one that is not what docs/tap.md says."""
     kind = validation.text(message.get("problem"), 64)
     try:
         states = strict.to_array("observations", message.get("observations"), ("<f4",), 2)
         adversary = strict.to_array("adversary", message.get("adversary"), ("<f4",), 1)
     except strict.WireError:
-        raise Odd("schema") from None
+        raise InvalidMessageError("schema") from None
     if not (0 < len(states) <= 512 and len(adversary) <= len(states) and states.shape[1] <= 128):
-        raise Odd("schema")
+        raise InvalidMessageError("schema")
     if not (np.isfinite(states).all() and np.isfinite(adversary).all()):
-        raise Odd("schema")
-    parameters = validation.named(message.get("task"))
+        raise InvalidMessageError("schema")
+    parameters = validation.parameters(message.get("task"))
     if kind == "darkroom":
         return _room(states, adversary, parameters)
     if kind == pick_place.KIND:
@@ -52,14 +52,14 @@ def of(message: dict[str, Any]) -> dict[str, Any]:
         frames, force = picture.sticks(kind, states), _rounded(np.minimum(adversary, 1.0))
         frame_s = validation.integer(message.get("every"), 1, 512) * picture.step_s(kind)
         return {"kind": "sticks", "frames": frames, "frame_s": frame_s, "force": force}
-    raise Odd("schema")
+    raise InvalidMessageError("schema")
 
 
 def _room(states: np.ndarray, adversary: np.ndarray, parameters: dict[str, Any]) -> dict[str, Any]:
     size = validation.integer(parameters.get("size"), 2, 256)
-    goal = [validation.integer(c, 0, size - 1) for c in validation.listed(parameters.get("goal"), 2)]
+    goal = [validation.integer(c, 0, size - 1) for c in validation.bounded_list(parameters.get("goal"), 2)]
     if states.shape[1] != 2 or len(goal) != 2:
-        raise Odd("schema")
+        raise InvalidMessageError("schema")
     path = np.rint(states).astype(np.int64).clip(0, size - 1)
     return {"kind": "room", "size": size, "goal": goal, "path": path.tolist(), "overridden": (adversary >= 0).tolist()}
 
@@ -67,7 +67,7 @@ def _room(states: np.ndarray, adversary: np.ndarray, parameters: dict[str, Any])
 def _paths(states: np.ndarray, parameters: dict[str, Any]) -> dict[str, Any]:
     goal = validation.numbers(parameters.get("goal"), 3)
     if states.shape[1] < 7 or len(goal) != 3:
-        raise Odd("schema")
+        raise InvalidMessageError("schema")
     drawn = {"hand": _HAND, "object": _OBJECT}
     paths = [{"name": name, "points": [_rounded(p) for p in states[:, place]]} for name, place in drawn.items()]
     return {"kind": "paths", "paths": paths, "goal": _rounded(np.array(goal[:2]))}

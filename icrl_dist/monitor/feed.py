@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.recording import Recording
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.stream.link import Link
 
 PERIOD_S = 0.25
@@ -18,7 +18,7 @@ PERIOD_S = 0.25
 class Feed(Protocol):
     """Keeps a picture up to date on a thread of its own."""
 
-    picture: Picture
+    state: RunState
 
     def now(self) -> float:
         """The picture's time, Unix seconds."""
@@ -40,15 +40,15 @@ class LiveFeed:
 
     def __init__(self, link: Link, run: str = "") -> None:
         """Subscribes to the monitor plane of ``run``, by default of whichever run is on at that endpoint."""
-        self.picture = Picture(run)
+        self.state = RunState(run)
         self._ended = threading.Event()
-        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.picture.hear(key, payload, time.time()))
+        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.state.hear(key, payload, time.time()))
         self._thread = threading.Thread(target=self._tick, name="picture", daemon=True)
         self._thread.start()
 
     def _tick(self) -> None:
         while not self._ended.wait(PERIOD_S):
-            self.picture.tick(time.time())
+            self.state.tick(time.time())
 
     def now(self) -> float:
         return time.time()
@@ -75,7 +75,7 @@ class ReplayFeed:
 
     def __init__(self, folder: Path, speed: float = 10.0) -> None:
         """``speed``: seconds of then a second of now.  Raises ConfigError if there is nothing to play."""
-        self.picture = Picture(recorded=True)
+        self.state = RunState(recorded=True)
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False
@@ -95,7 +95,7 @@ class ReplayFeed:
                     self._at = min(self._recording.end, self._at + elapsed * self._speed)
                 at, seek, self._seek = self._at, self._seek, False
             if seek:
-                self.picture.clear()
+                self.state.clear()
                 self._messages = self._recording.messages()
                 self._next = next(self._messages, None)
             self._until(at)
@@ -109,10 +109,10 @@ class ReplayFeed:
                 ticked = then
             if then - ticked >= 1.0:
                 ticked = then
-                self.picture.tick(then)
-            self.picture.hear(key, payload, then)
+                self.state.tick(then)
+            self.state.hear(key, payload, then)
             self._next = next(self._messages, None)
-        self.picture.tick(at)
+        self.state.tick(at)
 
     def now(self) -> float:
         return self._at

@@ -27,7 +27,7 @@ PUSH_S = 0.25
 EVENT = "picture"
 
 
-class Teller:
+class SnapshotPublisher:
     """Tells a feed's picture to every viewer: whole to one that joins, then what has changed, made once for all."""
 
     def __init__(self, feed: Feed) -> None:
@@ -37,11 +37,11 @@ class Teller:
         self._kept: tuple[str, int, str] = "", -1, ""
 
     def _picture(self, since: int) -> dict[str, Any]:
-        return {**self._feed.picture.snapshot(self._feed.now(), since), "replay": self._feed.replay()}
+        return {**self._feed.state.snapshot(self._feed.now(), since), "replay": self._feed.replay()}
 
     def _whole(self) -> tuple[str, str]:
         """What a viewer begins with; those who join in one tick share it."""
-        picture = self._feed.picture
+        picture = self._feed.state
         with self._lock:
             if self._kept[:2] != (picture.epoch, picture.seq):
                 whole = self._picture(-1)
@@ -93,14 +93,14 @@ class Teller:
     async def variation(self, request: Request) -> Response:
         """All that is kept of one variation, as JSON."""
         name = f"{request.path_params['task']}/{request.path_params['variation']}"
-        found = await asyncio.to_thread(self._feed.picture.variation, name)
+        found = await asyncio.to_thread(self._feed.state.variation, name)
         return PlainTextResponse("no such variation", 404) if found is None else JSONResponse(found)
 
 
 @contextlib.contextmanager
 def showing(feed: Feed, host: str, port: int) -> Iterator[str]:
     """Serve the page meanwhile; gives its URL.  Raises ConfigError if it cannot listen there."""
-    teller, over = Teller(feed), threading.Event()
+    teller, over = SnapshotPublisher(feed), threading.Event()
 
     routes = [Route("/variation/{task}/{variation}", teller.variation)]
     app = application("monitor.html", teller.stream, teller.command, routes)

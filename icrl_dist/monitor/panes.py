@@ -23,8 +23,8 @@ from icrl_dist.monitor.lines import (
     cell,
     spread,
 )
-from icrl_dist.monitor.seen import Seen, duration, number
 from icrl_dist.monitor.spark import bar, plot
+from icrl_dist.monitor.view_state import ViewState, duration, number
 
 _STATES = {"collecting": GOOD, "fitting": GOOD, "finished": GOOD, "waiting": WARNING, "interrupted": WARNING}
 """Any other is trouble."""
@@ -39,7 +39,7 @@ _SPAN = 300
 class Header(Lines):
     """The run, its stage, where a recording is, and the alerts that are on."""
 
-    def fill(self, seen: Seen, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
+    def fill(self, seen: ViewState, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
         """Tell what is seen; ``frozen``: since when nothing new is shown (Unix seconds); ``brief``: rates, too."""
         width = max(20, self.size.width)
         lines = [_run(seen), _stage(seen, width), *([_brief(seen)] if brief else [])]
@@ -55,7 +55,7 @@ class Header(Lines):
         self.show(lines)
 
 
-def _run(seen: Seen) -> Line:
+def _run(seen: ViewState) -> Line:
     run = seen.run
     state = run.get("state", "waiting")
     told = {"waiting": "waiting for the learner", "silent": f"SILENT for {run.get('silent_s') or 0:.0f} s"}.get(state, state)
@@ -74,7 +74,7 @@ def _run(seen: Seen) -> Line:
     return left
 
 
-def _stage(seen: Seen, width: int) -> Line:
+def _stage(seen: ViewState, width: int) -> Line:
     run = seen.run
     if not run.get("steps"):
         return [(" no stage has begun", DIM)]
@@ -93,7 +93,7 @@ def _stage(seen: Seen, width: int) -> Line:
     return spread([(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (told, PLAIN)], [(elapsed, DIM)], width)
 
 
-def _brief(seen: Seen) -> Line:
+def _brief(seen: ViewState) -> Line:
     newest = {name: next((v for v in reversed(seen.series[name]) if v is not None), None) for name, _, _ in _RATES}
     short = (("stored/s", "stored_per_s", 0), ("steps/s", "steps_per_s", 0), ("fit/s", "fit_per_s", 1), ("loss", "loss", 3))
     line: Line = []
@@ -128,7 +128,7 @@ _RATES = (
 )
 
 
-def rates(seen: Seen, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
+def rates(seen: ViewState, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
     """How fast every stage goes, a sparkline each; then what was dropped and ignored."""
     room = max(8, width - 23)
     head: list[Line] = [[("RATES", title(focused)), (f"  the last {_SPAN // 60} minutes", DIM)]]
@@ -171,7 +171,7 @@ def _counted(what: str, counts: dict[str, int]) -> list[Line]:
 _WHAT = {"alert": TROUBLE, "crash": TROUBLE, "failed": TROUBLE, "quarantine": TROUBLE, "version": GOOD, "finished": GOOD}
 
 
-def happened(seen: Seen, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
+def happened(seen: ViewState, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
     """What happened, the newest last."""
     head: list[Line] = [[("EVENTS", title(focused)), (f" {len(seen.events)}", BOLD), ("  newest last", DIM)]]
     lines: list[Line] = []

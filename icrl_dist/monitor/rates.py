@@ -12,7 +12,7 @@ _PERIOD_S = 1.0
 SERIES = ("stored_per_s", "episodes_per_s", "steps_per_s", "fit_per_s", "loss", "lag", "unstored")
 
 
-class Pace:
+class RateSeries:
     """Series of a point a second, and estimates from them."""
 
     def __init__(self) -> None:

@@ -17,10 +17,10 @@ from textual.widgets import Input
 from icrl_dist.monitor import detail, panes
 from icrl_dist.monitor.feed import Feed
 from icrl_dist.monitor.lines import DIM, Scroll
-from icrl_dist.monitor.pages import HELP, Detail, Help, Page
+from icrl_dist.monitor.overlays import HELP, Detail, Help, Overlay
 from icrl_dist.monitor.panes import Header, Keys, Tabs
-from icrl_dist.monitor.seen import Seen
 from icrl_dist.monitor.tables import VARIATIONS, WORKERS, Table, worker_row
+from icrl_dist.monitor.view_state import ViewState
 
 PERIOD_S = 0.25
 """What is seen is brought up to date this often, and less often where that takes long."""
@@ -32,7 +32,7 @@ _PANES = ("variations", "workers", "rates", "events")
 INTERRUPTED = 130
 
 
-class Screen(App[None]):
+class MonitorApp(App[None]):
     """One run, live or played again."""
 
     ENABLE_COMMAND_PALETTE = False
@@ -75,7 +75,7 @@ class Screen(App[None]):
     def __init__(self, feed: Feed) -> None:
         super().__init__()
         self._feed = feed
-        self._seen = Seen(feed.picture)
+        self._seen = ViewState(feed.state)
         self._frozen: float | None = None
         self._active = 0
         self._not_before = 0.0
@@ -139,7 +139,7 @@ class Screen(App[None]):
     def _fill_detail(self, page: Detail) -> None:
         if self._frozen is not None and page.filled == page.variation:
             return
-        known, sheet = self._feed.picture.variation(page.variation), page.query_one(Scroll)
+        known, sheet = self._feed.state.variation(page.variation), page.query_one(Scroll)
         if known is not None:
             sheet.fill(*detail.lines(known, sheet.size.width or self.size.width))
         else:
@@ -167,7 +167,7 @@ class Screen(App[None]):
     def _keys(self, replay: dict[str, Any] | None) -> list[tuple[str, str]]:
         hold = ("p", "play" if replay and replay["paused"] else "pause" if replay else "go on" if self._frozen else "freeze")
         played = [("+-", "speed"), ("←→", "seek")] if replay else []
-        if isinstance(self.screen, Page):
+        if isinstance(self.screen, Overlay):
             beside = [("[ ]", "previous, next")] if isinstance(self.screen, Detail) else []
             return [("Esc", "back"), ("↑↓", "scroll"), *beside, hold, *played, ("q", "quit")]
         return [
@@ -202,7 +202,7 @@ class Screen(App[None]):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Some keys are for the tables, some for a page over them, and while one types they are letters."""
         if action in ("pane", "show", "sort", "reverse", "filter"):
-            return not isinstance(self.screen, Page) and not self._typing()
+            return not isinstance(self.screen, Overlay) and not self._typing()
         if action in ("speed", "seek"):
             return self._feed.replay() is not None and not self._typing()
         if action == "beside":
@@ -265,7 +265,7 @@ class Screen(App[None]):
 
     def action_clear(self) -> None:
         """Back from a page; in a table, all rows again."""
-        if isinstance(self.screen, Page):
+        if isinstance(self.screen, Overlay):
             self.pop_screen()
             self.call_after_refresh(self._fill)
             return
@@ -282,7 +282,7 @@ class Screen(App[None]):
         if self._active == 0:
             self._open(Detail(event.row))
 
-    def _open(self, page: Page) -> None:
+    def _open(self, page: Overlay) -> None:
         if not isinstance(self.screen, type(page)):
             self.push_screen(page)
             self.call_after_refresh(self._fill)
@@ -308,6 +308,6 @@ class Screen(App[None]):
 
 def watch(feed: Feed) -> int:
     """Show a run until it is left; returns the exit code."""
-    app: Any = Screen(feed)
+    app: Any = MonitorApp(feed)
     app.run(mouse=False)
     return int(app.return_code or 0)

@@ -28,8 +28,8 @@ from icrl_dist.monitor.lines import (
     fit,
     spread,
 )
-from icrl_dist.monitor.seen import Row, matches, number
 from icrl_dist.monitor.spark import bounds, spark
+from icrl_dist.monitor.view_state import Row, matches, number
 
 _HEAD = 2
 """Lines above the rows."""

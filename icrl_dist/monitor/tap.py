@@ -12,7 +12,7 @@ from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.types import Identity
 
 
-class Tapped:
+class TapWriter:
     """Writes the trajectories that pass, until there are enough or they cannot be written.
 
     A message that is none is left out.  In JSON, bytes are hexadecimal digits.

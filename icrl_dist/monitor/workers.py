@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from icrl_dist.monitor import validation
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.telemetry import crash_reports
 
 SILENT_S = 2.0
@@ -31,7 +31,7 @@ class _Row:
 _NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0, "policy_version": -1}
 
 
-class Staff:
+class WorkerTable:
     """A bounded table of workers."""
 
     def __init__(self, beats: bool = True) -> None:
@@ -64,7 +64,7 @@ class Staff:
         row = self._rows.get(worker)
         if row is None:
             if len(self._rows) >= _MOST:
-                raise Odd("too many workers")
+                raise InvalidMessageError("too many workers")
             row = self._rows[worker] = _Row(now)
             before = crash_reports.predecessor(worker)
             if before is not None and before in self._rows and not self._rows[before].alive:

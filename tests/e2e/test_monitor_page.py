@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from icrl_dist.monitor import curves
+from icrl_dist.monitor import variations
 from icrl_dist.monitor.drawing import optimum
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.monitor.page import showing
@@ -67,7 +67,7 @@ class Plane:
         self.link, self.name = self.hub.link(), name
         self.feed = LiveFeed(self.hub.link())
         self.progress()
-        wait_for(lambda: self.feed.picture.snapshot(0.0)["run"]["name"], "the run is known", SHORT_S)
+        wait_for(lambda: self.feed.state.snapshot(0.0)["run"]["name"], "the run is known", SHORT_S)
 
     def put(self, payload, topic="any", run=None):
         self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
@@ -203,13 +203,13 @@ def test_hostile_messages_are_text_or_nothing(page):
 
 
 def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkeypatch):
-    monkeypatch.setattr(curves, "VARIATIONS", 700)
+    monkeypatch.setattr(variations, "VARIATIONS", 700)
     page.forgiven = r"ERR_(CONNECTION_REFUSED|INCOMPLETE_CHUNKED_ENCODING|CONNECTION_RESET|EMPTY_RESPONSE)"
     with plane() as run:
         run.progress()
         for number in range(1000):  # at once: a link would drop some
             payload = run.told(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
-            run.feed.picture.hear("icrl/a-run/mon/trajectories/w0", payload, time.time())
+            run.feed.state.hear("icrl/a-run/mon/trajectories/w0", payload, time.time())
         with showing(run.feed, "127.0.0.1", 0) as url:
             page.goto(url)
             until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")

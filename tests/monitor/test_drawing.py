@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.monitor import drawing
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.problems import registry
 from icrl_dist.problems.dmc import domains, picture
 from icrl_dist.problems.dmc.simulation import DMC
@@ -87,7 +87,7 @@ def test_hand_and_object_are_seen_from_above():
 def test_what_is_no_episode_is_not_drawn(changes):
     good = message("darkroom", {"goal": [1, 1], "size": 4}, np.zeros((3, 2)))
     assert drawing.of(good)["path"] == [[0, 0]] * 3
-    with pytest.raises(Odd):
+    with pytest.raises(InvalidMessageError):
         drawing.of(good | changes)
 
 

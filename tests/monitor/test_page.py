@@ -10,7 +10,7 @@ import pytest
 
 from icrl_dist.monitor import page as page_module
 from icrl_dist.monitor import serve
-from icrl_dist.monitor.page import EVENT, Teller, showing
+from icrl_dist.monitor.page import EVENT, SnapshotPublisher, showing
 from icrl_dist.monitor.serve import application, serving
 from tests.monitor.test_serve import Page, wait_for
 from tests.monitor.watched import Watched
@@ -24,8 +24,8 @@ class Run(Watched):
     def __init__(self):
         super().__init__()
         self.snapshots = []
-        snapshot = self.picture.snapshot
-        self.picture.snapshot = lambda now, since=-1: self.snapshots.append(since) or snapshot(now, since)
+        snapshot = self.state.snapshot
+        self.state.snapshot = lambda now, since=-1: self.snapshots.append(since) or snapshot(now, since)
 
     def returned(self, variation, trial, earned):
         named = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
@@ -68,7 +68,7 @@ def run():
 
 @pytest.fixture
 def page(run):
-    teller = Teller(run)
+    teller = SnapshotPublisher(run)
     routes = [serve.Route("/variation/{task}/{variation}", teller.variation)]
     app = application("monitor.html", teller.stream, teller.command, routes)
     with contextlib.ExitStack() as stack:
@@ -170,13 +170,13 @@ def test_what_cannot_be_told_is_logged_once_and_the_next_change_is_told(run, mon
     with showing(run, "127.0.0.1", 0) as url:
         view = View(Page(url, None, None))
         view.next()
-        whole, asked = run.picture.snapshot, []
+        whole, asked = run.state.snapshot, []
         broken = lambda now, since=-1: asked.append(since) or {**whole(now, since), "time": float("nan")}  # noqa: E731
-        monkeypatch.setattr(run.picture, "snapshot", broken)
+        monkeypatch.setattr(run.state, "snapshot", broken)
         run.say("event", what="note", text="told in the end")
         run.tick()
         wait_for(lambda: len(asked) > 3)
-        monkeypatch.setattr(run.picture, "snapshot", whole)
+        monkeypatch.setattr(run.state, "snapshot", whole)
         while "told in the end" not in [event["text"] for event in view.known["events"]]:
             view.next()
         view.close()
@@ -189,7 +189,7 @@ def test_what_is_forgotten_is_forgotten_by_all(run, page):
     views = [page.view(), page.view()]
     for view in views:
         view.next()
-    run.picture.clear()  # a recording is wound back
+    run.state.clear()  # a recording is wound back
     run.tick()
     page.tell()
     for view in views:

@@ -12,8 +12,8 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.launch import train
 from icrl_dist.monitor import page
 from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
-from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.recording import Recording
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.storage import files
 from icrl_dist.storage.dataset import Store
 from icrl_dist.stream.memory_link import MemoryLink
@@ -46,7 +46,7 @@ def watched(module_run, tmp_path_factory):
 
 
 def played(folder):
-    picture = Picture()
+    picture = RunState()
     recording = Recording(folder)
     for now, key, payload in recording.messages():
         picture.hear(key, payload, now)
@@ -57,7 +57,7 @@ def played(folder):
 
 def test_it_ends_in_the_picture_that_was_seen_live(watched):
     folder, heard = watched
-    live = Picture(folder.name)
+    live = RunState(folder.name)
     for key, payload in heard:
         live.hear(key, payload, 0.0)
     live.tick(0.0)
@@ -98,16 +98,16 @@ def test_it_is_played_at_any_speed_paused_and_wound_back(watched):
             time.sleep(0.02)
 
     with ReplayFeed(folder, speed=1e4) as feed:
-        until(lambda: feed.picture.snapshot(0.0)["run"]["state"] == "finished")
-        where, epoch = feed.replay(), feed.picture.epoch
+        until(lambda: feed.state.snapshot(0.0)["run"]["state"] == "finished")
+        where, epoch = feed.replay(), feed.state.epoch
         assert where["at"] == where["end"] and feed.now() == where["end"]
         feed.control(paused=True)
         feed.control(at=where["begin"])
-        until(lambda: feed.picture.epoch != epoch)
-        until(lambda: feed.picture.snapshot(0.0)["run"]["state"] != "finished")
+        until(lambda: feed.state.epoch != epoch)
+        until(lambda: feed.state.snapshot(0.0)["run"]["state"] != "finished")
         assert feed.replay()["at"] == where["begin"] and feed.replay()["paused"]
         feed.control(speed=1e9, paused=False)
-        until(lambda: feed.picture.snapshot(0.0)["run"]["state"] == "finished")
+        until(lambda: feed.state.snapshot(0.0)["run"]["state"] == "finished")
         assert feed.replay()["speed"] == 1e4
 
 
@@ -139,10 +139,10 @@ def test_a_live_feed_hears_what_is_published(hub):
     with LiveFeed(hub()) as feed, LiveFeed(hub(), "other") as other:
         link.publish("icrl/demo/mon/learner", progress(), droppable=True)
         deadline = time.monotonic() + 10
-        while name_in(feed.picture) != "demo":
+        while name_in(feed.state) != "demo":
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        assert feed.replay() is None and other.picture.heard == 0
+        assert feed.replay() is None and other.state.heard == 0
         feed.control(speed=2.0, paused=True, at=0.0)
 
 
@@ -162,7 +162,7 @@ def test_a_folder_is_watched_while_its_learner_holds_it_and_played_when_it_is_go
         (folder / "endpoint").write_text("tcp/127.0.0.1:1\n")
     monkeypatch.setattr(ZenohLink, "connect", lambda *_: hub())
     monkeypatch.setattr(
-        page, "serve", lambda feed, *_: feeds.append((type(feed), feed.picture.snapshot(0.0)["run"]["name"])) or 0
+        page, "serve", lambda feed, *_: feeds.append((type(feed), feed.state.snapshot(0.0)["run"]["name"])) or 0
     )
     with files.hold(folder) if there else contextlib.nullcontext():
         assert main(["monitor", str(tmp_path / ("latest" if link else "night")), "--web", "0"]) == 0
@@ -180,7 +180,7 @@ def test_without_a_folder_the_newest_run_is_meant_whose_learner_lives(hub, tmp_p
         os.utime(folder / "endpoint", (1000.0 + number, 1000.0 + number))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(ZenohLink, "connect", lambda endpoint, *_: found.append(endpoint) or hub())
-    monkeypatch.setattr(page, "serve", lambda feed, *_: found.append(name_in(feed.picture)) or 0)
+    monkeypatch.setattr(page, "serve", lambda feed, *_: found.append(name_in(feed.state)) or 0)
     with files.hold(tmp_path / "runs" / "older"):
         assert main(["monitor", "--web", "0"]) == 0
     assert main(["monitor", "--web", "0"]) == 0

@@ -12,11 +12,11 @@ import pytest
 
 from icrl_dist.cli.main import main
 from icrl_dist.monitor.lines import Column, Scroll, cell, fit
-from icrl_dist.monitor.pages import Detail, Help
+from icrl_dist.monitor.overlays import Detail, Help
 from icrl_dist.monitor.recording import Recording
-from icrl_dist.monitor.screen import Screen
-from icrl_dist.monitor.seen import duration, matches
+from icrl_dist.monitor.screen import MonitorApp
 from icrl_dist.monitor.tables import Table
+from icrl_dist.monitor.view_state import duration, matches
 from icrl_dist.stream import wire
 from tests.monitor.watched import BEGAN, Watched, episode, run_folder
 
@@ -38,7 +38,7 @@ def drive(feed, script, size=(130, 44)):
     """Run the view without a terminal while ``script(app, press)`` acts."""
 
     async def act():
-        app = Screen(feed)
+        app = MonitorApp(feed)
         async with app.run_test(size=size) as pilot:
 
             async def press(*keys):
@@ -205,14 +205,14 @@ def test_names_from_the_network_are_only_ever_text(size):
     feed = Watched()
     feed.progress(phase=None)  # the first that is heard of the run
     feed.busy()
-    feed.picture.hear("icrl/demo/mon/event", wire.encode_message("event", what="x", text="x", time=1e300), feed.time)
+    feed.state.hear("icrl/demo/mon/event", wire.encode_message("event", what="x", text="x", time=1e300), feed.time)
     feed.beat(HOSTILE, job=HOSTILE, doing=HOSTILE)
     feed.say("event", what="[red]", text=HOSTILE * 5)
     feed.say("event", what="alert", alert="[/]", active=True, text=HOSTILE)
     feed.say("event", what="quarantine", identity="adapt/0/0/0", text=HOSTILE)
     bad = episode(0, 1, 6)
-    feed.picture.hear("icrl/demo/mon/trajectories/x", b"\x81\xa1v\x01", feed.time)
-    feed.picture.hear("icrl/other/mon/learner", b"", feed.time)
+    feed.state.hear("icrl/demo/mon/trajectories/x", b"\x81\xa1v\x01", feed.time)
+    feed.state.hear("icrl/other/mon/learner", b"", feed.time)
     object.__setattr__(bad, "worker", HOSTILE)
     feed.store(bad)
     feed.pass_time(1.0)
@@ -283,7 +283,7 @@ def test_a_recording_that_is_wound_back_is_seen_anew():
 
     async def script(app, press):
         assert len(rows(app, "variations")) == 8
-        feed.picture.clear()
+        feed.state.clear()
         feed.store(episode(5, 0, 0))
         feed.pass_time(1.0)
         await press()

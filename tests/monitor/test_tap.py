@@ -12,7 +12,7 @@ import pytest
 
 from icrl_dist.cli.main import main
 from icrl_dist.config.run import ConfigError
-from icrl_dist.monitor.tap import Tapped
+from icrl_dist.monitor.tap import TapWriter
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import NULL
@@ -28,7 +28,7 @@ def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0)
     """What is written of 24 trajectories and some messages that are none."""
     out, ended, made = Out(), [], []
     monkeypatch.setattr(sys, "stdout", out)
-    tap = Tapped(tasks, adversaries, every, form, count, lambda: ended.append(True))
+    tap = TapWriter(tasks, adversaries, every, form, count, lambda: ended.append(True))
     for task in range(3):
         for variation in range(2):
             for trial in range(4):
@@ -82,7 +82,7 @@ def test_a_field_that_json_cannot_hold_costs_no_trajectory(monkeypatch, form):
         },
         {"identity": "adapt/0/0/1", "adversary": {}, **of},
     ]
-    Tapped((), (), 1, form, 0, lambda: None)("key", wire.encode_message("trajectories", worker="w0", variations=told))
+    TapWriter((), (), 1, form, 0, lambda: None)("key", wire.encode_message("trajectories", worker="w0", variations=told))
     written = out.buffer.getvalue()
     found = [*msgpack.Unpacker(io.BytesIO(written))] if form == "msgpack" else [*map(json.loads, written.decode().splitlines())]
     assert [one["identity"] for one in found] == ["adapt/0/0/0/0", "adapt/0/0/1/0"]

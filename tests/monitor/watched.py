@@ -8,7 +8,7 @@ from importlib import resources
 
 import numpy as np
 
-from icrl_dist.monitor.picture import Picture
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.problems.darkroom import room
 from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import monitor_messages, wire
@@ -48,7 +48,7 @@ class Watched:
     """A feed of what the test says."""
 
     def __init__(self, replay=None):
-        self.picture, self.time, self.recording, self.controls = Picture("demo"), BEGAN, replay, []
+        self.state, self.time, self.recording, self.controls = RunState("demo"), BEGAN, replay, []
 
     def now(self):
         return self.time
@@ -66,11 +66,11 @@ class Watched:
 
     def pass_time(self, seconds):
         self.time += seconds
-        self.picture.tick(self.time)
+        self.state.tick(self.time)
 
     def say(self, kind, topic=None, **fields):
         payload = wire.encode_message(kind, time=self.time, **fields)
-        self.picture.hear(f"icrl/demo/mon/{topic or kind}", payload, self.time)
+        self.state.hear(f"icrl/demo/mon/{topic or kind}", payload, self.time)
 
     def about(self):
         phases = [["pretrain", 0, 100], ["adapt", 0, 50]]
@@ -95,10 +95,10 @@ class Watched:
         self.say("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
 
     def store(self, trajectory):
-        self.picture.hear("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
+        self.state.hear("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
 
     def draw(self, trajectory):
-        self.picture.hear("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
+        self.state.hear("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
 
     def busy(self):
         """Four tasks of two variations, two workers."""

@@ -32,7 +32,7 @@ HELP: list[Line] = [
 ]
 
 
-class Page(screen.Screen[None]):
+class Overlay(screen.Screen[None]):
     """Something read from top to bottom, over the view."""
 
     def compose(self) -> Iterator[Widget]:
@@ -44,7 +44,7 @@ class Page(screen.Screen[None]):
         self.query_one(Scroll).focus()
 
 
-class Detail(Page):
+class Detail(Overlay):
     """One variation."""
 
     def __init__(self, variation: str) -> None:
@@ -54,5 +54,5 @@ class Detail(Page):
         """The one whose figures are shown; while the view is frozen, as they were when it was first asked for."""
 
 
-class Help(Page):
+class Help(Overlay):
     """What the keys do."""

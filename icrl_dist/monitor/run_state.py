@@ -12,10 +12,10 @@ from collections import Counter, deque
 from typing import Any
 
 from icrl_dist.monitor import readers, validation
-from icrl_dist.monitor.curves import Curves
-from icrl_dist.monitor.rates import Pace
-from icrl_dist.monitor.validation import Odd
-from icrl_dist.monitor.workers import Staff
+from icrl_dist.monitor.rates import RateSeries
+from icrl_dist.monitor.validation import InvalidMessageError
+from icrl_dist.monitor.variations import VariationTable
+from icrl_dist.monitor.workers import WorkerTable
 from icrl_dist.stream import validation as strict
 
 LARGEST = 1 << 20
@@ -32,7 +32,7 @@ _VARIATIONS = 4096
 _OVER = ("finished", "interrupted", "failed")
 
 
-class Picture:
+class RunState:
     """A run as its monitor plane shows it; safe to use from several threads.
 
     Times are Unix seconds: of this machine while a run is watched, of then while one is replayed.
@@ -57,9 +57,9 @@ class Picture:
             self._seq = 0
             self._run: dict[str, Any] = {"name": self._only, "state": "waiting", "version": -1, "trajectories": 0}
             self._heard = float("-inf")
-            self._staff = Staff(not self._recorded)
-            self._curves = Curves()
-            self._pace = Pace()
+            self._staff = WorkerTable(not self._recorded)
+            self._curves = VariationTable()
+            self._pace = RateSeries()
             self._events: deque[dict[str, Any]] = deque(maxlen=readers.EVENTS)
             self._event_count = 0
             self._alerts: dict[str, dict[str, Any]] = {}
@@ -77,7 +77,7 @@ class Picture:
                 self._take(run, kind, message, now)
         except strict.WireError as error:
             self.ignored[error.reason] += 1
-        except Odd as error:
+        except InvalidMessageError as error:
             self.ignored[str(error)] += 1
         self.heard += 1
 
@@ -91,7 +91,7 @@ class Picture:
             self._meet(run, now)
             self._begin(told)
         elif run != self._run["name"]:
-            raise Odd("another run" if self._run["name"] else "no run yet")
+            raise InvalidMessageError("another run" if self._run["name"] else "no run yet")
         elif kind == "trajectories":
             self._returned(message)
         elif kind == "episode":
@@ -103,27 +103,27 @@ class Picture:
         elif kind == "belief":
             self._belief(readers.belief(message), now)
         else:
-            raise Odd("unknown kind")
+            raise InvalidMessageError("unknown kind")
 
     def _meet(self, run: str, now: float) -> None:
         """The learner of ``run`` speaks: it is shown from now on, unless another is that is neither over nor long silent.
 
-        Raises Odd if it is not to be shown.
+        Raises InvalidMessageError if it is not to be shown.
         """
         shown = self._run["name"]
         if shown and run != shown:
             left = self._run["state"] in _OVER or now - self._heard > _LEFT_S
             if self._only or not left:
-                raise Odd("another run")
+                raise InvalidMessageError("another run")
             self.clear()
         self._run["name"], self._heard = run, now
 
     def _returned(self, message: dict[str, Any]) -> None:
-        worker, time, odd = validation.text(message.get("worker")), validation.when(message.get("time")), None
-        for told in validation.listed(message.get("variations"), _VARIATIONS):
+        worker, time, odd = validation.text(message.get("worker")), validation.timestamp(message.get("time")), None
+        for told in validation.bounded_list(message.get("variations"), _VARIATIONS):
             try:
-                self._pace.produced(self._curves.returned(validation.mapped(told), worker, time))
-            except Odd as error:  # the others are none the worse for it
+                self._pace.produced(self._curves.returned(validation.mapping(told), worker, time))
+            except InvalidMessageError as error:  # the others are none the worse for it
                 odd = error
         if odd:
             raise odd

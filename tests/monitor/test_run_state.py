@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from icrl_dist.monitor import curves, workers
-from icrl_dist.monitor.picture import Picture
-from icrl_dist.monitor.rates import Pace
+from icrl_dist.monitor import variations, workers
+from icrl_dist.monitor.rates import RateSeries
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from icrl_dist.stream import monitor_messages, wire
 from tests.monitor.messages import PUSHY, ROOM, about, beat, event, hear, progress, trajectory
@@ -24,7 +24,7 @@ def watch(picture, *trajectories, now=0.0):
 
 
 def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum():
-    picture = Picture("demo")
+    picture = RunState("demo")
     watch(picture, *(trajectory(f"adapt/1/3/1/{trial}", earned=trial) for trial in (0, 2, 1)))
     picture.tick(1.0)
     (row,) = picture.snapshot(1.0)["variations"]
@@ -37,7 +37,7 @@ def test_a_variation_is_its_adversary_its_returns_by_trial_and_its_exact_optimum
 
 
 def test_every_round_has_its_own_adversary_and_optimum_and_the_newest_phase_is_the_last():
-    picture = Picture("demo")
+    picture = RunState("demo")
     rounds = {f"adapt/{n}": PUSHY.replace(p=p) for n, p in ((1, 0.6), (0, 0.1))}  # what is late comes in its place
     for name, adversary in rounds.items():
         watch(picture, trajectory(f"{name}/3/1/0", adversary=adversary))
@@ -57,7 +57,7 @@ def test_every_round_has_its_own_adversary_and_optimum_and_the_newest_phase_is_t
 
 
 def test_a_quarantine_is_of_its_phase_and_known_though_nothing_was_earned_in_it():
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "event", event("quarantine", "it crashes", identity="adapt/0/3/1"))
     watch(picture, trajectory("adapt/1/4/0/0"))
     hear(picture, "event", event("quarantine", "stuck", identity="adapt/1/4/0"))
@@ -75,7 +75,7 @@ def test_a_quarantine_is_of_its_phase_and_known_though_nothing_was_earned_in_it(
 
 
 def test_from_random_starts_the_optimum_is_the_mean_over_the_cells():
-    picture = Picture("demo")
+    picture = RunState("demo")
     random_start = ROOM.replace(start="random")
     watch(picture, trajectory(task=random_start))
     picture.tick(1.0)
@@ -86,7 +86,7 @@ def test_from_random_starts_the_optimum_is_the_mean_over_the_cells():
 
 
 def test_a_variation_tells_where_it_came_from_and_shows_its_newest_episode():
-    picture = Picture("demo")
+    picture = RunState("demo")
     watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/3/1/1", earned=3.0, worker="w1"), now=5.0)
     found = picture.variation("3/1")
     assert [line["identity"] for line in found["lineage"]] == ["adapt/0/3/1/0", "adapt/0/3/1/1"]
@@ -101,7 +101,7 @@ def test_a_variation_tells_where_it_came_from_and_shows_its_newest_episode():
 
 
 def test_a_later_snapshot_has_only_what_changed():
-    picture = Picture("demo")
+    picture = RunState("demo")
     watch(picture, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/4/0/0"))
     hear(picture, "event", event("note", "one"))
     picture.tick(1.0)
@@ -121,8 +121,8 @@ def test_a_later_snapshot_has_only_what_changed():
 
 
 def test_every_change_is_told_of_however_many_there_are(monkeypatch):
-    monkeypatch.setattr(curves, "_TOLD", 3)
-    picture, told, since = Picture("demo"), [], -1
+    monkeypatch.setattr(variations, "_TOLD", 3)
+    picture, told, since = RunState("demo"), [], -1
     picture.tick(0.0)
     since = picture.snapshot(0.0)["seq"]
     watch(picture, *(trajectory(f"adapt/0/{task}/0/0") for task in range(8)))
@@ -135,7 +135,7 @@ def test_every_change_is_told_of_however_many_there_are(monkeypatch):
 
 
 def test_workers_work_wait_fall_silent_go_and_come_again():
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "worker/w0", beat(steps=0, episodes=4, trajectories=3), 0.0)
     hear(picture, "worker/w1", beat("w1", job=""), 0.0)
     for second in range(1, 5):
@@ -156,7 +156,7 @@ def test_workers_work_wait_fall_silent_go_and_come_again():
 
 
 def test_a_recording_that_stands_still_grows_nothing_and_rates_go_on_from_there():
-    picture = Picture("demo", recorded=True)
+    picture = RunState("demo", recorded=True)
     for second in range(5):
         hear(picture, "worker/w0", beat(steps=100 * second), float(second))
         picture.tick(float(second))
@@ -169,7 +169,7 @@ def test_a_recording_that_stands_still_grows_nothing_and_rates_go_on_from_there(
 
 
 def test_the_next_life_of_a_worker_takes_its_row():
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "worker/w0", beat("w0"), 0.0)
     hear(picture, "worker/w1", beat("w1"), 0.0)
     for now, name in ((1.0, "w1"), (2.0, "w1-1")):
@@ -182,7 +182,7 @@ def test_the_next_life_of_a_worker_takes_its_row():
 
 
 def test_a_workers_lag_is_that_of_the_weights_that_act_in_its_job():
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "learner", progress(version=3))
     for worker, said in {
         "w0": {"policy_version": 1},
@@ -195,7 +195,7 @@ def test_a_workers_lag_is_that_of_the_weights_that_act_in_its_job():
 
 
 def test_the_run_goes_through_its_states():
-    picture = Picture("demo")
+    picture = RunState("demo")
     assert picture.snapshot(0.0)["run"]["state"] == "waiting"
     hear(picture, "run", about())
     hear(picture, "learner", progress(step=10, trajectories=10), 0.0)
@@ -214,7 +214,7 @@ def test_the_run_goes_through_its_states():
 
 
 def test_the_time_left_is_that_of_the_stage_the_fit_and_the_phases_to_come():
-    pace = Pace()
+    pace = RateSeries()
     pace.phases = [("pretrain", 0, 60), ("adapt", 0, 30), ("adapt", 1, 30)]
 
     def at(now, **where):
@@ -232,7 +232,7 @@ def test_the_time_left_is_that_of_the_stage_the_fit_and_the_phases_to_come():
 
 
 def test_rates_are_counted_once_a_second():
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "learner", progress(trajectories=10), 0.0)
     picture.tick(0.0)
     watch(picture, *(trajectory(f"adapt/0/0/0/{n}") for n in range(6)), now=1.0)
@@ -246,7 +246,7 @@ def test_rates_are_counted_once_a_second():
 
 
 def test_alerts_are_shown_while_they_are_on_and_a_quarantine_in_its_phase():
-    picture = Picture("demo")
+    picture = RunState("demo")
     watch(picture, trajectory("adapt/0/3/1/0"))
     hear(picture, "event", event("alert", "stuck at zero", alert="zero", active=True))
     hear(picture, "event", event("quarantine", "it crashes", identity="adapt/0/3/1"))
@@ -264,7 +264,7 @@ def test_alerts_are_shown_while_they_are_on_and_a_quarantine_in_its_phase():
 
 def test_the_alerts_that_are_on_are_those_the_learner_repeats():
     on = [{"name": "zero", "text": "stuck", "since": 2.0}, {"name": "silent w0", "text": "w0 is silent", "since": 3.0}]
-    late = Picture("demo")
+    late = RunState("demo")
     hear(late, "run", about(alerts=on))
     assert late.snapshot(9.0)["alerts"] == on, "the events were before its time"
     hear(late, "event", event("alert", "stuck in more", alert="zero", active=True, time=8.0))
@@ -280,11 +280,11 @@ def test_the_alerts_that_are_on_are_those_the_learner_repeats():
 
 
 def test_memory_is_bounded_whatever_comes(monkeypatch):
-    monkeypatch.setattr(curves, "VARIATIONS", 5)
-    monkeypatch.setattr(curves, "_EPISODES", 12)
-    monkeypatch.setattr(curves, "_OPTIMA", 0)
+    monkeypatch.setattr(variations, "VARIATIONS", 5)
+    monkeypatch.setattr(variations, "_EPISODES", 12)
+    monkeypatch.setattr(variations, "_OPTIMA", 0)
     monkeypatch.setattr(workers, "_MOST", 3)
-    picture = Picture("demo")
+    picture = RunState("demo")
     for n in range(300):
         watch(picture, trajectory(f"adapt/0/{n % 9}/0/{n}"))
         hear(picture, f"worker/w{n}", beat(f"w{n}"))
@@ -303,7 +303,7 @@ def test_memory_is_bounded_whatever_comes(monkeypatch):
 
 
 def test_one_run_is_shown_and_another_at_the_same_place_left_out():
-    picture = Picture()
+    picture = RunState()
     for kind, message in (("event", event("note", "x")), ("x", wire.encode_message("x")), ("learner", progress(phase=None))):
         hear(picture, kind, message, run="stray")
     assert picture.snapshot(0.0)["run"]["name"] == "", "only a learner's word says which run is on"
@@ -317,7 +317,7 @@ def test_one_run_is_shown_and_another_at_the_same_place_left_out():
 
 @pytest.mark.parametrize("over", [True, False])
 def test_the_next_run_at_the_same_place_is_shown_once_this_one_is_over_or_long_silent(over):
-    picture, named = Picture(), Picture("demo")
+    picture, named = RunState(), RunState("demo")
     for one in (picture, named):
         hear(one, "learner", progress(version=4))
         watch(one, trajectory())
@@ -333,7 +333,7 @@ def test_the_next_run_at_the_same_place_is_shown_once_this_one_is_over_or_long_s
 
 @pytest.mark.parametrize("how", ["finished", "interrupted", "failed"])
 def test_a_run_that_was_over_may_go_on(how):
-    picture = Picture()
+    picture = RunState()
     hear(picture, "learner", progress(), 0.0)
     hear(picture, "event", event(how, "x", time=5.0), 5.0)
     hear(picture, "learner", progress(time=4.9), 5.1)
@@ -373,7 +373,7 @@ ODD = [
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_no_field_of_any_message_can_break_it(kind):
-    picture = Picture("demo")
+    picture = RunState("demo")
     whole = msgpack.unpackb(MESSAGES[kind])
     for name in whole:
         hear(picture, "x", msgpack.packb({k: v for k, v in whole.items() if k != name}))
@@ -411,7 +411,7 @@ IMPOSSIBLE = [
 
 @pytest.mark.parametrize(("kind", "message", "odd"), IMPOSSIBLE)
 def test_of_a_message_with_one_odd_field_nothing_is_believed(kind, message, odd):
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "learner", progress())
     before = picture.snapshot(2.0)
     hear(picture, kind, message(**odd), 1.0)
@@ -422,7 +422,7 @@ def test_of_a_message_with_one_odd_field_nothing_is_believed(kind, message, odd)
 
 @pytest.mark.parametrize("alpha", [1e5, 1e308, 0.0])
 def test_where_a_law_makes_no_numbers_nobody_knows_the_optimum(alpha):
-    picture = Picture("demo")
+    picture = RunState("demo")
     watch(picture, trajectory(adversary=PUSHY.replace(alpha=(alpha,) * 5)))
     picture.tick(1.0)
     (row,) = picture.snapshot(1.0)["variations"]
@@ -432,7 +432,7 @@ def test_where_a_law_makes_no_numbers_nobody_knows_the_optimum(alpha):
 @settings(max_examples=30, deadline=None)
 @given(st.binary(max_size=200), st.text(max_size=20))
 def test_no_bytes_can_break_it(payload, topic):
-    picture = Picture("demo")
+    picture = RunState("demo")
     picture.hear(f"icrl/{topic}/mon/x", payload, 0.0)
     picture.hear(topic, payload, 0.0)
     picture.tick(1.0)
@@ -440,13 +440,13 @@ def test_no_bytes_can_break_it(payload, topic):
 
 
 def test_a_huge_message_is_left_out():
-    picture = Picture("demo")
+    picture = RunState("demo")
     hear(picture, "event", event("note", "x" * (2 << 20)))
     assert picture.snapshot(0.0)["ignored"] == {"oversized": 1}
 
 
 def test_a_belief_is_kept_a_worker():
-    picture = Picture("demo")
+    picture = RunState("demo")
     law = [1 / 16] * 16
     said = {"identity": "adapt/0/3/1/7", "worker": "w0", "size": 4, "goal": [2, 1], "implied": law, "exact": law}
     hear(picture, "belief/w0", wire.encode_message("belief", time=0.0, **said))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.rates import SERIES
+from icrl_dist.monitor.run_state import RunState
 
 _POINTS = 600
 _EVENTS = 200
@@ -16,10 +16,10 @@ _LAST = 5
 Row = dict[str, Any]
 
 
-class Seen:
+class ViewState:
     """A picture as of the last look; its rows are made anew only where something changed."""
 
-    def __init__(self, picture: Picture) -> None:
+    def __init__(self, picture: RunState) -> None:
         self._picture = picture
         self._forget("")
 

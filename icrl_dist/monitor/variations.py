@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from icrl_dist.monitor import drawing as sketch
 from icrl_dist.monitor import validation
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.types import STAGES, Identity
 
 VARIATIONS = 4096
@@ -32,7 +32,7 @@ Place = tuple[int, int]
 """A variation, as task and variation; or a phase, as stage and round."""
 
 
-class About(NamedTuple):
+class VariationInfo(NamedTuple):
     """What a variation is in one phase."""
 
     problem: str
@@ -40,63 +40,63 @@ class About(NamedTuple):
     adversary: dict[str, Any]
 
     @classmethod
-    def of(cls, told: dict[str, Any]) -> About:
+    def from_message(cls, told: dict[str, Any]) -> VariationInfo:
         """As an entry of ``variations`` in docs/tap.md tells it."""
         return cls(
             validation.text(told.get("problem"), 64),
-            validation.named(told.get("task")),
-            validation.named(told.get("adversary")),
+            validation.parameters(told.get("task")),
+            validation.parameters(told.get("adversary")),
         )
 
 
-_NOTHING = About("", {}, {})
+_NOTHING = VariationInfo("", {}, {})
 
 
-class Part:
+class PhaseReturns:
     """One phase of a variation: ICAA draws its adversary anew every round, and with it the optimum."""
 
     __slots__ = ("about", "name", "optimum", "quarantine", "returns")
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.about: About | None = None
+        self.about: VariationInfo | None = None
         self.optimum: float | None = None
         self.quarantine = ""
         """Why the run goes on without it; nothing may be known of it but that."""
         self.returns: dict[int, float] = {}
 
 
-class Curve:
+class VariationReturns:
     """One variation: what it is in each phase, and what was earned in it."""
 
     __slots__ = ("changed", "dirty", "lineage", "parts")
 
     def __init__(self) -> None:
-        self.parts: dict[Place, Part] = {}
+        self.parts: dict[Place, PhaseReturns] = {}
         """By stage and round, as they were heard of; a few."""
         self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_LINEAGE)
         self.changed = 0
         self.dirty = False
 
-    def part(self, identity: Identity) -> Part:
+    def part(self, identity: Identity) -> PhaseReturns:
         """Its part in that phase, from now on; of many, the one that was heard of first makes room."""
         phase = _phase(identity)
         if phase not in self.parts:
             if len(self.parts) >= _PHASES:
                 del self.parts[next(iter(self.parts))]
-            self.parts[phase] = Part(f"{identity.stage}/{identity.round}")
+            self.parts[phase] = PhaseReturns(f"{identity.stage}/{identity.round}")
         return self.parts[phase]
 
 
-class Curves:
+class VariationTable:
     """A bounded table of variations, named ``TASK/VARIATION``."""
 
     def __init__(self) -> None:
-        self._curves: dict[Place, Curve] = {}
+        self._curves: dict[Place, VariationReturns] = {}
         self._left_out: set[Place] = set()
         self._unsolved: OrderedDict[tuple[Place, Place], None] = OrderedDict()
         """Variations and phases whose optimum has still to be looked up."""
-        self._dirty: deque[Curve] = deque()
+        self._dirty: deque[VariationReturns] = deque()
         self._episodes: OrderedDict[Place, dict[str, Any]] = OrderedDict()
         self._next = 1
 
@@ -107,14 +107,14 @@ class Curves:
     def returned(self, told: dict[str, Any], worker: str, time: float) -> int:
         """Episodes of a variation ended: as in an entry of ``variations`` in docs/tap.md; how many."""
         identity = _of_variation(validation.text(told.get("identity"), 120))
-        trials = [validation.integer(trial, 0) for trial in validation.listed(told.get("trials"), _TOGETHER)]
+        trials = [validation.integer(trial, 0) for trial in validation.bounded_list(told.get("trials"), _TOGETHER)]
         returns = validation.numbers(told.get("returns"), _TOGETHER)
         if len(trials) != len(returns):
-            raise Odd("schema")
+            raise InvalidMessageError("schema")
         weights, digest = validation.integer(told.get("policy_version"), -1), validation.text(told.get("weights_digest"), 64)
         place, phase = (identity.task, identity.variation), _phase(identity)
         known = self._curves[place].parts.get(phase) if place in self._curves else None
-        about = known.about if known is not None and known.about is not None else About.of(told)
+        about = known.about if known is not None and known.about is not None else VariationInfo.from_message(told)
         curve = self._curve(place)
         part = curve.part(identity)
         if part.about is None:
@@ -130,17 +130,17 @@ class Curves:
         self._touch(curve)
         return len(trials)
 
-    def _curve(self, place: Place) -> Curve:
-        """That of a variation, from now on.  Raises Odd if there are too many."""
+    def _curve(self, place: Place) -> VariationReturns:
+        """That of a variation, from now on.  Raises InvalidMessageError if there are too many."""
         if place not in self._curves:
             if len(self._curves) >= VARIATIONS:
                 if len(self._left_out) < 16 * VARIATIONS:
                     self._left_out.add(place)
-                raise Odd("too many variations")
-            self._curves[place] = Curve()
+                raise InvalidMessageError("too many variations")
+            self._curves[place] = VariationReturns()
         return self._curves[place]
 
-    def _touch(self, curve: Curve) -> None:
+    def _touch(self, curve: VariationReturns) -> None:
         if not curve.dirty:
             curve.dirty = True
             self._dirty.append(curve)
@@ -164,7 +164,7 @@ class Curves:
             "identity": "/".join(map(str, identity)),
             "worker": validation.text(message.get("worker")),
             "episode_return": validation.number(message.get("episode_return")),
-            "time": validation.when(message.get("time")),
+            "time": validation.timestamp(message.get("time")),
         }
         self._episodes[place] = {**told, "drawing": drawing, "seq": self._next}
         if len(self._episodes) > _DRAWN:
@@ -211,7 +211,7 @@ class Curves:
 
 @functools.lru_cache(maxsize=VARIATIONS)
 def _of_variation(name: str) -> Identity:
-    """``STAGE/ROUND/TASK/VARIATION`` as the identity of its first trial.  Raises Odd for anything else."""
+    """``STAGE/ROUND/TASK/VARIATION`` as the identity of its first trial.  Raises InvalidMessageError for anything else."""
     return validation.identity(f"{name}/0")
 
 
@@ -226,7 +226,7 @@ def _phase(identity: Identity) -> Place:
     return STAGES.index(identity.stage), identity.round
 
 
-def _told(place: Place, curve: Curve) -> dict[str, Any]:
+def _told(place: Place, curve: VariationReturns) -> dict[str, Any]:
     parts = [part for _, part in sorted(curve.parts.items())]
     newest = parts[-1]
     about = newest.about or _NOTHING
@@ -243,7 +243,7 @@ def _told(place: Place, curve: Curve) -> dict[str, Any]:
     }
 
 
-def _part(part: Part) -> dict[str, Any]:
+def _part(part: PhaseReturns) -> dict[str, Any]:
     trials = sorted(part.returns)
     returns = [round(part.returns[trial], 4) for trial in trials]
     adversary = (part.about or _NOTHING).adversary
