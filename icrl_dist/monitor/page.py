@@ -18,7 +18,8 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from icrl_dist.monitor.feed import Feed
-from icrl_dist.monitor.serve import EventStream, application, serving
+from icrl_dist.monitor.event_stream import EventStream
+from icrl_dist.monitor.serve import application, serving
 
 _log = logging.getLogger(__name__)
 

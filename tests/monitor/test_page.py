@@ -1,4 +1,4 @@
-"""The page's server, without a browser: a whole picture first, then what has changed; details; recordings."""
+"""The server of the live view's page, without a browser: a full snapshot, then changes; single variations; recordings."""
 
 import asyncio
 import contextlib
@@ -9,10 +9,10 @@ from importlib import resources
 import pytest
 
 from icrl_dist.monitor import page as page_module
-from icrl_dist.monitor import serve
+from icrl_dist.monitor import event_stream, serve
 from icrl_dist.monitor.page import EVENT, SnapshotPublisher, showing
 from icrl_dist.monitor.serve import application, serving
-from tests.monitor.test_serve import Page, wait_for
+from tests.monitor.test_serve import PageClient, wait_for
 from tests.monitor.watched import Watched
 
 ASSETS = resources.files("icrl_dist.monitor") / "assets"
@@ -41,7 +41,7 @@ class View:
     """What a page that follows docs/monitor.md knows."""
 
     def __init__(self, page):
-        self.viewer, self.known, self.told = page.watch(), None, []
+        self.viewer, self.known, self.told = page.connect(), None, []
 
     def next(self):
         event, told = self.viewer.next()
@@ -58,7 +58,7 @@ class View:
 
     def close(self):
         self.viewer.connection.close()
-        self.viewer.answer.close()
+        self.viewer.response.close()
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def page(run):
     app = application("monitor.html", teller.stream, teller.command, routes)
     with contextlib.ExitStack() as stack:
         url = stack.enter_context(serving(app, teller.stream, "127.0.0.1", 0))
-        page = Page(url, teller.stream, None)
+        page = PageClient(url, teller.stream, None)
         page.tell = teller.tell
 
         def view():
@@ -168,7 +168,7 @@ def test_nothing_is_computed_for_nobody_and_who_returns_begins_anew(run, page):
 def test_what_cannot_be_told_is_logged_once_and_the_next_change_is_told(run, monkeypatch, caplog):
     monkeypatch.setattr(page_module, "PUSH_S", 0.01)
     with showing(run, "127.0.0.1", 0) as url:
-        view = View(Page(url, None, None))
+        view = View(PageClient(url, None, None))
         view.next()
         whole, asked = run.state.snapshot, []
         broken = lambda now, since=-1: asked.append(since) or {**whole(now, since), "time": float("nan")}  # noqa: E731
@@ -197,28 +197,31 @@ def test_what_is_forgotten_is_forgotten_by_all(run, page):
         assert told["since"] == -1 and told["variations"] == [] and told["epoch"] != view.told[0]["epoch"]
 
 
-def test_a_viewer_that_fell_behind_is_greeted_anew():
-    async def slow():
-        greetings = iter(range(10))
-        viewer = serve._Viewer(asyncio.get_running_loop(), lambda: ("picture", f"whole {next(greetings)}"))
-        heard = [await viewer.next()]
-        for number in range(serve.BEHIND):
-            viewer.put("picture", f"change {number}", False)
-        heard.append(await viewer.next())
-        for number in range(serve.BEHIND + 3):
-            viewer.put("picture", f"change {number}", False)
-        heard += [await viewer.next(), await viewer.next()]
-        return [[line[6:] for line in said.splitlines() if line.startswith("data: ")] for said in heard]
+def test_a_viewer_that_fell_behind_restarts_from_a_full_snapshot():
+    async def receive_late():
+        snapshots = iter(range(10))
+        viewer = event_stream._Viewer(asyncio.get_running_loop(), lambda: ("picture", f"full {next(snapshots)}"))
 
-    changes = [f"change {number}" for number in range(serve.BEHIND)]
-    # What comes after it fell behind may be told beside the whole: it changes nothing to hear it again.
-    assert asyncio.run(slow()) == [["whole 0"], changes, ["whole 1"], ["change 17", "change 18"]]
+        def put(count):
+            for number in range(count):
+                viewer.put("picture", event_stream._encoded("picture", f"change {number}"), False)
+
+        received = [await viewer.next()]
+        put(event_stream.MAX_BEHIND)
+        received.append(await viewer.next())
+        put(event_stream.MAX_BEHIND + 3)
+        received += [await viewer.next(), await viewer.next()]
+        return [[line[6:] for line in chunk.decode().splitlines() if line.startswith("data: ")] for chunk in received]
+
+    changes = [f"change {number}" for number in range(event_stream.MAX_BEHIND)]
+    # A change may be in the full snapshot and be sent after it again: applying it twice has no effect.
+    assert asyncio.run(receive_late()) == [["full 0"], changes, ["full 1"], ["change 17", "change 18"]]
 
 
 def test_a_variation_can_be_asked_for(run, page):
     run.returned("3/1", 0, 1.5)
     run.tick()
-    status, headers, body = page.ask("GET", "/variation/3/1")
+    status, headers, body = page.request("GET", "/variation/3/1")
     detail = json.loads(body)
     assert status == 200 and headers["content-type"] == "application/json"
     assert detail["adversary"] == {"kind": "uniform", "p": 0.5} and detail["episode"] is None
@@ -230,20 +233,20 @@ def test_a_variation_can_be_asked_for(run, page):
         "d" * 64,
     )
     for name in ("3/2", "3", "3/1/0", "a/b", "-3/1", "3/%31%2f..", "9" * 30 + "/0", "%C2%B2/0"):
-        assert page.ask("GET", f"/variation/{name}")[0] == 404, name
+        assert page.request("GET", f"/variation/{name}")[0] == 404, name
 
 
 def test_a_recording_is_stopped_hurried_and_wound(run, page):
-    assert page.order('{"paused": true}') == (
+    assert page.command('{"paused": true}') == (
         400,
         '{"error":"this run is on: only a recording can be stopped, hurried or wound"}',
     )
     run.recording = {"begin": 1.0, "end": 9.0, "at": 2.0, "speed": 10.0, "paused": False}
     orders = [{"paused": True}, {"speed": 2.5}, {"at": 4, "paused": False}]
     for order in orders:
-        assert page.order(json.dumps(order)) == (204, "")
+        assert page.command(json.dumps(order)) == (204, "")
     for bad in ({"paused": 1}, {"speed": "fast"}, {"speed": 0}, {"speed": True}, {"at": None}, {"at": -1}, {"stop": 1}):
-        status, text = page.order(json.dumps(bad))
+        status, text = page.command(json.dumps(bad))
         assert status == 400 and next(iter(bad)) in json.loads(text)["error"]
     assert run.controls == orders
     run.tick()
@@ -252,7 +255,7 @@ def test_a_recording_is_stopped_hurried_and_wound(run, page):
 
 def test_the_page_tells_by_itself_and_ends(run):
     with showing(run, "127.0.0.1", 0) as url:
-        view = View(Page(url, None, None))
+        view = View(PageClient(url, None, None))
         assert view.next()["since"] == -1
         run.tick()
         assert view.next()["since"] >= 0  # nobody called tell
@@ -262,7 +265,7 @@ def test_the_page_tells_by_itself_and_ends(run):
 
 
 def test_the_page_needs_nothing_but_what_is_served_and_no_markup_from_data(page):
-    status, headers, html = page.ask("GET", "/")
+    status, headers, html = page.request("GET", "/")
     text = html.decode()
     assert status == 200 and headers["content-type"].startswith("text/html")
     assert not re.search(r"<script(?![^>]*\bsrc=)|\bstyle=|<style|\bon\w+=|https?://", text)
@@ -273,7 +276,7 @@ def test_the_page_needs_nothing_but_what_is_served_and_no_markup_from_data(page)
         assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function", code), script.name
         wanted |= {f"/assets/{name}" for name in re.findall(r'from "\./([^"]+)"', code)}
     for path in wanted:
-        assert page.ask("GET", path)[0] == 200, path
+        assert page.request("GET", path)[0] == 200, path
     ids = set(re.findall(r'\bid="([^"]+)"', text))
     asked = {one for script in scripts for one in re.findall(r'byId\("([^"]+)"\)', script.read_text())}
     assert asked and asked <= ids

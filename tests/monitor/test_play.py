@@ -12,7 +12,7 @@ from icrl_dist.config.run import dumps, load, parse
 from icrl_dist.monitor import player
 from icrl_dist.monitor.play import HELD_S, PlayGame
 from icrl_dist.monitor.player import Player
-from icrl_dist.monitor.serve import EventStream
+from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.problems.darkroom.room import MOVES, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 
@@ -293,7 +293,7 @@ def test_nothing_moves_while_nobody_looks_on(run):
         (["here", "--pretrained", "darkroom"], "play: name a run folder"),
         (["--pretrained", "lightroom"], "no agent of that name is shipped; there are darkroom"),
         (["nowhere"], "nowhere: no such run folder or checkpoint"),
-        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port is 0 (any free one) to 65535"),
+        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port must be 0 (any free port) to 65535"),
         (["--pretrained", "darkroom", "--host", "nowhere.invalid"], "name an address of this machine"),
     ],
 )
