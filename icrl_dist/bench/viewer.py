@@ -48,7 +48,7 @@ def view(endpoint: str) -> None:
             sys.stdin.readline()
             ended.set()
             looking.join()
-            print(feed.state.heard, flush=True)
+            print(feed.state.received, flush=True)
 
 
 def crowd(streams: int, per_s: float) -> None:

@@ -42,7 +42,7 @@ class LiveFeed:
         """Subscribes to the monitor plane of ``run``, by default of whichever run is on at that endpoint."""
         self.state = RunState(run)
         self._ended = threading.Event()
-        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.state.hear(key, payload, time.time()))
+        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.state.receive(key, payload, time.time()))
         self._thread = threading.Thread(target=self._tick, name="picture", daemon=True)
         self._thread.start()
 
@@ -110,7 +110,7 @@ class ReplayFeed:
             if then - ticked >= 1.0:
                 ticked = then
                 self.state.tick(then)
-            self.state.hear(key, payload, then)
+            self.state.receive(key, payload, then)
             self._next = next(self._messages, None)
         self.state.tick(at)
 

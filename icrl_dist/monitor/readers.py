@@ -1,6 +1,6 @@
-"""Messages of the monitor plane, each read as a whole before any of it is believed.
+"""Parsers of monitor messages: each checks the whole message before the view uses any field of it.
 
-Every function raises InvalidMessageError for a message that is not what docs/tap.md says.
+Every function raises InvalidMessageError for a message that does not match docs/tap.md.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from icrl_dist.monitor import validation
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.types import STAGES
 
-EVENTS = 200
-"""Events that are remembered, and alerts that are on, at most."""
-_TOLD = 4096
-"""Phases, and alerts, of which a message tells, at most."""
+MAX_EVENTS = 200
+"""Limit on the events that are kept, and on the active alerts."""
+_MAX_ENTRIES = 4096
+"""Limit on the phases, and on the alerts, in one message."""
 _COUNTS = ("round", "step", "steps", "version", "trajectories", "workers", "lag")
 
 
 def progress(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``learner`` message: how far the run is, and when that was said."""
+    """Parse a ``learner`` message: the run's progress and the time of the message."""
     stage, phase, loss = (message.get(name) for name in ("stage", "phase", "loss"))
     if stage not in ("collect", "fit") or phase not in STAGES:
         raise InvalidMessageError("schema")
@@ -35,9 +35,9 @@ def progress(message: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def about(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``run`` message: what the run is about, and the alerts that are on; None where it does not say (a recording)."""
-    phases = [validation.bounded_list(phase, 3) for phase in validation.bounded_list(message.get("phases"), _TOLD)]
+def run_info(message: dict[str, Any]) -> dict[str, Any]:
+    """Parse a ``run`` message: method, problem, phases and active alerts; ``alerts`` is None if absent (a recording)."""
+    phases = [validation.bounded_list(phase, 3) for phase in validation.bounded_list(message.get("phases"), _MAX_ENTRIES)]
     alerts = message.get("alerts")
     return {
         **{name: validation.text(message.get(name), longest) for name, longest in (("method", 32), ("problem", 64))},
@@ -48,17 +48,17 @@ def about(message: dict[str, Any]) -> dict[str, Any]:
         ],
         "alerts": None
         if alerts is None
-        else [_alert(validation.mapping(one)) for one in validation.bounded_list(alerts, _TOLD)[:EVENTS]],
+        else [_alert(validation.mapping(one)) for one in validation.bounded_list(alerts, _MAX_ENTRIES)[:MAX_EVENTS]],
     }
 
 
-def _alert(told: dict[str, Any]) -> dict[str, Any]:
-    text = validation.text(told.get("text"), 500)
-    return {"name": validation.text(told.get("name")), "text": text, "since": validation.timestamp(told.get("since"))}
+def _alert(entry: dict[str, Any]) -> dict[str, Any]:
+    text = validation.text(entry.get("text"), 500)
+    return {"name": validation.text(entry.get("name")), "text": text, "since": validation.timestamp(entry.get("since"))}
 
 
 def event(message: dict[str, Any]) -> dict[str, Any]:
-    """Of an ``event`` message: what happened, and what belongs to events of that sort."""
+    """Parse an ``event`` message: its kind, text and time, and the fields of that kind of event."""
     what = validation.text(message.get("what"), 32)
     found = {"what": what, "text": validation.text(message.get("text"), 500), "time": validation.timestamp(message.get("time"))}
     if what == "worker":
@@ -73,16 +73,16 @@ def event(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def belief(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``belief`` message: where a worker's T_theta believes the goal to be."""
+    """Parse a ``belief`` message: the posterior over goals that T_theta implies on a worker, and the exact one."""
     size = validation.integer(message.get("size"), 2, 64)
     goal = [validation.integer(c, 0, size - 1) for c in validation.bounded_list(message.get("goal"), 2)]
-    laws = {name: validation.numbers(message.get(name), size * size) for name in ("implied", "exact")}
-    if any(len(law) != size * size for law in laws.values()) or len(goal) != 2:
+    distributions = {name: validation.numbers(message.get(name), size * size) for name in ("implied", "exact")}
+    if any(len(probs) != size * size for probs in distributions.values()) or len(goal) != 2:
         raise InvalidMessageError("schema")
     return {
         "worker": validation.text(message.get("worker")),
         "identity": str(validation.identity(message.get("identity"))),
         "size": size,
         "goal": goal,
-        **laws,
+        **distributions,
     }

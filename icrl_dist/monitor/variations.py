@@ -1,4 +1,4 @@
-"""Adaptation, variation by variation: returns over episodes, and some episodes to be drawn."""
+"""Returns of every variation over its episodes, and sampled episodes as drawings."""
 
 from __future__ import annotations
 
@@ -6,245 +6,250 @@ import functools
 from collections import OrderedDict, deque
 from typing import Any, NamedTuple
 
-from icrl_dist.monitor import drawing as sketch
+from icrl_dist.monitor import drawing as drawings
 from icrl_dist.monitor import validation
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.types import STAGES, Identity
 
-VARIATIONS = 4096
+MAX_VARIATIONS = 4096
 """Variations that are kept; further ones are only counted."""
-_EPISODES = 256
-"""Returns kept of a phase, a variation: of longer phases the newest."""
-_PHASES = 3
-"""Phases kept of a variation, the newest."""
-_LINEAGE = 32
-_TOGETHER = 4096
-"""Episodes of a variation that a message tells of, at most."""
-_DRAWN = 48
-"""Episodes kept to be drawn."""
-_OPTIMA = 4
-"""Optima computed a tick, at most: each takes some milliseconds."""
-_TOLD = 200
-"""Variations told of a tick, at most; the others follow in their turn."""
+_MAX_RETURNS = 256
+"""Returns kept for each phase of a variation, the newest."""
+_MAX_PHASES = 3
+"""Phases kept for each variation, the newest."""
+_MAX_LINEAGE = 32
+_MAX_ENTRIES = 4096
+"""Limit on the episodes of one variation in one message."""
+_MAX_DRAWINGS = 48
+_OPTIMA_PER_TICK = 4
+"""Each optimum takes some milliseconds to compute."""
+_CHANGES_PER_TICK = 200
+"""Limit on the variations that become part of one change; the remaining ones follow at later ticks."""
 
 
-Place = tuple[int, int]
-"""A variation, as task and variation; or a phase, as stage and round."""
+Pair = tuple[int, int]
+"""A variation as (task, variation), or a phase as (stage, round)."""
 
 
 class VariationInfo(NamedTuple):
-    """What a variation is in one phase."""
+    """Problem, task and adversary of a variation in one phase."""
 
     problem: str
     task: dict[str, Any]
     adversary: dict[str, Any]
 
     @classmethod
-    def from_message(cls, told: dict[str, Any]) -> VariationInfo:
-        """As an entry of ``variations`` in docs/tap.md tells it."""
+    def from_message(cls, entry: dict[str, Any]) -> VariationInfo:
+        """Parse an entry of ``variations`` (docs/tap.md).  Raises InvalidMessageError."""
         return cls(
-            validation.text(told.get("problem"), 64),
-            validation.parameters(told.get("task")),
-            validation.parameters(told.get("adversary")),
+            validation.text(entry.get("problem"), 64),
+            validation.parameters(entry.get("task")),
+            validation.parameters(entry.get("adversary")),
         )
 
 
-_NOTHING = VariationInfo("", {}, {})
+_UNKNOWN = VariationInfo("", {}, {})
 
 
 class PhaseReturns:
-    """One phase of a variation: ICAA draws its adversary anew every round, and with it the optimum."""
+    """One phase of a variation.  ICAA draws the adversary anew in every round, so the optimum differs by phase."""
 
-    __slots__ = ("about", "name", "optimum", "quarantine", "returns")
+    __slots__ = ("info", "name", "optimum", "quarantine", "returns")
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.about: VariationInfo | None = None
+        self.info: VariationInfo | None = None
         self.optimum: float | None = None
         self.quarantine = ""
-        """Why the run goes on without it; nothing may be known of it but that."""
+        """Why the variation was quarantined in this phase; may be set before any episode arrives."""
         self.returns: dict[int, float] = {}
 
 
 class VariationReturns:
-    """One variation: what it is in each phase, and what was earned in it."""
+    """The phases of one variation and the lineage of its newest episodes."""
 
-    __slots__ = ("changed", "dirty", "lineage", "parts")
+    __slots__ = ("changed", "dirty", "lineage", "phases")
 
     def __init__(self) -> None:
-        self.parts: dict[Place, PhaseReturns] = {}
-        """By stage and round, as they were heard of; a few."""
-        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_LINEAGE)
+        self.phases: dict[Pair, PhaseReturns] = {}
+        """By (stage, round), in order of arrival."""
+        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_MAX_LINEAGE)
         self.changed = 0
+        """``seq`` of the newest change that snapshots contain."""
         self.dirty = False
+        """Whether it changed since then."""
 
-    def part(self, identity: Identity) -> PhaseReturns:
-        """Its part in that phase, from now on; of many, the one that was heard of first makes room."""
-        phase = _phase(identity)
-        if phase not in self.parts:
-            if len(self.parts) >= _PHASES:
-                del self.parts[next(iter(self.parts))]
-            self.parts[phase] = PhaseReturns(f"{identity.stage}/{identity.round}")
-        return self.parts[phase]
+    def phase(self, identity: Identity) -> PhaseReturns:
+        """The phase of ``identity``, added if needed; beyond the limit the phase that arrived first is removed."""
+        key = _phase_key(identity)
+        if key not in self.phases:
+            if len(self.phases) >= _MAX_PHASES:
+                del self.phases[next(iter(self.phases))]
+            self.phases[key] = PhaseReturns(f"{identity.stage}/{identity.round}")
+        return self.phases[key]
 
 
 class VariationTable:
-    """A bounded table of variations, named ``TASK/VARIATION``."""
+    """A table of variations named ``TASK/VARIATION``, with a limit on their number."""
 
     def __init__(self) -> None:
-        self._curves: dict[Place, VariationReturns] = {}
-        self._left_out: set[Place] = set()
-        self._unsolved: OrderedDict[tuple[Place, Place], None] = OrderedDict()
-        """Variations and phases whose optimum has still to be looked up."""
+        self._variations: dict[Pair, VariationReturns] = {}
+        self._left_out: set[Pair] = set()
+        self._unsolved: OrderedDict[tuple[Pair, Pair], None] = OrderedDict()
+        """Variations and phases whose optimum is not computed yet."""
         self._dirty: deque[VariationReturns] = deque()
-        self._episodes: OrderedDict[Place, dict[str, Any]] = OrderedDict()
-        self._next = 1
+        self._episodes: OrderedDict[Pair, dict[str, Any]] = OrderedDict()
+        self._next_seq = 1
 
     def __len__(self) -> int:
-        """Variations that were heard of."""
-        return len(self._curves) + len(self._left_out)
+        """Number of variations in messages so far, those beyond the limit included."""
+        return len(self._variations) + len(self._left_out)
 
-    def returned(self, told: dict[str, Any], worker: str, time: float) -> int:
-        """Episodes of a variation ended: as in an entry of ``variations`` in docs/tap.md; how many."""
-        identity = _of_variation(validation.text(told.get("identity"), 120))
-        trials = [validation.integer(trial, 0) for trial in validation.bounded_list(told.get("trials"), _TOGETHER)]
-        returns = validation.numbers(told.get("returns"), _TOGETHER)
+    def add_returns(self, entry: dict[str, Any], worker: str, time: float) -> int:
+        """Add the finished episodes of an entry of ``variations`` (docs/tap.md); returns their number.
+
+        Raises InvalidMessageError.
+        """
+        identity = _first_identity(validation.text(entry.get("identity"), 120))
+        trials = [validation.integer(trial, 0) for trial in validation.bounded_list(entry.get("trials"), _MAX_ENTRIES)]
+        returns = validation.numbers(entry.get("returns"), _MAX_ENTRIES)
         if len(trials) != len(returns):
             raise InvalidMessageError("schema")
-        weights, digest = validation.integer(told.get("policy_version"), -1), validation.text(told.get("weights_digest"), 64)
-        place, phase = (identity.task, identity.variation), _phase(identity)
-        known = self._curves[place].parts.get(phase) if place in self._curves else None
-        about = known.about if known is not None and known.about is not None else VariationInfo.from_message(told)
-        curve = self._curve(place)
-        part = curve.part(identity)
-        if part.about is None:
-            part.about = about
-            self._unsolved[place, phase] = None
-            if len(self._unsolved) > _PHASES * VARIATIONS:
+        version, digest = validation.integer(entry.get("policy_version"), -1), validation.text(entry.get("weights_digest"), 64)
+        key, phase_key = (identity.task, identity.variation), _phase_key(identity)
+        known = self._variations[key].phases.get(phase_key) if key in self._variations else None
+        info = known.info if known is not None and known.info is not None else VariationInfo.from_message(entry)
+        variation = self._variation(key)
+        phase = variation.phase(identity)
+        if phase.info is None:
+            phase.info = info
+            self._unsolved[key, phase_key] = None
+            if len(self._unsolved) > _MAX_PHASES * MAX_VARIATIONS:
                 self._unsolved.popitem(last=False)
-        for trial, earned in zip(trials, returns, strict=True):
-            part.returns[trial] = earned
-            curve.lineage.append((part.name, trial, earned, weights, digest, worker, time))
-        for _ in range(len(part.returns) - _EPISODES):
-            del part.returns[min(part.returns)]
-        self._touch(curve)
+        for trial, episode_return in zip(trials, returns, strict=True):
+            phase.returns[trial] = episode_return
+            variation.lineage.append((phase.name, trial, episode_return, version, digest, worker, time))
+        for _ in range(len(phase.returns) - _MAX_RETURNS):
+            del phase.returns[min(phase.returns)]
+        self._mark_dirty(variation)
         return len(trials)
 
-    def _curve(self, place: Place) -> VariationReturns:
-        """That of a variation, from now on.  Raises InvalidMessageError if there are too many."""
-        if place not in self._curves:
-            if len(self._curves) >= VARIATIONS:
-                if len(self._left_out) < 16 * VARIATIONS:
-                    self._left_out.add(place)
+    def _variation(self, key: Pair) -> VariationReturns:
+        """The variation ``key``, added if needed.  Raises InvalidMessageError beyond the limit."""
+        if key not in self._variations:
+            if len(self._variations) >= MAX_VARIATIONS:
+                if len(self._left_out) < 16 * MAX_VARIATIONS:
+                    self._left_out.add(key)
                 raise InvalidMessageError("too many variations")
-            self._curves[place] = VariationReturns()
-        return self._curves[place]
+            self._variations[key] = VariationReturns()
+        return self._variations[key]
 
-    def _touch(self, curve: VariationReturns) -> None:
-        if not curve.dirty:
-            curve.dirty = True
-            self._dirty.append(curve)
+    def _mark_dirty(self, variation: VariationReturns) -> None:
+        if not variation.dirty:
+            variation.dirty = True
+            self._dirty.append(variation)
 
-    def quarantined(self, identity: Identity, cause: str) -> None:
-        """In that phase the run goes on without the variation of which this is a trial, and which it may never have begun.
+    def set_quarantine(self, identity: Identity, cause: str) -> None:
+        """Record why a variation is quarantined in a phase; an empty ``cause`` ends the quarantine.
 
-        Without a ``cause`` it goes on with it after all.
+        ``identity`` is any trial of it, which may never have started.  Raises InvalidMessageError.
         """
-        curve = self._curve((identity.task, identity.variation))
-        curve.part(identity).quarantine = cause
-        self._touch(curve)
+        variation = self._variation((identity.task, identity.variation))
+        variation.phase(identity).quarantine = cause
+        self._mark_dirty(variation)
 
-    def drawn(self, identity: Identity, message: dict[str, Any]) -> None:
-        """An episode to be drawn; of a variation the newest is kept."""
-        place = identity.task, identity.variation
-        drawing = sketch.of(message)
-        self._episodes.pop(place, None)
-        told = {
-            "name": f"{place[0]}/{place[1]}",
+    def add_episode(self, identity: Identity, message: dict[str, Any]) -> None:
+        """Add an ``episode`` message as a drawing; the newest of each variation is kept.  Raises InvalidMessageError."""
+        key = identity.task, identity.variation
+        drawing = drawings.of(message)
+        self._episodes.pop(key, None)
+        fields = {
+            "name": f"{key[0]}/{key[1]}",
             "identity": "/".join(map(str, identity)),
             "worker": validation.text(message.get("worker")),
             "episode_return": validation.number(message.get("episode_return")),
             "time": validation.timestamp(message.get("time")),
         }
-        self._episodes[place] = {**told, "drawing": drawing, "seq": self._next}
-        if len(self._episodes) > _DRAWN:
+        self._episodes[key] = {**fields, "drawing": drawing, "seq": self._next_seq}
+        if len(self._episodes) > _MAX_DRAWINGS:
             self._episodes.popitem(last=False)
 
     def tick(self, seq: int) -> None:
-        """Look up some optima, and let some of what has changed be told as of ``seq``."""
-        self._next = seq + 1
-        for _ in range(min(_OPTIMA, len(self._unsolved))):
-            (place, phase), _ = self._unsolved.popitem(last=False)
-            curve = self._curves[place]
-            part = curve.parts.get(phase)
-            if part is not None and part.about is not None:
-                part.optimum = sketch.optimum(*part.about)
-                if part.optimum is not None:
-                    self._touch(curve)
-        for _ in range(min(_TOLD, len(self._dirty))):
-            curve = self._dirty.popleft()
-            curve.dirty, curve.changed = False, seq
+        """Compute some optima, and make some changes visible to snapshots as of ``seq``."""
+        self._next_seq = seq + 1
+        for _ in range(min(_OPTIMA_PER_TICK, len(self._unsolved))):
+            (key, phase_key), _ = self._unsolved.popitem(last=False)
+            variation = self._variations[key]
+            phase = variation.phases.get(phase_key)
+            if phase is not None and phase.info is not None:
+                phase.optimum = drawings.optimum(*phase.info)
+                if phase.optimum is not None:
+                    self._mark_dirty(variation)
+        for _ in range(min(_CHANGES_PER_TICK, len(self._dirty))):
+            variation = self._dirty.popleft()
+            variation.dirty, variation.changed = False, seq
 
     def changed(self, since: int) -> tuple[list[dict[str, Any]], int]:
-        """The variations that changed after ``since``, and how many were left out for want of room."""
-        return [_told(place, c) for place, c in sorted(self._curves.items()) if c.changed > since], len(self._left_out)
+        """Rows of the variations that changed after ``since``, and the number of variations beyond the limit."""
+        rows = [_row(key, variation) for key, variation in sorted(self._variations.items()) if variation.changed > since]
+        return rows, len(self._left_out)
 
     def episodes(self, since: int) -> list[dict[str, Any]]:
-        """Episodes to be drawn that came after ``since``, the oldest first."""
+        """Drawn episodes that arrived after ``since``, oldest first."""
         return [episode for episode in self._episodes.values() if episode["seq"] > since]
 
     def detail(self, name: str) -> dict[str, Any] | None:
-        """All that is kept of a variation."""
+        """Everything kept of a variation: its row, lineage and newest episode; None if it is unknown."""
         task, _, variation = name.partition("/")
         if not (task.isascii() and task.isdigit() and variation.isascii() and variation.isdigit() and len(name) < 24):
             return None
-        place = int(task), int(variation)
-        curve = self._curves.get(place)
-        if curve is None:
+        key = int(task), int(variation)
+        found = self._variations.get(key)
+        if found is None:
             return None
         return {
-            **_told(place, curve),
-            "lineage": [_origin(place, *one) for one in curve.lineage],
-            "episode": self._episodes.get(place),
+            **_row(key, found),
+            "lineage": [_lineage_entry(key, *entry) for entry in found.lineage],
+            "episode": self._episodes.get(key),
         }
 
 
-@functools.lru_cache(maxsize=VARIATIONS)
-def _of_variation(name: str) -> Identity:
-    """``STAGE/ROUND/TASK/VARIATION`` as the identity of its first trial.  Raises InvalidMessageError for anything else."""
+@functools.lru_cache(maxsize=MAX_VARIATIONS)
+def _first_identity(name: str) -> Identity:
+    """Identity of the first trial of ``STAGE/ROUND/TASK/VARIATION``.  Raises InvalidMessageError."""
     return validation.identity(f"{name}/0")
 
 
-def _origin(
-    place: Place, phase: str, trial: int, earned: float, weights: int, digest: str, worker: str, time: float
+def _lineage_entry(
+    key: Pair, phase: str, trial: int, episode_return: float, version: int, digest: str, worker: str, time: float
 ) -> dict[str, Any]:
-    said = {"policy_version": weights, "weights_digest": digest, "worker": worker, "time": time}
-    return {"identity": f"{phase}/{place[0]}/{place[1]}/{trial}", "episode_return": earned, **said}
+    origin = {"policy_version": version, "weights_digest": digest, "worker": worker, "time": time}
+    return {"identity": f"{phase}/{key[0]}/{key[1]}/{trial}", "episode_return": episode_return, **origin}
 
 
-def _phase(identity: Identity) -> Place:
+def _phase_key(identity: Identity) -> Pair:
     return STAGES.index(identity.stage), identity.round
 
 
-def _told(place: Place, curve: VariationReturns) -> dict[str, Any]:
-    parts = [part for _, part in sorted(curve.parts.items())]
-    newest = parts[-1]
-    about = newest.about or _NOTHING
+def _row(key: Pair, variation: VariationReturns) -> dict[str, Any]:
+    phases = [phase for _, phase in sorted(variation.phases.items())]
+    newest = phases[-1]
+    info = newest.info or _UNKNOWN
     return {
-        "name": f"{place[0]}/{place[1]}",
-        "task": place[0],
-        "variation": place[1],
-        "problem": about.problem,
-        "parameters": about.task,
-        "adversary": about.adversary,
+        "name": f"{key[0]}/{key[1]}",
+        "task": key[0],
+        "variation": key[1],
+        "problem": info.problem,
+        "parameters": info.task,
+        "adversary": info.adversary,
         "optimum": newest.optimum,
         "quarantine": newest.quarantine,
-        "phases": [_part(part) for part in parts],
+        "phases": [_phase_row(phase) for phase in phases],
     }
 
 
-def _part(part: PhaseReturns) -> dict[str, Any]:
-    trials = sorted(part.returns)
-    returns = [round(part.returns[trial], 4) for trial in trials]
-    adversary = (part.about or _NOTHING).adversary
-    return {"name": part.name, "adversary": adversary, "optimum": part.optimum, "trials": trials, "returns": returns}
+def _phase_row(phase: PhaseReturns) -> dict[str, Any]:
+    trials = sorted(phase.returns)
+    returns = [round(phase.returns[trial], 4) for trial in trials]
+    adversary = (phase.info or _UNKNOWN).adversary
+    return {"name": phase.name, "adversary": adversary, "optimum": phase.optimum, "trials": trials, "returns": returns}

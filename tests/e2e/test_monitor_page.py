@@ -203,13 +203,13 @@ def test_hostile_messages_are_text_or_nothing(page):
 
 
 def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkeypatch):
-    monkeypatch.setattr(variations, "VARIATIONS", 700)
+    monkeypatch.setattr(variations, "MAX_VARIATIONS", 700)
     page.forgiven = r"ERR_(CONNECTION_REFUSED|INCOMPLETE_CHUNKED_ENCODING|CONNECTION_RESET|EMPTY_RESPONSE)"
     with plane() as run:
         run.progress()
         for number in range(1000):  # at once: a link would drop some
             payload = run.told(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
-            run.feed.state.hear("icrl/a-run/mon/trajectories/w0", payload, time.time())
+            run.feed.state.receive("icrl/a-run/mon/trajectories/w0", payload, time.time())
         with showing(run.feed, "127.0.0.1", 0) as url:
             page.goto(url)
             until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")

@@ -62,4 +62,4 @@ def event(what, text, **changes):
 
 def hear(picture, topic, payload, now=0.0, run="demo"):
     """Tell a picture."""
-    picture.hear(f"icrl/{run}/mon/{topic}", payload, now)
+    picture.receive(f"icrl/{run}/mon/{topic}", payload, now)

@@ -49,7 +49,7 @@ def played(folder):
     picture = RunState()
     recording = Recording(folder)
     for now, key, payload in recording.messages():
-        picture.hear(key, payload, now)
+        picture.receive(key, payload, now)
     picture.tick(recording.end)
     recording.close()
     return picture, recording
@@ -59,7 +59,7 @@ def test_it_ends_in_the_picture_that_was_seen_live(watched):
     folder, heard = watched
     live = RunState(folder.name)
     for key, payload in heard:
-        live.hear(key, payload, 0.0)
+        live.receive(key, payload, 0.0)
     live.tick(0.0)
     again, recording = played(folder)
     assert not live.ignored and not again.ignored
@@ -142,7 +142,7 @@ def test_a_live_feed_hears_what_is_published(hub):
         while name_in(feed.state) != "demo":
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        assert feed.replay() is None and other.state.heard == 0
+        assert feed.replay() is None and other.state.received == 0
         feed.control(speed=2.0, paused=True, at=0.0)
 
 

@@ -121,7 +121,7 @@ def test_a_later_snapshot_has_only_what_changed():
 
 
 def test_every_change_is_told_of_however_many_there_are(monkeypatch):
-    monkeypatch.setattr(variations, "_TOLD", 3)
+    monkeypatch.setattr(variations, "_CHANGES_PER_TICK", 3)
     picture, told, since = RunState("demo"), [], -1
     picture.tick(0.0)
     since = picture.snapshot(0.0)["seq"]
@@ -163,8 +163,8 @@ def test_a_recording_that_stands_still_grows_nothing_and_rates_go_on_from_there(
     for _ in range(1000):
         picture.tick(4.0)
     picture.tick(3.5)  # a clock is set back
-    (row,) = picture._staff._rows.values()
-    assert len(row.marks) < 8
+    (row,) = picture._workers._workers.values()
+    assert len(row.history) < 8
     assert picture.snapshot(4.0)["workers"][0]["steps_per_s"] == pytest.approx(100.0, rel=0.3)
 
 
@@ -219,7 +219,7 @@ def test_the_time_left_is_that_of_the_stage_the_fit_and_the_phases_to_come():
 
     def at(now, **where):
         run = {"stage": "collect", "phase": "adapt", "round": 0, "steps": 100, "trajectories": 0} | where
-        pace.progress(run, now)
+        pace.update(run, now)
         return pace.eta_s(run)
 
     assert at(0.0, phase="pretrain", step=0) is None
@@ -280,10 +280,10 @@ def test_the_alerts_that_are_on_are_those_the_learner_repeats():
 
 
 def test_memory_is_bounded_whatever_comes(monkeypatch):
-    monkeypatch.setattr(variations, "VARIATIONS", 5)
-    monkeypatch.setattr(variations, "_EPISODES", 12)
-    monkeypatch.setattr(variations, "_OPTIMA", 0)
-    monkeypatch.setattr(workers, "_MOST", 3)
+    monkeypatch.setattr(variations, "MAX_VARIATIONS", 5)
+    monkeypatch.setattr(variations, "_MAX_RETURNS", 12)
+    monkeypatch.setattr(variations, "_OPTIMA_PER_TICK", 0)
+    monkeypatch.setattr(workers, "_MAX_WORKERS", 3)
     picture = RunState("demo")
     for n in range(300):
         watch(picture, trajectory(f"adapt/0/{n % 9}/0/{n}"))
@@ -291,7 +291,7 @@ def test_memory_is_bounded_whatever_comes(monkeypatch):
         hear(picture, "event", event("note", f"{n}"))
     for n in range(20):
         watch(picture, *(trajectory(f"adapt/{n}/0/0/{m}") for m in range(15)))
-    assert len(picture._curves._unsolved) == 5 * 3
+    assert len(picture._variations._unsolved) == 5 * 3
     picture.tick(1.0)
     shown = picture.snapshot(1.0)
     assert (len(shown["variations"]), shown["variation_count"], shown["variations_left_out"]) == (5, 9, 4)
@@ -391,7 +391,7 @@ def test_no_field_of_any_message_can_break_it(kind):
     picture.tick(1.0)
     text = json.dumps(picture.snapshot(1.0), allow_nan=False)
     assert "\\u001b" not in text and sum(picture.ignored.values()) > len(ODD)
-    assert picture.heard > sum(picture.ignored.values()), "some were taken in"
+    assert picture.received > sum(picture.ignored.values()), "some were taken in"
 
 
 IMPOSSIBLE = [
@@ -433,10 +433,10 @@ def test_where_a_law_makes_no_numbers_nobody_knows_the_optimum(alpha):
 @given(st.binary(max_size=200), st.text(max_size=20))
 def test_no_bytes_can_break_it(payload, topic):
     picture = RunState("demo")
-    picture.hear(f"icrl/{topic}/mon/x", payload, 0.0)
-    picture.hear(topic, payload, 0.0)
+    picture.receive(f"icrl/{topic}/mon/x", payload, 0.0)
+    picture.receive(topic, payload, 0.0)
     picture.tick(1.0)
-    assert sum(picture.ignored.values()) == picture.heard == 2
+    assert sum(picture.ignored.values()) == picture.received == 2
 
 
 def test_a_huge_message_is_left_out():

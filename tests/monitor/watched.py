@@ -70,7 +70,7 @@ class Watched:
 
     def say(self, kind, topic=None, **fields):
         payload = wire.encode_message(kind, time=self.time, **fields)
-        self.state.hear(f"icrl/demo/mon/{topic or kind}", payload, self.time)
+        self.state.receive(f"icrl/demo/mon/{topic or kind}", payload, self.time)
 
     def about(self):
         phases = [["pretrain", 0, 100], ["adapt", 0, 50]]
@@ -95,10 +95,10 @@ class Watched:
         self.say("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
 
     def store(self, trajectory):
-        self.state.hear("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
+        self.state.receive("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
 
     def draw(self, trajectory):
-        self.state.hear("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
+        self.state.receive("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
 
     def busy(self):
         """Four tasks of two variations, two workers."""
