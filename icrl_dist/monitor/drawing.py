@@ -1,11 +1,11 @@
-"""Sampled episodes as drawings of few numbers, and what is exactly known of a variation.
+"""Converts episodes to drawings of few numbers, and computes the optimum of a variation where that is possible.
 
 A drawing is one of
 
-- ``room``: ``size``, ``goal``, ``path`` (the cells, one more than steps), ``overridden`` (a step each);
-- ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in metres, ``frame_s`` seconds apart, and
-  ``force`` (0 to 1 a frame);
-- ``paths``: ``paths``, named lists of points seen from above in metres, and ``goal``.
+- ``room``: ``size``, ``goal``, ``path`` (cells, one more than steps), ``overridden`` (one flag a step);
+- ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in meters, ``frame_s`` seconds apart, and
+  ``force`` (0 to 1, one value a frame);
+- ``paths``: ``paths``, named lists of points from above in meters, and ``goal``.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from icrl_dist.stream import validation as strict
 from icrl_dist.types import Adversary, Task, Variation
 
 _LARGEST_ROOM, _LONGEST = 32, 1000
-"""Of larger rooms and longer episodes the optimum is not computed."""
+"""Size and horizon up to which the optimum is computed."""
 _HAND, _OBJECT = slice(0, 2), slice(4, 6)
-"""Where Meta-World's observation has x and y of hand and object."""
+"""Components of Meta-World's observation with x and y of hand and object."""
 
 
 def of(message: dict[str, Any]) -> dict[str, Any]:
-    """The drawing of an ``episode`` message.  Raises InvalidMessageError for one that is not what docs/tap.md says."""
+    """The drawing of an ``episode`` message.  Raises InvalidMessageError if it does not match docs/tap.md."""
     kind = validation.text(message.get("problem"), 64)
     try:
         states = strict.to_array("observations", message.get("observations"), ("<f4",), 2)
@@ -78,8 +78,8 @@ def _rounded(values: np.ndarray) -> list[float]:
 
 
 def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> float | None:
-    """The optimal undiscounted return of a Dark Room variation, over its start cells; None where nobody knows it
-    or what was told makes no finite number."""
+    """The optimal undiscounted return of a Dark Room variation, its mean over start cells; None for other problems,
+    for large rooms, and for parameters that are invalid or give no finite number."""
     size, horizon = task.get("size"), task.get("horizon")
     if problem != "darkroom" or not isinstance(size, int) or not isinstance(horizon, int):
         return None
@@ -95,7 +95,7 @@ def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> fl
         best = float(values.mean() if start == "random" else values[int(start[0]) * size + int(start[1])])
         return best if math.isfinite(best) else None
     except (ValueError, KeyError, TypeError, IndexError, ArithmeticError):
-        return None  # it comes from a message, and is no room
+        return None  # the parameters come from an untrusted message
 
 
 def _value(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What is opened over the terminal view: a variation, and what the keys do."""
+"""Screens that open over the terminal view: one variation, and the help."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from icrl_dist.monitor.lines import ACCENT, DIM, PLAIN, TITLE, Line, Scroll
 from icrl_dist.monitor.panes import Header, Keys
 
 KEYS = (
-    ("q, Ctrl-C", "leave; the run goes on"),
+    ("q, Ctrl-C", "quit the view; the run continues"),
     ("Tab, Shift-Tab, 1 to 4", "variations, workers, rates, events"),
     ("↑ ↓ PgUp PgDn Home End", "move (j and k too)"),
-    ("Enter", "open a variation; [ and ] go to its neighbours"),
-    ("s, S", "sort by the next column; the other way round"),
+    ("Enter", "open a variation; [ and ] open the previous and the next one"),
+    ("s, S", "sort by the next column; reverse the order"),
     ("/", "filter: task 3, task 3/1, dirichlet, quarantined, any words"),
-    ("Esc", "all rows again; back"),
-    ("p, Space", "freeze what is shown, the run goes on; in a recording, pause"),
-    ("+ -", "a recording at twice or half the speed"),
-    ("← →", "a twentieth of the recording back or on"),
+    ("Esc", "remove the filter; back"),
+    ("p, Space", "freeze the view, the run continues; in a recording, pause"),
+    ("+ -", "double or halve the speed of a recording"),
+    ("← →", "seek back or forward by a twentieth of the recording"),
 )
 
 HELP: list[Line] = [
     [(" KEYS", TITLE)],
     *([(f" {key:<24}", ACCENT), (does, PLAIN)] for key, does in KEYS),
     [],
-    [(" The view reads the monitor plane only: it can slow nobody down, and what it misses is", DIM)],
-    [(" missing here, never from the run.  docs/monitor.md says what everything means.", DIM)],
+    [(" The view only reads monitor messages: it cannot slow the run, and a message that is", DIM)],
+    [(" lost on the way is missing here, never in the run.  See docs/monitor.md.", DIM)],
 ]
 
 
 class Overlay(screen.Screen[None]):
-    """Something read from top to bottom, over the view."""
+    """A scrollable text over the view."""
 
     def compose(self) -> Iterator[Widget]:
         yield Header("header")
@@ -45,14 +45,14 @@ class Overlay(screen.Screen[None]):
 
 
 class Detail(Overlay):
-    """One variation."""
+    """The details of one variation."""
 
     def __init__(self, variation: str) -> None:
         super().__init__()
         self.variation = variation
         self.filled = ""
-        """The one whose figures are shown; while the view is frozen, as they were when it was first asked for."""
+        """The variation whose text is shown now; while the view is frozen, the text is not updated."""
 
 
 class Help(Overlay):
-    """What the keys do."""
+    """The list of keys."""

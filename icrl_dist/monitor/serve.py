@@ -32,7 +32,13 @@ MAX_BODY = 4096
 """Bytes of a command."""
 _LOCAL_NAMES = {"127.0.0.1", "localhost", "::1"}
 _ASSETS = resources.files("icrl_dist.monitor") / "assets"
-_MEDIA_TYPES = {"css": "text/css", "html": "text/html", "js": "text/javascript", "svg": "image/svg+xml", "LICENSE": "text/plain"}
+_MEDIA_TYPES = {
+    "css": "text/css",
+    "html": "text/html",
+    "js": "text/javascript",
+    "svg": "image/svg+xml",
+    "LICENSE": "text/plain",
+}
 _HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "

@@ -14,7 +14,7 @@ import pytest
 from icrl_dist.monitor import variations
 from icrl_dist.monitor.drawing import optimum
 from icrl_dist.monitor.feed import LiveFeed
-from icrl_dist.monitor.page import showing
+from icrl_dist.monitor.page import serving_run
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
@@ -103,7 +103,7 @@ def plane(name="a-run"):
 @contextlib.contextmanager
 def shown(page, feed):
     """The page's URL; the page is left before its server goes, of which it would complain."""
-    with showing(feed, "127.0.0.1", 0) as url:
+    with serving_run(feed, "127.0.0.1", 0) as url:
         yield url
         assert page.evaluate("window.__pwned") is None
         page.goto("about:blank")
@@ -210,7 +210,7 @@ def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkey
         for number in range(1000):  # at once: a link would drop some
             payload = run.told(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
             run.feed.state.receive("icrl/a-run/mon/trajectories/w0", payload, time.time())
-        with showing(run.feed, "127.0.0.1", 0) as url:
+        with serving_run(run.feed, "127.0.0.1", 0) as url:
             page.goto(url)
             until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")
             words = page.locator("#variation-more").inner_text()
@@ -222,7 +222,7 @@ def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkey
             assert page.locator("#variation-table tbody tr").count() == 200
         until(page, f"!({CLEAR})")
         run.returned("0/0", 1, 1000.0, problem="unknown")
-        with showing(run.feed, "127.0.0.1", int(url.rstrip("/").rpartition(":")[2])):
+        with serving_run(run.feed, "127.0.0.1", int(url.rstrip("/").rpartition(":")[2])):
             until(page, CLEAR)
             until(page, "document.querySelector('#variation-table tbody th').textContent === '0/0'")
 

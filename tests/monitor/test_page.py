@@ -10,15 +10,15 @@ import pytest
 
 from icrl_dist.monitor import page as page_module
 from icrl_dist.monitor import event_stream, serve
-from icrl_dist.monitor.page import EVENT, SnapshotPublisher, showing
+from icrl_dist.monitor.page import EVENT, SnapshotPublisher, serving_run
 from icrl_dist.monitor.serve import application, serving
 from tests.monitor.test_serve import PageClient, wait_for
-from tests.monitor.watched import Watched
+from tests.monitor.fake_feed import FakeFeed
 
 ASSETS = resources.files("icrl_dist.monitor") / "assets"
 
 
-class Run(Watched):
+class Run(FakeFeed):
     """A feed that remembers since when pictures were asked for; ``tick`` is what the page's thread does."""
 
     def __init__(self):
@@ -31,7 +31,7 @@ class Run(Watched):
         named = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
         columns = {"trials": [trial], "returns": [earned], "steps": [8], "policy_version": 0, "weights_digest": "d" * 64}
         told = {"identity": f"adapt/0/{variation}", "problem": "darkroom", **named, **columns}
-        self.say("trajectories", worker="w0", variations=[told])
+        self.send("trajectories", worker="w0", variations=[told])
 
     def tick(self):
         self.pass_time(0.25)
@@ -68,13 +68,13 @@ def run():
 
 @pytest.fixture
 def page(run):
-    teller = SnapshotPublisher(run)
-    routes = [serve.Route("/variation/{task}/{variation}", teller.variation)]
-    app = application("monitor.html", teller.stream, teller.command, routes)
+    publisher = SnapshotPublisher(run)
+    routes = [serve.Route("/variation/{task}/{variation}", publisher.variation)]
+    app = application("monitor.html", publisher.stream, publisher.command, routes)
     with contextlib.ExitStack() as stack:
-        url = stack.enter_context(serving(app, teller.stream, "127.0.0.1", 0))
-        page = PageClient(url, teller.stream, None)
-        page.tell = teller.tell
+        url = stack.enter_context(serving(app, publisher.stream, "127.0.0.1", 0))
+        page = PageClient(url, publisher.stream, None)
+        page.publish = publisher.publish
 
         def view():
             views = page.stream.viewers
@@ -90,16 +90,16 @@ def page(run):
 def test_a_viewer_is_told_the_whole_and_then_only_what_changed(run, page):
     run.returned("0/0", 0, 1.0)
     run.returned("0/1", 0, 2.0)
-    run.say("event", what="version", text="T^0 is fitted", version=0)
+    run.send("event", what="version", text="T^0 is fitted", version=0)
     run.tick()
     view = page.view()
     whole = view.next()
     assert whole["since"] == -1 and whole["replay"] is None
     assert [row["name"] for row in whole["variations"]] == ["0/0", "0/1"] and len(whole["events"]) == 1
     run.returned("0/1", 1, 3.0)
-    run.say("event", what="version", text="T^1 is fitted", version=1)
+    run.send("event", what="version", text="T^1 is fitted", version=1)
     run.tick()
-    page.tell()
+    page.publish()
     delta = view.next()
     assert (delta["since"], delta["seq"]) == (whole["seq"], whole["seq"] + 1)
     assert [event["text"] for event in delta["events"]] == ["T^1 is fitted"]
@@ -107,7 +107,7 @@ def test_a_viewer_is_told_the_whole_and_then_only_what_changed(run, page):
     (phase,) = delta["variations"][-1]["phases"]
     assert (phase["name"], phase["trials"], phase["returns"]) == ("adapt/0", [0, 1], [2.0, 3.0])
     run.tick()
-    page.tell()
+    page.publish()
     assert not view.next()["variations"]
 
 
@@ -119,14 +119,14 @@ def test_all_viewers_know_the_same_whenever_they_came(run, page):
     for trial in range(1, 5):
         run.returned("0/0", trial, float(trial))
         run.tick()
-        page.tell()
+        page.publish()
     for _ in range(4):
         first.next()
     late = page.view()
     late.next()
     run.returned("1/0", 0, 9.0)
     run.tick()
-    page.tell()
+    page.publish()
     first.next()
     late.next()
     run.snapshots.clear()
@@ -141,24 +141,24 @@ def test_a_tick_is_computed_once_for_all(run, page):
         assert view.next()["since"] == -1
     assert run.snapshots == [-1]
     run.tick()
-    page.tell()
+    page.publish()
     told = [view.next() for view in views]
     assert told[0] == told[1] == told[2] and run.snapshots == [-1, told[0]["since"]]
 
 
 def test_nothing_is_computed_for_nobody_and_who_returns_begins_anew(run, page):
     run.tick()
-    page.tell()
+    page.publish()
     assert run.snapshots == []
     first = page.view()
     before = first.next()
     first.close()
     # A lost viewer is noticed when it is told something.
-    wait_for(lambda: (run.tick(), page.tell(), page.stream.viewers == 0)[-1])
+    wait_for(lambda: (run.tick(), page.publish(), page.stream.viewers == 0)[-1])
     run.snapshots.clear()
     run.returned("0/0", 0, 1.0)
     run.tick()
-    page.tell()
+    page.publish()
     assert run.snapshots == []
     again = page.view()
     whole = again.next()
@@ -167,13 +167,13 @@ def test_nothing_is_computed_for_nobody_and_who_returns_begins_anew(run, page):
 
 def test_what_cannot_be_told_is_logged_once_and_the_next_change_is_told(run, monkeypatch, caplog):
     monkeypatch.setattr(page_module, "PUSH_S", 0.01)
-    with showing(run, "127.0.0.1", 0) as url:
+    with serving_run(run, "127.0.0.1", 0) as url:
         view = View(PageClient(url, None, None))
         view.next()
         whole, asked = run.state.snapshot, []
         broken = lambda now, since=-1: asked.append(since) or {**whole(now, since), "time": float("nan")}  # noqa: E731
         monkeypatch.setattr(run.state, "snapshot", broken)
-        run.say("event", what="note", text="told in the end")
+        run.send("event", what="note", text="told in the end")
         run.tick()
         wait_for(lambda: len(asked) > 3)
         monkeypatch.setattr(run.state, "snapshot", whole)
@@ -191,7 +191,7 @@ def test_what_is_forgotten_is_forgotten_by_all(run, page):
         view.next()
     run.state.clear()  # a recording is wound back
     run.tick()
-    page.tell()
+    page.publish()
     for view in views:
         told = view.next()
         assert told["since"] == -1 and told["variations"] == [] and told["epoch"] != view.told[0]["epoch"]
@@ -254,7 +254,7 @@ def test_a_recording_is_stopped_hurried_and_wound(run, page):
 
 
 def test_the_page_tells_by_itself_and_ends(run):
-    with showing(run, "127.0.0.1", 0) as url:
+    with serving_run(run, "127.0.0.1", 0) as url:
         view = View(PageClient(url, None, None))
         assert view.next()["since"] == -1
         run.tick()

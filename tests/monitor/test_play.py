@@ -308,4 +308,4 @@ def test_only_a_dark_room_can_be_played(monkeypatch, capsys):
     agent.manifest = {"run": dumps(load("dmc-cheetah-run"))}
     monkeypatch.setattr(player, "load_agent", lambda *_: agent)
     assert main(["play", "runs/cheetah"]) == 2
-    assert "play runs/cheetah: its agent knows dmc-cheetah-run; only a Dark Room can be played" in capsys.readouterr().err
+    assert "play runs/cheetah: its agent is for dmc-cheetah-run; play needs an agent for Dark Room" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import service
 from tests.monitor.messages import progress
-from tests.monitor.watched import run_folder
+from tests.monitor.fake_feed import run_folder
 
 METRICS = service.Metrics
 

@@ -18,7 +18,7 @@ from icrl_dist.monitor.screen import MonitorApp
 from icrl_dist.monitor.tables import Table
 from icrl_dist.monitor.view_state import duration, matches
 from icrl_dist.stream import wire
-from tests.monitor.watched import BEGAN, Watched, episode, run_folder
+from tests.monitor.fake_feed import BEGAN, FakeFeed, episode, run_folder
 
 
 def shown(app, name):
@@ -43,7 +43,7 @@ def drive(feed, script, size=(130, 44)):
 
             async def press(*keys):
                 await pilot.press(*keys)
-                app.look()
+                app.update_view()
                 await pilot.pause()
 
             await press()
@@ -54,9 +54,9 @@ def drive(feed, script, size=(130, 44)):
 
 
 def test_everything_is_said_of_a_run(monkeypatch):
-    feed = Watched()
-    feed.busy()
-    feed.progress("fit", 30, 120, loss=0.731, drops={"checksum": 3})
+    feed = FakeFeed()
+    feed.send_run_in_progress()
+    feed.send_progress("fit", 30, 120, loss=0.731, drops={"checksum": 3})
     feed.pass_time(1.0)
 
     async def script(app, press):
@@ -74,8 +74,8 @@ def test_everything_is_said_of_a_run(monkeypatch):
 
 
 def test_a_small_terminal_shows_one_pane_at_a_time():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
         assert "variations 8" in text(app, "tabs") and "workers 2" in text(app, "tabs")
@@ -93,18 +93,18 @@ def test_a_small_terminal_shows_one_pane_at_a_time():
 
 
 def test_sorting_goes_through_the_columns_and_back_and_the_cursor_stays_on_its_row():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
         table = app.query_one("#variations", Table)
         await press("down", "down")
-        assert table.beside(0) == "1/0"
+        assert table.move(0) == "1/0"
         await press("s")
         assert "by share" in shown(app, "variations")[0]
         places = rows(app, "variations")
         shares = [int(re.search(r"(\d+)%", line)[1]) for line in shown(app, "variations")[2:]]
-        assert shares == sorted(shares) and table.beside(0) == "1/0"
+        assert shares == sorted(shares) and table.move(0) == "1/0"
         await press("S")
         assert rows(app, "variations")[0] == places[-1]
 
@@ -112,8 +112,8 @@ def test_sorting_goes_through_the_columns_and_back_and_the_cursor_stays_on_its_r
 
 
 def test_a_filter_is_typed_and_cleared():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
         await press("slash", *"task", "space", "3")
@@ -145,13 +145,13 @@ def test_a_filter_is_typed_and_cleared():
     ],
 )
 def test_what_a_filter_matches(wanted, does):
-    assert matches({"task": 3, "variation": 1, "found": "3/1 adapt/0 null goal 2,2"}, wanted) == does
+    assert matches({"task": 3, "variation": 1, "search_text": "3/1 adapt/0 null goal 2,2"}, wanted) == does
 
 
 def test_a_variation_opens_with_returns_path_and_lineage():
-    feed = Watched()
-    feed.busy()
-    feed.draw(episode(1, 1, 5))
+    feed = FakeFeed()
+    feed.send_run_in_progress()
+    feed.send_episode(episode(1, 1, 5))
 
     async def script(app, press):
         await press("down", "down", "down", "enter")
@@ -172,23 +172,23 @@ def test_a_variation_opens_with_returns_path_and_lineage():
 
 
 def test_trouble_comes_first_and_in_words():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
-        feed.say("event", what="worker", text="worker w1 is gone", worker="w1", alive=False)
-        feed.say("event", what="alert", alert="returns", active=True, text="returns fell by half")
+        feed.send("event", what="worker", text="worker w1 is gone", worker="w1", alive=False)
+        feed.send("event", what="alert", alert="returns", active=True, text="returns fell by half")
         cause = "three workers ended in it"
-        feed.say("event", what="quarantine", identity="adapt/0/2/1", text=cause)
+        feed.send("event", what="quarantine", identity="adapt/0/2/1", text=cause)
         for _ in range(4):
             feed.pass_time(0.5)
-            feed.beat("w0")
+            feed.send_heartbeat("w0")
         await press()
         assert shown(app, "workers")[2].startswith("gone 3 s") and "w1" in shown(app, "workers")[2]
         assert "ALERT returns fell by half" in text(app, "header")
         assert rows(app, "variations")[0] == "2/1" and f"QUARANTINED: {cause}" in shown(app, "variations")[2]
         assert "worker w1 is gone" in shown(app, "events")[1] and cause in shown(app, "events")[3]
-        feed.say("event", what="alert", alert="returns", active=False, text="returns recovered")
+        feed.send("event", what="alert", alert="returns", active=False, text="returns recovered")
         feed.pass_time(3.0)
         await press()
         assert "ALERT" not in text(app, "header") and "SILENT for 6 s" in text(app, "header")
@@ -202,19 +202,19 @@ HOSTILE = "[bold red]x[/] [/nope] \x1b[2J\x07\u202e\ud7ff 名前 e\u0301\u0301 $
 
 @pytest.mark.parametrize("size", [(80, 24), (130, 44)])
 def test_names_from_the_network_are_only_ever_text(size):
-    feed = Watched()
-    feed.progress(phase=None)  # the first that is heard of the run
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_progress(phase=None)  # the first that is heard of the run
+    feed.send_run_in_progress()
     feed.state.receive("icrl/demo/mon/event", wire.encode_message("event", what="x", text="x", time=1e300), feed.time)
-    feed.beat(HOSTILE, job=HOSTILE, doing=HOSTILE)
-    feed.say("event", what="[red]", text=HOSTILE * 5)
-    feed.say("event", what="alert", alert="[/]", active=True, text=HOSTILE)
-    feed.say("event", what="quarantine", identity="adapt/0/0/0", text=HOSTILE)
+    feed.send_heartbeat(HOSTILE, job=HOSTILE, doing=HOSTILE)
+    feed.send("event", what="[red]", text=HOSTILE * 5)
+    feed.send("event", what="alert", alert="[/]", active=True, text=HOSTILE)
+    feed.send("event", what="quarantine", identity="adapt/0/0/0", text=HOSTILE)
     bad = episode(0, 1, 6)
     feed.state.receive("icrl/demo/mon/trajectories/x", b"\x81\xa1v\x01", feed.time)
     feed.state.receive("icrl/other/mon/learner", b"", feed.time)
     object.__setattr__(bad, "worker", HOSTILE)
-    feed.store(bad)
+    feed.send_trajectory(bad)
     feed.pass_time(1.0)
 
     async def script(app, press):
@@ -236,19 +236,19 @@ def test_names_from_the_network_are_only_ever_text(size):
 
 
 def test_p_freezes_a_run_that_is_on_and_shows_it_as_it_is_afterwards():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
         await press("p")
         assert "FROZEN" in text(app, "header")
-        feed.progress(step=90)
+        feed.send_progress(step=90)
         feed.pass_time(1.0)
         await press()
         assert "30 of 120" in text(app, "header")
         await press("enter")
         assert "VARIATION 0/0" in text(app, "sheet") and "6 episodes" in text(app, "sheet"), "first asked for while frozen"
-        feed.store(episode(0, 0, 6))
+        feed.send_trajectory(episode(0, 0, 6))
         await press()
         assert "6 episodes" in text(app, "sheet")
         await press("right_square_bracket")
@@ -263,8 +263,8 @@ def test_p_freezes_a_run_that_is_on_and_shows_it_as_it_is_afterwards():
 
 
 def test_the_keys_of_a_recording():
-    feed = Watched({"begin": BEGAN, "end": BEGAN + 200, "at": BEGAN + 100, "speed": 10.0, "paused": False})
-    feed.busy()
+    feed = FakeFeed({"begin": BEGAN, "end": BEGAN + 200, "at": BEGAN + 100, "speed": 10.0, "paused": False})
+    feed.send_run_in_progress()
 
     async def script(app, press):
         assert "recording at 10x" in text(app, "header") and "1:40 of 3:20" in text(app, "header")
@@ -278,13 +278,13 @@ def test_the_keys_of_a_recording():
 
 
 def test_a_recording_that_is_wound_back_is_seen_anew():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
         assert len(rows(app, "variations")) == 8
         feed.state.clear()
-        feed.store(episode(5, 0, 0))
+        feed.send_trajectory(episode(5, 0, 0))
         feed.pass_time(1.0)
         await press()
         assert rows(app, "variations") == ["5/0"]
@@ -293,10 +293,10 @@ def test_a_recording_that_is_wound_back_is_seen_anew():
 
 
 def test_many_variations_are_a_window_and_a_count():
-    feed = Watched()
+    feed = FakeFeed()
     payload = [episode(t, v) for t in range(13) for v in range(20)]
     for trajectory in payload:
-        feed.store(trajectory)
+        feed.send_trajectory(trajectory)
     feed.pass_time(1.0)
 
     async def script(app, press):
@@ -310,11 +310,11 @@ def test_many_variations_are_a_window_and_a_count():
 
 
 def test_what_is_told_twice_is_shown_once():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
-        feed.say("event", what="note", text="a note")  # told now, and once more after the next tick
+        feed.send("event", what="note", text="a note")  # told now, and once more after the next tick
         await press()
         feed.pass_time(1.0)
         await press()
@@ -324,18 +324,18 @@ def test_what_is_told_twice_is_shown_once():
 
 
 def test_only_lines_that_differ_are_drawn_again():
-    feed = Watched()
-    feed.busy()
+    feed = FakeFeed()
+    feed.send_run_in_progress()
 
     async def script(app, press):
         table, drawn = app.query_one("#variations", Table), []
         refresh = table.refresh
         table.refresh = lambda *regions, **kw: (drawn.extend(region.y for region in regions), refresh(*regions, **kw))[1]
-        app.look()
+        app.update_view()
         assert drawn == []
-        feed.store(episode(2, 0, 6, earned=1))
+        feed.send_trajectory(episode(2, 0, 6, total=1))
         feed.pass_time(0.25)
-        app.look()
+        app.update_view()
         assert drawn == [2 + 4]
         table.refresh = refresh
 
@@ -343,7 +343,7 @@ def test_only_lines_that_differ_are_drawn_again():
 
 
 def test_help_and_the_ways_out():
-    feed = Watched()
+    feed = FakeFeed()
 
     async def asked(app, press):
         await press("question_mark")
