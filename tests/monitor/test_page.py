@@ -8,12 +8,12 @@ from importlib import resources
 
 import pytest
 
-from icrl_dist.monitor import page as page_module
 from icrl_dist.monitor import event_stream, serve
+from icrl_dist.monitor import page as page_module
 from icrl_dist.monitor.page import EVENT, SnapshotPublisher, serving_run
 from icrl_dist.monitor.serve import application, serving
-from tests.monitor.test_serve import PageClient, wait_for
 from tests.monitor.fake_feed import FakeFeed
+from tests.monitor.test_serve import PageClient, wait_for
 
 ASSETS = resources.files("icrl_dist.monitor") / "assets"
 

@@ -10,9 +10,9 @@ from icrl_dist.agent.in_context_agent import InContextAgent, load_agent
 from icrl_dist.cli.main import main
 from icrl_dist.config.run import dumps, load, parse
 from icrl_dist.monitor import player
+from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.play import HELD_S, PlayGame
 from icrl_dist.monitor.player import Player
-from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.problems.darkroom.room import MOVES, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 

@@ -19,8 +19,8 @@ from icrl_dist.storage.dataset import Store
 from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import service
+from tests.monitor.fake_feed import BEGAN, run_folder
 from tests.monitor.messages import progress
-from tests.monitor.fake_feed import run_folder
 
 METRICS = service.Metrics
 
@@ -185,3 +185,14 @@ def test_without_a_folder_the_newest_run_is_meant_whose_learner_lives(hub, tmp_p
         assert main(["monitor", "--web", "0"]) == 0
     assert main(["monitor", "--web", "0"]) == 0
     assert found == ["tcp/127.0.0.1:0", "older", "tcp/127.0.0.1:1", "crashed"]
+
+
+def test_rollouts_of_new_weights_are_played_after_their_fit(tmp_path):
+    recording = Recording(run_folder(tmp_path / "run"))
+    try:
+        said = [(then - BEGAN, payload) for then, key, payload in recording.messages() if "/trajectories/" in key]
+    finally:
+        recording.close()
+    assert len(said) == 72
+    assert max(then for then, payload in said if b"pretrain/" in payload) <= 2
+    assert min(then for then, payload in said if b"adapt/" in payload) > 6
