@@ -13,8 +13,8 @@ from rich.console import Console
 
 from icrl_dist.agent.in_context_agent import load_agent
 from icrl_dist.config.run import ConfigError, Deployment, parse
-from icrl_dist.monitor.play import PlayGame
 from icrl_dist.monitor.event_stream import EventStream
+from icrl_dist.monitor.play import PlayGame
 from icrl_dist.monitor.serve import application, serving
 
 FRAME_S, BELIEF_S, HURRY_S = 0.05, 0.15, 0.25

@@ -18,7 +18,7 @@ from icrl_dist.monitor.page import serving_run
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
-from tests.monitor.test_page import Run
+from tests.monitor.test_page import CountingFeed
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -263,7 +263,7 @@ def test_every_round_is_over_its_own_optimum_and_many_alerts_leave_room_for_it(p
 
 
 def test_a_recording_is_steered_by_keyboard(page):
-    run = Run()
+    run = CountingFeed()
     run.recording = {"begin": 1000.0, "end": 1100.0, "at": 1010.0, "speed": 10.0, "paused": False}
     run.tick()
     with shown(page, run) as url:
