@@ -38,7 +38,7 @@ def view(endpoint: str) -> None:
             def look(feed: LiveFeed = feed, ended: threading.Event = ended) -> None:
                 since = -1
                 while not ended.wait(LOOK_S):
-                    shown = feed.picture.snapshot(feed.now(), since)
+                    shown = feed.state.snapshot(feed.now(), since)
                     since = shown["seq"]
                     json.dumps(shown)
 
@@ -48,7 +48,7 @@ def view(endpoint: str) -> None:
             sys.stdin.readline()
             ended.set()
             looking.join()
-            print(feed.picture.heard, flush=True)
+            print(feed.state.received, flush=True)
 
 
 def crowd(streams: int, per_s: float) -> None:

@@ -105,13 +105,13 @@ class TapArguments:
 
 def tap(arguments: TapArguments, console: Console) -> int:
     """Print trajectories until Ctrl-C or ``--count``.  Returns the exit code."""
-    from icrl_dist.monitor.tap import Tapped
+    from icrl_dist.monitor.tap import TapWriter
     from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
     endpoint, certificates, run = _learner_of(arguments.what, arguments.connect, arguments.certificates)
     ended = threading.Event()
-    tapped = Tapped(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, ended.set)
+    tapped = TapWriter(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, ended.set)
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: ended.set())
     with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:

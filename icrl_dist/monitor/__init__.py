@@ -1,1 +1,1 @@
-"""The live view: terminal and browser.  Pages are served by ``serve``; ``play`` has a game of its own."""
+"""The live view of a run in a terminal and in a browser, and ``icrl-dist play``; ``serve`` serves the pages of both."""

@@ -1,11 +1,11 @@
-"""Sampled episodes as drawings of few numbers, and what is exactly known of a variation.
+"""Converts episodes to drawings of few numbers, and computes the optimum of a variation where that is possible.
 
 A drawing is one of
 
-- ``room``: ``size``, ``goal``, ``path`` (the cells, one more than steps), ``overridden`` (a step each);
-- ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in metres, ``frame_s`` seconds apart, and
-  ``force`` (0 to 1 a frame);
-- ``paths``: ``paths``, named lists of points seen from above in metres, and ``goal``.
+- ``room``: ``size``, ``goal``, ``path`` (cells, one more than steps), ``overridden`` (one flag a step);
+- ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in meters, ``frame_s`` seconds apart, and
+  ``force`` (0 to 1, one value a frame);
+- ``paths``: ``paths``, named lists of points from above in meters, and ``goal``.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ from typing import Any
 import numpy as np
 
 from icrl_dist.monitor import validation
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.problems import registry
 from icrl_dist.stream import validation as strict
 
 
 def of(message: dict[str, Any]) -> dict[str, Any]:
-    """The drawing of an ``episode`` message.  Raises Odd for one that is not what docs/tap.md says."""
+    """The drawing of an ``episode`` message.  Raises InvalidMessageError if it does not match docs/tap.md."""
     kind = validation.text(message.get("problem"), 64)
     try:
         states = strict.to_array("observations", message.get("observations"), ("<f4",), 2)
         adversary = strict.to_array("adversary", message.get("adversary"), ("<f4",), 1)
     except strict.WireError:
-        raise Odd("schema") from None
+        raise InvalidMessageError("schema") from None
     if not (0 < len(states) <= 512 and len(adversary) <= len(states) and states.shape[1] <= 128):
-        raise Odd("schema")
+        raise InvalidMessageError("schema")
     if not (np.isfinite(states).all() and np.isfinite(adversary).all()):
-        raise Odd("schema")
-    parameters = validation.named(message.get("task"))
+        raise InvalidMessageError("schema")
+    parameters = validation.parameters(message.get("task"))
     every = validation.integer(message.get("every"), 1, 512)
     draw = registry.problem(kind).drawing if kind in registry.names() else None
     if draw is None:
-        raise Odd("schema")
+        raise InvalidMessageError("schema")
     try:
         return draw(states, adversary, parameters, every)
     except ValueError:
-        raise Odd("schema") from None
+        raise InvalidMessageError("schema") from None
 
 
 def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> float | None:

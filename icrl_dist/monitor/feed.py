@@ -1,4 +1,4 @@
-"""Where a picture comes from: a run that is on, or one on disk, played again."""
+"""Sources of the live view: a live run, or a recording played from a run folder."""
 
 from __future__ import annotations
 
@@ -7,48 +7,48 @@ import time
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from icrl_dist.monitor.picture import Picture
 from icrl_dist.monitor.recording import Recording
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.stream.link import Link
 
 PERIOD_S = 0.25
-"""A picture's time goes on this often."""
+"""Time between two ticks of the run state."""
 
 
 class Feed(Protocol):
-    """Keeps a picture up to date on a thread of its own."""
+    """Keeps a run state up to date on its own thread."""
 
-    picture: Picture
+    state: RunState
 
     def now(self) -> float:
-        """The picture's time, Unix seconds."""
+        """The current time of the run state, Unix seconds."""
         ...
 
     def replay(self) -> dict[str, Any] | None:
-        """Where a recording is: ``begin``, ``end``, ``at`` (Unix seconds), ``speed``, ``paused``; None for a run that is on."""
+        """Position in a recording: ``begin``, ``end``, ``at`` (Unix seconds), ``speed``, ``paused``; None for a live run."""
         ...
 
     def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
-        """Play a recording faster or slower, stop and go on, or from another moment on; nothing for a run that is on."""
+        """Set the speed of a recording, pause or resume it, or seek to ``at``; does nothing for a live run."""
         ...
 
     def close(self) -> None: ...
 
 
 class LiveFeed:
-    """A run that is on, over a link to its learner."""
+    """A live run, over a link to its learner."""
 
     def __init__(self, link: Link, run: str = "") -> None:
-        """Subscribes to the monitor plane of ``run``, by default of whichever run is on at that endpoint."""
-        self.picture = Picture(run)
+        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint."""
+        self.state = RunState(run)
         self._ended = threading.Event()
-        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.picture.hear(key, payload, time.time()))
-        self._thread = threading.Thread(target=self._tick, name="picture", daemon=True)
+        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.state.receive(key, payload, time.time()))
+        self._thread = threading.Thread(target=self._tick, name="run-state", daemon=True)
         self._thread.start()
 
     def _tick(self) -> None:
         while not self._ended.wait(PERIOD_S):
-            self.picture.tick(time.time())
+            self.state.tick(time.time())
 
     def now(self) -> float:
         return time.time()
@@ -57,7 +57,7 @@ class LiveFeed:
         return None
 
     def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
-        """A run that is on cannot be hurried."""
+        """A live run has no controls."""
 
     def close(self) -> None:
         self._ended.set()
@@ -71,11 +71,11 @@ class LiveFeed:
 
 
 class ReplayFeed:
-    """A run on disk, finished or crashed, played again from its dataset and metrics."""
+    """A run on disk, finished or crashed, played from its dataset and metrics."""
 
     def __init__(self, folder: Path, speed: float = 10.0) -> None:
-        """``speed``: seconds of then a second of now.  Raises ConfigError if there is nothing to play."""
-        self.picture = Picture(recorded=True)
+        """``speed``: recorded seconds played in a second.  Raises ConfigError if there is nothing to play."""
+        self.state = RunState(recorded=True)
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False
@@ -95,24 +95,24 @@ class ReplayFeed:
                     self._at = min(self._recording.end, self._at + elapsed * self._speed)
                 at, seek, self._seek = self._at, self._seek, False
             if seek:
-                self.picture.clear()
+                self.state.clear()
                 self._messages = self._recording.messages()
                 self._next = next(self._messages, None)
-            self._until(at)
+            self._play_until(at)
 
-    def _until(self, at: float) -> None:
-        """Hear everything up to then, a second of then at a time, as it was heard."""
-        ticked = None
+    def _play_until(self, at: float) -> None:
+        """Receive all messages up to ``at``, with a tick after every recorded second, as in a live run."""
+        last_tick = None
         while self._next is not None and self._next[0] <= at and not self._ended.is_set():
-            then, key, payload = self._next
-            if ticked is None:
-                ticked = then
-            if then - ticked >= 1.0:
-                ticked = then
-                self.picture.tick(then)
-            self.picture.hear(key, payload, then)
+            time_, key, payload = self._next
+            if last_tick is None:
+                last_tick = time_
+            if time_ - last_tick >= 1.0:
+                last_tick = time_
+                self.state.tick(time_)
+            self.state.receive(key, payload, time_)
             self._next = next(self._messages, None)
-        self.picture.tick(at)
+        self.state.tick(at)
 
     def now(self) -> float:
         return self._at

@@ -1,7 +1,7 @@
-"""Widgets of plain lines: what has not changed is not sent to the terminal again.
+"""Textual widgets made of lines of text; a line that has not changed is not sent to the terminal again.
 
-All text is written as it is: nothing that came from a run is taken for markup, and what would
-take no cell or move the cursor is left out.
+Text from a run is never parsed as markup, and characters that take no cell or move the cursor are
+removed.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ Line = list[Part]
 
 
 def safe(text: str) -> str:
-    """Text of printable characters that take one or two cells each."""
+    """``text`` without the characters that are not printable or take no cell."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(c for c in text if c.isprintable() and cell_len(c) > 0)
 
 
 def width_of(line: Line) -> int:
-    """How many cells a line takes."""
+    """Width of a line in cells."""
     return sum(cell_len(text) for text, _ in line)
 
 
 def spread(left: Line, right: Line, width: int) -> Line:
-    """One line with a part at each end; the right one gives way where both do not fit."""
+    """One line with a part at each end; the right part is left out where both do not fit."""
     gap = width - width_of(left) - width_of(right)
     return [*left, (" " * gap, PLAIN), *right] if gap > 0 else left
 
@@ -58,16 +58,17 @@ class Column:
     name: str
     title: str
     width: int
-    """Cells; of a column that stretches, the fewest."""
+    """Cells; the minimum for a column that stretches."""
     rank: int = 0
-    """Where there is not room for all columns, those with the highest rank go first."""
+    """If the columns do not fit, those with the highest rank are removed first."""
     right: bool = False
+    """Aligned to the right."""
     stretch: int = 0
-    """Its share of the room that is left."""
+    """Weight with which it receives remaining cells."""
 
 
 def fit(columns: Sequence[Column], width: int) -> list[tuple[Column, int]]:
-    """The columns that there is room for, in order, each with its width; one cell between them."""
+    """The columns that fit into ``width``, in order, each with its width; one cell lies between them."""
     kept = list(columns)
     while len(kept) > 1 and sum(column.width + 1 for column in kept) > width:
         kept.remove(max(reversed(kept), key=lambda column: column.rank))
@@ -78,7 +79,7 @@ def fit(columns: Sequence[Column], width: int) -> list[tuple[Column, int]]:
 
 
 def cell(text: str, width: int, right: bool = False) -> str:
-    """Text in exactly so many cells; what is cut ends in an ellipsis."""
+    """``text`` in exactly ``width`` cells; text that is cut ends in an ellipsis."""
     text = safe(text)
     length = cell_len(text)
     if length > width:
@@ -87,7 +88,7 @@ def cell(text: str, width: int, right: bool = False) -> str:
 
 
 class Lines(Widget):
-    """Lines, as many as there is room for; only those that differ are drawn again."""
+    """A widget that shows as many lines as fit; only changed lines are drawn again."""
 
     def __init__(self, name: str) -> None:
         super().__init__(id=name)
@@ -95,11 +96,11 @@ class Lines(Widget):
 
     @property
     def lines(self) -> list[str]:
-        """What it shows, for whoever reads along."""
+        """The text that is shown, for tests."""
         return ["".join(text for text, _ in line) for line in self._lines]
 
     def show(self, lines: Sequence[Line]) -> None:
-        """Show these from now on."""
+        """Replace the lines."""
         old, self._lines = self._lines, [[(safe(text), style) for text, style in line] for line in lines]
         longest = max(len(old), len(self._lines))
         changed = [y for y in range(min(longest, self.size.height)) if old[y : y + 1] != self._lines[y : y + 1]]
@@ -117,37 +118,37 @@ class Lines(Widget):
 
 
 class Scroll(Lines, can_focus=True):
-    """More lines than there is room for, moved with the cursor keys."""
+    """A widget with more lines than fit, scrolled with the cursor keys."""
 
     def __init__(self, name: str, follow: bool = False) -> None:
-        """``follow``: stay at the end, unless it was left."""
+        """``follow``: stay at the end when lines are added, until the user scrolls up."""
         super().__init__(name)
-        self._whole: list[Line] = []
+        self._content: list[Line] = []
         self._head: list[Line] = []
-        self._follow, self._end, self._top = follow, follow, 0
+        self._follow, self._at_end, self._top = follow, follow, 0
 
     def fill(self, head: list[Line], lines: list[Line]) -> None:
-        """Show these; ``head`` does not move."""
-        self._head, self._whole = head, lines
+        """Replace the content; ``head`` does not scroll."""
+        self._head, self._content = head, lines
         self._draw()
 
     def _draw(self) -> None:
-        last = max(0, len(self._whole) - self._room())
-        self._top = last if self._end else min(self._top, last)
-        self.show([*self._head, *self._whole[self._top : self._top + self._room()]])
+        last = max(0, len(self._content) - self._page_size())
+        self._top = last if self._at_end else min(self._top, last)
+        self.show([*self._head, *self._content[self._top : self._top + self._page_size()]])
 
-    def _room(self) -> int:
+    def _page_size(self) -> int:
         return max(1, self.size.height - len(self._head))
 
     def on_resize(self) -> None:
         self._draw()
 
     def on_key(self, event: events.Key) -> None:
-        page = self._room()
+        page = self._page_size()
         steps = {"up": -1, "k": -1, "down": 1, "j": 1, "pageup": -page, "pagedown": page, "home": -(10**9), "end": 10**9}
         if event.key in steps:
             event.stop()
-            last = max(0, len(self._whole) - page)
+            last = max(0, len(self._content) - page)
             self._top = min(max(0, self._top + steps[event.key]), last)
-            self._end = self._follow and self._top == last
+            self._at_end = self._follow and self._top == last
             self._draw()

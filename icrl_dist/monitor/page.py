@@ -1,4 +1,4 @@
-"""The live view in a browser: one picture, told to every viewer; docs/monitor.md says how."""
+"""The live view in a browser: serves snapshots of one run's state to many viewers (docs/monitor.md)."""
 
 from __future__ import annotations
 
@@ -17,95 +17,97 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
+from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.feed import Feed
-from icrl_dist.monitor.serve import EventStream, application, serving
+from icrl_dist.monitor.serve import application, serving
 
 _log = logging.getLogger(__name__)
 
 PUSH_S = 0.25
-"""Viewers are told this often."""
+"""Time between two snapshots."""
 EVENT = "picture"
 
 
-class Teller:
-    """Tells a feed's picture to every viewer: whole to one that joins, then what has changed, made once for all."""
+class SnapshotPublisher:
+    """Publishes a feed's state: a full snapshot to a new viewer, then the changes, computed once for all viewers."""
 
     def __init__(self, feed: Feed) -> None:
-        self._feed, self.stream = feed, EventStream(self._whole)
+        self._feed, self.stream = feed, EventStream(self._initial_event)
         self._lock = threading.Lock()
         self._epoch, self._since = "", -1
-        self._kept: tuple[str, int, str] = "", -1, ""
+        self._cached: tuple[str, int, str] = "", -1, ""
+        """Epoch, seq and JSON text of the newest full snapshot."""
 
-    def _picture(self, since: int) -> dict[str, Any]:
-        return {**self._feed.picture.snapshot(self._feed.now(), since), "replay": self._feed.replay()}
+    def _snapshot(self, since: int) -> dict[str, Any]:
+        return {**self._feed.state.snapshot(self._feed.now(), since), "replay": self._feed.replay()}
 
-    def _whole(self) -> tuple[str, str]:
-        """What a viewer begins with; those who join in one tick share it."""
-        picture = self._feed.picture
+    def _initial_event(self) -> tuple[str, str]:
+        """A full snapshot; viewers that join in the same tick share it."""
+        state = self._feed.state
         with self._lock:
-            if self._kept[:2] != (picture.epoch, picture.seq):
-                whole = self._picture(-1)
-                self._kept = whole["epoch"], whole["seq"], json.dumps(whole, allow_nan=False, separators=(",", ":"))
+            if self._cached[:2] != (state.epoch, state.seq):
+                full = self._snapshot(-1)
+                self._cached = full["epoch"], full["seq"], json.dumps(full, allow_nan=False, separators=(",", ":"))
                 if not self._epoch:
-                    self._epoch, self._since = self._kept[:2]
-            return EVENT, self._kept[2]
+                    self._epoch, self._since = self._cached[:2]
+            return EVENT, self._cached[2]
 
-    def tell(self) -> None:
-        """Tell those who look on what has changed since the last time."""
+    def publish(self) -> None:
+        """Send what has changed since the last call to all viewers."""
         with self._lock:
             if not self.stream.viewers:
-                self._epoch, self._kept = "", ("", -1, "")
-            elif self._epoch:  # else nobody has begun yet
-                delta = self._picture(self._since)
+                self._epoch, self._cached = "", ("", -1, "")
+            elif self._epoch:  # empty until the first viewer has its full snapshot
+                delta = self._snapshot(self._since)
                 if delta["epoch"] != self._epoch:
-                    delta = self._picture(-1)
+                    delta = self._snapshot(-1)
                 self.stream.publish(EVENT, delta)
-                self._epoch, self._since = delta["epoch"], delta["seq"]  # not before it was told: it is tried again
+                self._epoch, self._since = delta["epoch"], delta["seq"]  # after publish: a failed change is sent next time
 
-    def go_on(self, over: threading.Event) -> None:
-        """Tell four times a second until ``over``; what cannot be told is logged once a kind of error."""
+    def run(self, over: threading.Event) -> None:
+        """Publish four times a second until ``over`` is set; log one error of each type."""
         logged: set[type[Exception]] = set()
         while not over.wait(PUSH_S):
             try:
-                self.tell()
+                self.publish()
             except Exception as error:
                 if type(error) not in logged:
                     logged.add(type(error))
-                    _log.exception("viewers cannot be told of this; further ones of its kind are not logged")
+                    _log.exception("a snapshot could not be sent to viewers; further errors of this type are not logged")
 
     def command(self, fields: dict[str, Any]) -> None:
-        """``speed`` (seconds of then a second of now), ``paused`` and ``at`` (Unix seconds) of a recording.
+        """Control a recording: ``speed`` (recorded seconds a second), ``paused``, ``at`` (Unix seconds).
 
-        Raises ValueError for anything else, and for a run that is on.
+        Raises ValueError for other fields or values, and for a live run.
         """
         if self._feed.replay() is None:
-            raise ValueError("this run is on: only a recording can be stopped, hurried or wound")
+            raise ValueError("this run is live: only a recording has pause, speed and seek")
         for name, value in fields.items():
             if name == "paused":
                 if type(value) is not bool:
-                    raise ValueError(f"paused={value!r:.40}: true or false")
+                    raise ValueError(f"paused={value!r:.40}: must be true or false")
             elif name not in ("speed", "at"):
-                raise ValueError(f"{name[:40]!r}: unknown; speed, paused and at are known")
+                raise ValueError(f"{name[:40]!r}: unknown field; the fields are speed, paused and at")
             elif type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
-                raise ValueError(f"{name}={value!r:.40}: a number above 0")
+                raise ValueError(f"{name}={value!r:.40}: must be a number above 0")
         self._feed.control(**fields)
 
     async def variation(self, request: Request) -> Response:
-        """All that is kept of one variation, as JSON."""
+        """Endpoint: everything kept of one variation, as JSON."""
         name = f"{request.path_params['task']}/{request.path_params['variation']}"
-        found = await asyncio.to_thread(self._feed.picture.variation, name)
+        found = await asyncio.to_thread(self._feed.state.variation, name)
         return PlainTextResponse("no such variation", 404) if found is None else JSONResponse(found)
 
 
 @contextlib.contextmanager
-def showing(feed: Feed, host: str, port: int) -> Iterator[str]:
-    """Serve the page meanwhile; gives its URL.  Raises ConfigError if it cannot listen there."""
-    teller, over = Teller(feed), threading.Event()
+def serving_run(feed: Feed, host: str, port: int) -> Iterator[str]:
+    """Context manager: serves the page and yields its URL.  Raises ConfigError if the address cannot be used."""
+    publisher, over = SnapshotPublisher(feed), threading.Event()
 
-    routes = [Route("/variation/{task}/{variation}", teller.variation)]
-    app = application("monitor.html", teller.stream, teller.command, routes)
-    thread = threading.Thread(target=teller.go_on, args=(over,), name="teller", daemon=True)
-    with serving(app, teller.stream, host, port) as url:
+    routes = [Route("/variation/{task}/{variation}", publisher.variation)]
+    app = application("monitor.html", publisher.stream, publisher.command, routes)
+    thread = threading.Thread(target=publisher.run, args=(over,), name="publisher", daemon=True)
+    with serving(app, publisher.stream, host, port) as url:
         thread.start()
         try:
             yield url
@@ -115,11 +117,11 @@ def showing(feed: Feed, host: str, port: int) -> Iterator[str]:
 
 
 def serve(feed: Feed, host: str, port: int, console: Console) -> int:
-    """Serve the page until Ctrl-C or SIGTERM; returns the exit code.  Raises ConfigError if it cannot listen there."""
+    """Serve the page until Ctrl-C or SIGTERM; returns the exit code.  Raises ConfigError if the address cannot be used."""
     over = threading.Event()
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, lambda *_: over.set())
-    with showing(feed, host, port) as url:
+    with serving_run(feed, host, port) as url:
         console.print(f"the live view is at {url}  (Ctrl-C ends the view, not the run)", highlight=False, soft_wrap=True)
         over.wait()
     return 0

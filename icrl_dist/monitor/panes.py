@@ -1,4 +1,4 @@
-"""What the view says beside its tables: the run's state, its rates, what happened, and the keys."""
+"""Parts of the terminal view beside its tables: header, rates, events, keys and tabs."""
 
 from __future__ import annotations
 
@@ -23,61 +23,62 @@ from icrl_dist.monitor.lines import (
     cell,
     spread,
 )
-from icrl_dist.monitor.seen import Seen, duration, number
 from icrl_dist.monitor.spark import bar, plot
+from icrl_dist.monitor.view_state import ViewState, duration, number
 
 _STATES = {"collecting": GOOD, "fitting": GOOD, "finished": GOOD, "waiting": WARNING, "interrupted": WARNING}
-"""Any other is trouble."""
-_ALERTS = 4
-"""Alerts shown one by one."""
-_TALL = 4
-"""Lines of a sparkline of the rates, at most."""
+"""Styles of the normal states; any other state is styled as trouble."""
+_MAX_ALERTS = 4
+"""Alerts shown in full; further ones are counted."""
+_MAX_HEIGHT = 4
+"""Limit on the lines of a sparkline."""
 _SPAN = 300
-"""Points, of a second each, that a sparkline of the rates is of."""
+"""Points, one a second, in a sparkline."""
 
 
 class Header(Lines):
-    """The run, its stage, where a recording is, and the alerts that are on."""
+    """The run, its stage, the position in a recording, and the active alerts."""
 
-    def fill(self, seen: Seen, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
-        """Tell what is seen; ``frozen``: since when nothing new is shown (Unix seconds); ``brief``: rates, too."""
+    def fill(self, view: ViewState, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
+        """Show ``view``; ``frozen``: when the view was frozen (Unix seconds), if it is; ``brief``: with a line of rates."""
         width = max(20, self.size.width)
-        lines = [_run(seen), _stage(seen, width), *([_brief(seen)] if brief else [])]
+        lines = [_run(view), _stage(view, width), *([_brief(view)] if brief else [])]
         if replay is not None:
             lines.append(_replay(replay, width))
         if frozen is not None:
-            lines.append([(f" FROZEN at {_clock(frozen)}: the run goes on; p shows it as it is now", WARNING)])
-        lines += [[(f" ALERT {alert['text']}", TROUBLE)] for alert in seen.alerts[:_ALERTS]]
-        if len(seen.alerts) > _ALERTS:
-            lines.append([(f" and {len(seen.alerts) - _ALERTS} more alerts", TROUBLE)])
+            lines.append([(f" FROZEN at {_clock(frozen)}: the run continues; p unfreezes the view", WARNING)])
+        lines += [[(f" ALERT {alert['text']}", TROUBLE)] for alert in view.alerts[:_MAX_ALERTS]]
+        if len(view.alerts) > _MAX_ALERTS:
+            lines.append([(f" and {len(view.alerts) - _MAX_ALERTS} more alerts", TROUBLE)])
         if self.styles.height is None or self.styles.height.value != len(lines):
             self.styles.height = len(lines)
         self.show(lines)
 
 
-def _run(seen: Seen) -> Line:
-    run = seen.run
+def _run(view: ViewState) -> Line:
+    run = view.run
     state = run.get("state", "waiting")
-    told = {"waiting": "waiting for the learner", "silent": f"SILENT for {run.get('silent_s') or 0:.0f} s"}.get(state, state)
-    what = " · ".join(run[name] for name in ("method", "problem") if run.get(name))
+    silent = f"SILENT for {run.get('silent_s') or 0:.0f} s"
+    state_text = {"waiting": "waiting for the learner", "silent": silent}.get(state, state)
+    kind = " · ".join(run[name] for name in ("method", "problem") if run.get(name))
     left: Line = [
         (f" {cell(run['name'], min(len(run['name']), 32)) if run.get('name') else 'no run yet'} ", BOLD),
-        (f" {what}  " if what else " ", DIM),
-        (f"● {told}", _STATES.get(state, TROUBLE)),
+        (f" {kind}  " if kind else " ", DIM),
+        (f"● {state_text}", _STATES.get(state, TROUBLE)),
     ]
     if run.get("rounds"):
-        at = f"  round {run.get('round', 0) + 1} of {run['rounds']}"
-        left.append((f"  pretraining, {run['rounds']} rounds follow" if run.get("phase") == "pretrain" else at, PLAIN))
+        round_text = f"  round {run.get('round', 0) + 1} of {run['rounds']}"
+        left.append((f"  pretraining, {run['rounds']} rounds follow" if run.get("phase") == "pretrain" else round_text, PLAIN))
     if run.get("version", -1) >= 0:
         left.append((f"  T^{run['version']}", ACCENT))
     left.append((f"  {run.get('trajectories', 0):,} stored", PLAIN))
     return left
 
 
-def _stage(seen: Seen, width: int) -> Line:
-    run = seen.run
+def _stage(view: ViewState, width: int) -> Line:
+    run = view.run
     if not run.get("steps"):
-        return [(" no stage has begun", DIM)]
+        return [(" no stage has started", DIM)]
     elapsed = f"elapsed {duration(run.get('elapsed_s'))}, left {duration(run.get('eta_s'))} "
     version = run["version"]
     if run.get("stage") == "fit":
@@ -85,36 +86,35 @@ def _stage(seen: Seen, width: int) -> Line:
     elif run["phase"] == "pretrain":
         name = "contexts, D^0"
     else:
-        name = f"round {run['round']}: T^{version} rolls out"
+        name = f"round {run['round']}: rollouts of T^{version}"
     share = run["step"] / run["steps"]
-    left = f", {duration(run['stage_eta_s'])} more" if run.get("stage_eta_s") else ""
-    told = f" {share:4.0%}  {run['step']:,} of {run['steps']:,}{left}"
-    done, rest = bar(share, max(5, min(60, width - len(name) - len(told) - len(elapsed) - 4)))
-    return spread([(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (told, PLAIN)], [(elapsed, DIM)], width)
+    left = f", {duration(run['stage_eta_s'])} left" if run.get("stage_eta_s") else ""
+    steps = f" {share:4.0%}  {run['step']:,} of {run['steps']:,}{left}"
+    done, rest = bar(share, max(5, min(60, width - len(name) - len(steps) - len(elapsed) - 4)))
+    return spread([(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (steps, PLAIN)], [(elapsed, DIM)], width)
 
 
-def _brief(seen: Seen) -> Line:
-    newest = {name: next((v for v in reversed(seen.series[name]) if v is not None), None) for name, _, _ in _RATES}
+def _brief(view: ViewState) -> Line:
+    newest = {name: next((v for v in reversed(view.series[name]) if v is not None), None) for name, _, _ in _RATES}
     short = (("stored/s", "stored_per_s", 0), ("steps/s", "steps_per_s", 0), ("fit/s", "fit_per_s", 1), ("loss", "loss", 3))
     line: Line = []
-    for told, name, digits in (*short, ("lag", "lag", 0), ("unstored", "unstored", 0)):
-        line += [(f" {told} ", DIM), (number(newest[name], digits) + " ", PLAIN)]
-    dropped = sum((seen.run.get("drops") or {}).values())
+    for label, name, digits in (*short, ("lag", "lag", 0), ("unstored", "unstored", 0)):
+        line += [(f" {label} ", DIM), (number(newest[name], digits) + " ", PLAIN)]
+    dropped = sum((view.run.get("drops") or {}).values())
     return [*line, (" dropped ", DIM), (f"{dropped:,}", WARNING if dropped else PLAIN)]
 
 
 def _replay(replay: dict[str, Any], width: int) -> Line:
     at, length = replay["at"] - replay["begin"], replay["end"] - replay["begin"]
-    over = at >= length
-    what = "PAUSED" if replay["paused"] else "at its end" if over else f"at {replay['speed']:g}x"
-    name = f" {'⏸' if replay['paused'] else '▶'} recording {what} "
-    told = f" {duration(at)} of {duration(length)}, {_clock(replay['at'])}"
-    done, rest = bar(at / length if length > 0 else 1.0, max(5, min(60, width - len(name) - len(told) - 2)))
-    return [(name, WARNING if replay["paused"] else ACCENT), (done, ACCENT), (rest, DIM), (told, PLAIN)]
+    mode = "PAUSED" if replay["paused"] else "at its end" if at >= length else f"at {replay['speed']:g}x"
+    name = f" {'⏸' if replay['paused'] else '▶'} recording {mode} "
+    position = f" {duration(at)} of {duration(length)}, {_clock(replay['at'])}"
+    done, rest = bar(at / length if length > 0 else 1.0, max(5, min(60, width - len(name) - len(position) - 2)))
+    return [(name, WARNING if replay["paused"] else ACCENT), (done, ACCENT), (rest, DIM), (position, PLAIN)]
 
 
-def _clock(when: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(when))
+def _clock(unix_s: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(unix_s))
 
 
 _RATES = (
@@ -128,25 +128,25 @@ _RATES = (
 )
 
 
-def rates(seen: Seen, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
-    """How fast every stage goes, a sparkline each; then what was dropped and ignored."""
+def rate_lines(view: ViewState, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
+    """Title and lines of the rates pane: a sparkline for each rate, then counts of dropped and ignored messages."""
     room = max(8, width - 23)
     head: list[Line] = [[("RATES", title(focused)), (f"  the last {_SPAN // 60} minutes", DIM)]]
     lines: list[Line] = []
     each = -(-_SPAN // room)
-    counted = [*_counted("dropped", seen.run.get("drops") or {}), *_counted("ignored", seen.ignored)]
-    tall = min(_TALL, max(1, (height - 1 - len(counted)) // len(_RATES)))
-    for name, told, digits in _RATES:
-        series = seen.series[name]
+    counted = [*_counted("dropped", view.run.get("drops") or {}), *_counted("ignored", view.ignored)]
+    tall = min(_MAX_HEIGHT, max(1, (height - 1 - len(counted)) // len(_RATES)))
+    for name, label, digits in _RATES:
+        series = view.series[name]
         kept = min(len(series), room * each)
         begin = len(series) - kept
-        begin += -(seen.points - kept) % each  # buckets begin where they began before
+        begin += -(view.points - kept) % each  # so that a point stays in its bucket when points are added
         values = list(islice(series, begin, None))
         buckets = [_mean(values[i : i + each]) for i in range(0, len(values), each)][-room:]
         known = [value for value in buckets if value is not None]
         low = min(known, default=0.0) if name == "loss" else 0.0
         newest = next((value for value in reversed(series) if value is not None), None)
-        line: Line = [(cell(told, 12), DIM), (cell(number(newest, digits), 9, right=True) + "  ", BOLD)]
+        line: Line = [(cell(label, 12), DIM), (cell(number(newest, digits), 9, right=True) + "  ", BOLD)]
         drawn = plot(buckets, room, tall, low, max([*known, low + 1e-9]))
         lines += [[(" " * 23, PLAIN), (above, SPARK)] for above in drawn[:-1]]
         lines.append([*line, (drawn[-1], SPARK)])
@@ -171,16 +171,16 @@ def _counted(what: str, counts: dict[str, int]) -> list[Line]:
 _WHAT = {"alert": TROUBLE, "crash": TROUBLE, "failed": TROUBLE, "quarantine": TROUBLE, "version": GOOD, "finished": GOOD}
 
 
-def happened(seen: Seen, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
-    """What happened, the newest last."""
-    head: list[Line] = [[("EVENTS", title(focused)), (f" {len(seen.events)}", BOLD), ("  newest last", DIM)]]
+def event_lines(view: ViewState, width: int, height: int, focused: bool) -> tuple[list[Line], list[Line]]:
+    """Title and lines of the events pane, newest event last."""
+    head: list[Line] = [[("EVENTS", title(focused)), (f" {len(view.events)}", BOLD), ("  newest last", DIM)]]
     lines: list[Line] = []
-    for event in seen.events:
+    for event in view.events:
         style = _WHAT.get(event["what"], PLAIN)
         for i, part in enumerate(textwrap.wrap(event["text"], max(10, width - 21)) or [""]):
             start: Line = [(f"{_clock(event['time'])} ", DIM), (cell(event["what"], 11) + " ", style)]
             lines.append([*(start if i == 0 else [(" " * 21, PLAIN)]), (part, style if style is TROUBLE else PLAIN)])
-    return head, lines or [[("nothing has happened yet", DIM)]]
+    return head, lines or [[("no events yet", DIM)]]
 
 
 def title(focused: bool) -> Any:
@@ -192,18 +192,18 @@ FOCUSED = BOLD.__class__(reverse=True)
 
 
 class Keys(Lines):
-    """One line of keys and what they do."""
+    """One line of keys and their actions."""
 
     def fill(self, keys: Sequence[tuple[str, str]]) -> None:
-        """Show these."""
+        """Show ``keys``: pairs of key and action."""
         self.show([[part for key, does in keys for part in ((f" {key}", ACCENT), (f" {does} ", DIM))]])
 
 
 class Tabs(Lines):
-    """The panes by number, where there is only room for one."""
+    """The numbered panes, for a terminal that fits only one."""
 
     def fill(self, names: Sequence[str], active: int) -> None:
-        """Show these."""
+        """Show the names; ``active``: index of the pane that is shown."""
         line: Line = [(" ", PLAIN)]
         for i, name in enumerate(names):
             line += [(f" {i + 1} {name} ", title(True) if i == active else DIM), (" ", PLAIN)]

@@ -1,4 +1,4 @@
-"""The loop of ``icrl-dist play``: one thread has the game, any number of viewers see it and disturb it."""
+"""The loop of ``icrl-dist play``: one thread owns the game, and any number of viewers watch and control it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from rich.console import Console
 
 from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import ConfigError, Deployment, parse
-from icrl_dist.monitor.serve import EventStream, application, serving
+from icrl_dist.monitor.event_stream import EventStream
+from icrl_dist.monitor.serve import application, serving
 from icrl_dist.problems import registry as problems
 
 FRAME_S, BELIEF_S, HURRY_S = 0.05, 0.15, 0.25
-"""At least so long from one picture to the next, from one belief, and from one picture where steps follow as fast as can be."""
+"""Minimum time between two states sent, between two beliefs, and between two states while steps run at full speed."""
 _ANSWER_S = 10.0
 
 
 class Player:
-    """Steps a game at its speed while somebody looks on.
+    """Steps a game at its speed while viewers are connected.
 
-    The game is touched by the thread in ``run`` alone; ``command`` may be called from any.
+    Only the thread in ``run`` accesses the game; ``command`` may be called from any thread.
     """
 
     def __init__(self, game: Any, stream: EventStream) -> None:
@@ -32,18 +33,18 @@ class Player:
         self._orders: queue.SimpleQueue[tuple[dict[str, Any], Future[None]]] = queue.SimpleQueue()
 
     def command(self, fields: dict[str, Any]) -> None:
-        """Have the game do it, and wait for that.  Raises ValueError as ``PlayGame.command`` does."""
+        """Execute a command in the thread of the game and wait for it.  Raises ValueError as ``PlayGame.command`` does."""
         done: Future[None] = Future()
         self._orders.put((fields, done))
         try:
             done.result(_ANSWER_S)
         except TimeoutError:
-            raise ValueError("the game is busy: try again") from None
+            raise ValueError(f"no answer from the game for {_ANSWER_S:g} s: try again") from None
 
     def run(self, over: Event) -> None:
         """Play until ``over`` is set."""
         step_at = frame_at = belief_at = 0.0
-        picture = belief = True  # whether viewers have yet to be shown the newest
+        picture = belief = True  # whether the newest state and belief are not sent yet
         finished = -1
         while not over.is_set():
             game, now = self._game, time.monotonic()
@@ -68,7 +69,7 @@ class Player:
                 picture, belief, finished = True, True, -1
 
     def _obey(self, wait_s: float) -> bool:
-        """Carry out what is ordered within ``wait_s``; whether anything was."""
+        """Execute the commands that arrive within ``wait_s``; returns whether there were any."""
         obeyed = False
         try:
             while True:
@@ -95,20 +96,18 @@ class Player:
 def play(
     what: str | Path, where: tuple[str, int], deploy: Deployment | None, seed: int, paused: bool, console: Console
 ) -> None:
-    """Let whoever opens the page at ``where``, host and port, disturb the agent, until interrupted.
+    """Serve the game at ``where``, host and port, until interrupted.
 
-    Raises ConfigError for an agent of another game than Dark Room, or if it cannot listen there.
+    Raises ConfigError if the agent is not for Dark Room, or if the address cannot be used.
     """
     agent = load_agent(what, seed, deploy)
     run = parse(str(agent.manifest.get("run", "")), str(what))
     make_game = problems.of(run).game
     if make_game is None:
-        raise ConfigError(
-            f"play {what}: its agent was trained in {run.problem}, which cannot be played; use an agent of darkroom"
-        )
+        raise ConfigError(f"play {what}: its agent is for {run.problem}, which cannot be played; use an agent of darkroom")
     stream, game = EventStream(), make_game(agent, run, seed)
     game.pause(paused)
     player = Player(game, stream)
     with serving(application("play.html", stream, player.command), stream, *where) as url:
-        console.print(f"{url}: be the adversary (Ctrl-C ends it)", highlight=False, markup=False)
+        console.print(f"{url}: the page of the game (Ctrl-C ends the game)", highlight=False, markup=False)
         player.run(Event())

@@ -1,6 +1,6 @@
-"""Messages of the monitor plane, each read as a whole before any of it is believed.
+"""Parsers of monitor messages: each checks the whole message before the view uses any field of it.
 
-Every function raises Odd for a message that is not what docs/tap.md says.
+Every function raises InvalidMessageError for a message that does not match docs/tap.md.
 """
 
 from __future__ import annotations
@@ -8,59 +8,59 @@ from __future__ import annotations
 from typing import Any
 
 from icrl_dist.monitor import validation
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.types import STAGES
 
-EVENTS = 200
-"""Events that are remembered, and alerts that are on, at most."""
-_TOLD = 4096
-"""Phases, and alerts, of which a message tells, at most."""
+MAX_EVENTS = 200
+"""Limit on the events that are kept, and on the active alerts."""
+_MAX_ENTRIES = 4096
+"""Limit on the phases, and on the alerts, in one message."""
 _COUNTS = ("round", "step", "steps", "version", "trajectories", "workers", "lag")
 
 
 def progress(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``learner`` message: how far the run is, and when that was said."""
+    """Parse a ``learner`` message: the run's progress and the time of the message."""
     stage, phase, loss = (message.get(name) for name in ("stage", "phase", "loss"))
     if stage not in ("collect", "fit") or phase not in STAGES:
-        raise Odd("schema")
+        raise InvalidMessageError("schema")
     found = {name: validation.integer(message.get(name), -1) for name in _COUNTS}
     return {
         **found,
         "stage": stage,
         "phase": phase,
         "drops": validation.counts(message.get("drops")),
-        "doing": [validation.text(line, 200) for line in validation.listed(message.get("doing"), 64)],
-        "time": validation.when(message.get("time")),
+        "doing": [validation.text(line, 200) for line in validation.bounded_list(message.get("doing"), 64)],
+        "time": validation.timestamp(message.get("time")),
         **({} if loss is None else {"loss": validation.number(loss)}),
     }
 
 
-def about(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``run`` message: what the run is about, and the alerts that are on; None where it does not say (a recording)."""
-    phases = [validation.listed(phase, 3) for phase in validation.listed(message.get("phases"), _TOLD)]
+def run_info(message: dict[str, Any]) -> dict[str, Any]:
+    """Parse a ``run`` message: method, problem, phases and active alerts; ``alerts`` is None if absent (a recording)."""
+    phases = [validation.bounded_list(phase, 3) for phase in validation.bounded_list(message.get("phases"), _MAX_ENTRIES)]
     alerts = message.get("alerts")
     return {
         **{name: validation.text(message.get(name), longest) for name, longest in (("method", 32), ("problem", 64))},
         **{name: validation.integer(message.get(name), 0, 10**7) for name in ("tasks", "variations", "rounds")},
-        "began": validation.when(message.get("began")),
+        "began": validation.timestamp(message.get("began")),
         "phases": [
             (validation.text(p[0], 32), validation.integer(p[1], 0), validation.integer(p[2], 0)) for p in phases if len(p) == 3
         ],
         "alerts": None
         if alerts is None
-        else [_alert(validation.mapped(one)) for one in validation.listed(alerts, _TOLD)[:EVENTS]],
+        else [_alert(validation.mapping(one)) for one in validation.bounded_list(alerts, _MAX_ENTRIES)[:MAX_EVENTS]],
     }
 
 
-def _alert(told: dict[str, Any]) -> dict[str, Any]:
-    text = validation.text(told.get("text"), 500)
-    return {"name": validation.text(told.get("name")), "text": text, "since": validation.when(told.get("since"))}
+def _alert(entry: dict[str, Any]) -> dict[str, Any]:
+    text = validation.text(entry.get("text"), 500)
+    return {"name": validation.text(entry.get("name")), "text": text, "since": validation.timestamp(entry.get("since"))}
 
 
 def event(message: dict[str, Any]) -> dict[str, Any]:
-    """Of an ``event`` message: what happened, and what belongs to events of that sort."""
+    """Parse an ``event`` message: its kind, text and time, and the fields of that kind of event."""
     what = validation.text(message.get("what"), 32)
-    found = {"what": what, "text": validation.text(message.get("text"), 500), "time": validation.when(message.get("time"))}
+    found = {"what": what, "text": validation.text(message.get("text"), 500), "time": validation.timestamp(message.get("time"))}
     if what == "worker":
         found |= {"worker": validation.text(message.get("worker")), "alive": bool(message.get("alive"))}
     elif what == "alert":
@@ -73,16 +73,16 @@ def event(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def belief(message: dict[str, Any]) -> dict[str, Any]:
-    """Of a ``belief`` message: where a worker's T_theta believes the goal to be."""
+    """Parse a ``belief`` message: the posterior over goals that T_theta implies on a worker, and the exact one."""
     size = validation.integer(message.get("size"), 2, 64)
-    goal = [validation.integer(c, 0, size - 1) for c in validation.listed(message.get("goal"), 2)]
-    laws = {name: validation.numbers(message.get(name), size * size) for name in ("implied", "exact")}
-    if any(len(law) != size * size for law in laws.values()) or len(goal) != 2:
-        raise Odd("schema")
+    goal = [validation.integer(c, 0, size - 1) for c in validation.bounded_list(message.get("goal"), 2)]
+    distributions = {name: validation.numbers(message.get(name), size * size) for name in ("implied", "exact")}
+    if any(len(probs) != size * size for probs in distributions.values()) or len(goal) != 2:
+        raise InvalidMessageError("schema")
     return {
         "worker": validation.text(message.get("worker")),
         "identity": str(validation.identity(message.get("identity"))),
         "size": size,
         "goal": goal,
-        **laws,
+        **distributions,
     }

@@ -17,23 +17,23 @@ from textual.widgets import Input
 from icrl_dist.monitor import detail, panes
 from icrl_dist.monitor.feed import Feed
 from icrl_dist.monitor.lines import DIM, Scroll
-from icrl_dist.monitor.pages import HELP, Detail, Help, Page
+from icrl_dist.monitor.overlays import HELP, Detail, Help, Overlay
 from icrl_dist.monitor.panes import Header, Keys, Tabs
-from icrl_dist.monitor.seen import Seen
 from icrl_dist.monitor.tables import VARIATIONS, WORKERS, Table, worker_row
+from icrl_dist.monitor.view_state import ViewState
 
 PERIOD_S = 0.25
-"""What is seen is brought up to date this often, and less often where that takes long."""
-_SHARE = 8
-"""It rests so many times as long as it worked."""
+"""Time between two updates of the view; longer if an update takes long."""
+_REST = 8
+"""Ratio of the time between updates to the time that an update takes."""
 _ROOMY = (110, 36)
-"""From so many columns and lines on, all panes are shown at once."""
+"""Columns and lines from which on all panes are shown at once."""
 _PANES = ("variations", "workers", "rates", "events")
 INTERRUPTED = 130
 
 
-class Screen(App[None]):
-    """One run, live or played again."""
+class MonitorApp(App[None]):
+    """One run, live or from a recording."""
 
     ENABLE_COMMAND_PALETTE = False
     TITLE = "icrl-dist monitor"
@@ -58,7 +58,7 @@ class Screen(App[None]):
         Binding("shift+tab", "pane(-1)", priority=True),
         *(Binding(str(i + 1), f"show({i})") for i in range(len(_PANES))),
         Binding("q", "quit"),
-        Binding("p,space", "hold"),
+        Binding("p,space", "freeze"),
         Binding("s", "sort"),
         Binding("S", "reverse"),
         Binding("slash", "filter"),
@@ -68,14 +68,14 @@ class Screen(App[None]):
         Binding("minus", "speed(0.5)"),
         Binding("left", "seek(-1)"),
         Binding("right", "seek(1)"),
-        Binding("left_square_bracket", "beside(-1)"),
-        Binding("right_square_bracket", "beside(1)"),
+        Binding("left_square_bracket", "neighbor(-1)"),
+        Binding("right_square_bracket", "neighbor(1)"),
     ]
 
     def __init__(self, feed: Feed) -> None:
         super().__init__()
         self._feed = feed
-        self._seen = Seen(feed.picture)
+        self._view = ViewState(feed.state)
         self._frozen: float | None = None
         self._active = 0
         self._not_before = 0.0
@@ -101,33 +101,33 @@ class Screen(App[None]):
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             try:
                 asyncio.get_running_loop().add_signal_handler(number, self.action_interrupt)
-            except (ValueError, RuntimeError):  # not the main thread: signals are not ours
+            except (ValueError, RuntimeError):  # not in the main thread, which alone handles signals
                 break
         self._laid_out = True
         self._arrange()
         self.set_interval(PERIOD_S, self._tick)
-        self.look()
+        self.update_view()
 
-    # What is shown.
+    # Content of the widgets.
 
     def _tick(self) -> None:
         began = time.monotonic()
         if began >= self._not_before:
-            self.look()
-            self._not_before = began + (time.monotonic() - began) * (1 + _SHARE)
+            self.update_view()
+            self._not_before = began + (time.monotonic() - began) * (1 + _REST)
 
-    def look(self) -> None:
-        """Bring what is shown up to date, unless it is frozen."""
+    def update_view(self) -> None:
+        """Show the newest state, unless the view is frozen."""
         if self._frozen is None:
-            self._seen.look(self._feed.now())
+            self._view.update(self._feed.now())
         self._fill()
 
     def _fill(self) -> None:
-        """Everything in sight as it is now."""
+        """Fill every visible widget."""
         if not self.screen_stack or not self.screen.query(Keys):
-            return  # a page that is not composed yet, or is being left, or the end
+            return  # the screen is not composed yet, or is being closed
         replay = self._feed.replay()
-        self.screen.query_one(Header).fill(self._seen, replay, self._frozen, not self._roomy())
+        self.screen.query_one(Header).fill(self._view, replay, self._frozen, not self._roomy())
         self.screen.query_one(Keys).fill(self._keys(replay))
         if isinstance(self.screen, Help):
             self.screen.query_one(Scroll).fill([], HELP)
@@ -139,40 +139,41 @@ class Screen(App[None]):
     def _fill_detail(self, page: Detail) -> None:
         if self._frozen is not None and page.filled == page.variation:
             return
-        known, sheet = self._feed.picture.variation(page.variation), page.query_one(Scroll)
+        known, sheet = self._feed.state.variation(page.variation), page.query_one(Scroll)
         if known is not None:
             sheet.fill(*detail.lines(known, sheet.size.width or self.size.width))
         else:
-            sheet.fill([], [[(f" {page.variation}: not heard of at this time", DIM)]])
+            sheet.fill([], [[(f" {page.variation}: no episode yet", DIM)]])
         page.filled = page.variation
 
     def _fill_panes(self) -> None:
-        seen = self._seen
+        view = self._view
         if (pane := self._pane("variations")).display:
             assert isinstance(pane, Table)
-            pane.note = f"{seen.left_out:,} more are not kept" if seen.left_out else ""
-            pane.fill(seen.variations.values())
+            pane.note = f"{view.left_out:,} more are not kept" if view.left_out else ""
+            pane.fill(view.variations.values())
         if (pane := self._pane("workers")).display:
             assert isinstance(pane, Table)
-            pane.fill(worker_row(row) for row in seen.workers)
-        for name, lines in (("rates", panes.rates), ("events", panes.happened)):
+            pane.fill(worker_row(row) for row in view.workers)
+        for name, lines in (("rates", panes.rate_lines), ("events", panes.event_lines)):
             if (pane := self._pane(name)).display:
                 assert isinstance(pane, Scroll)
-                pane.fill(*lines(seen, pane.size.width or 40, pane.size.height, pane.has_focus))
+                pane.fill(*lines(view, pane.size.width or 40, pane.size.height, pane.has_focus))
         if self.query_one(Tabs).display:
-            counts = (len(seen.variations), len(seen.workers), None, len(seen.events))
+            counts = (len(view.variations), len(view.workers), None, len(view.events))
             names = [name if n is None else f"{name} {n:,}" for name, n in zip(_PANES, counts, strict=True)]
             self.query_one(Tabs).fill(names, self._active)
 
     def _keys(self, replay: dict[str, Any] | None) -> list[tuple[str, str]]:
-        hold = ("p", "play" if replay and replay["paused"] else "pause" if replay else "go on" if self._frozen else "freeze")
-        played = [("+-", "speed"), ("←→", "seek")] if replay else []
-        if isinstance(self.screen, Page):
-            beside = [("[ ]", "previous, next")] if isinstance(self.screen, Detail) else []
-            return [("Esc", "back"), ("↑↓", "scroll"), *beside, hold, *played, ("q", "quit")]
-        return [
-            ("q", "quit"), hold, ("s", "sort"), ("/", "filter"), ("⏎", "open"), ("Tab", "next"), *played, ("?", "help")
-        ]  # fmt: skip
+        if replay:
+            freeze, recording = ("p", "play" if replay["paused"] else "pause"), [("+-", "speed"), ("←→", "seek")]
+        else:
+            freeze, recording = ("p", "unfreeze" if self._frozen else "freeze"), []
+        if isinstance(self.screen, Overlay):
+            neighbors = [("[ ]", "previous, next")] if isinstance(self.screen, Detail) else []
+            return [("Esc", "back"), ("↑↓", "scroll"), *neighbors, freeze, *recording, ("q", "quit")]
+        table = [("s", "sort"), ("/", "filter"), ("⏎", "open"), ("Tab", "next")]
+        return [("q", "quit"), freeze, *table, *recording, ("?", "help")]
 
     def _pane(self, name: str) -> Widget:
         return self.screen_stack[0].query_one(f"#{name}")
@@ -186,7 +187,7 @@ class Screen(App[None]):
         return self.size.width >= _ROOMY[0] and self.size.height >= _ROOMY[1]
 
     def _arrange(self) -> None:
-        """All panes where there is room for them, else the one that is chosen."""
+        """Show all panes if the terminal is large enough, else only the active one."""
         roomy = self._roomy()
         base = self.screen_stack[0]
         base.set_class(not roomy, "one")
@@ -197,15 +198,15 @@ class Screen(App[None]):
         base.query_one("#right").display = roomy or self._active >= 2
         self._pane(_PANES[self._active]).focus()
 
-    # What the keys do.
+    # Actions of the keys.
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Some keys are for the tables, some for a page over them, and while one types they are letters."""
+        """Whether a key acts now: some keys are for tables, some for overlays, and a filter takes keys as letters."""
         if action in ("pane", "show", "sort", "reverse", "filter"):
-            return not isinstance(self.screen, Page) and not self._typing()
+            return not isinstance(self.screen, Overlay) and not self._typing()
         if action in ("speed", "seek"):
             return self._feed.replay() is not None and not self._typing()
-        if action == "beside":
+        if action == "neighbor":
             return isinstance(self.screen, Detail)
         return True
 
@@ -213,7 +214,7 @@ class Screen(App[None]):
         return isinstance(self.focused, Input)
 
     def action_interrupt(self) -> None:
-        """Leave, as Ctrl-C does."""
+        """Quit with the exit code of Ctrl-C."""
         self.exit(return_code=INTERRUPTED)
 
     def action_pane(self, step: int) -> None:
@@ -224,14 +225,14 @@ class Screen(App[None]):
         self._arrange()
         self.call_after_refresh(self._fill)
 
-    def action_hold(self) -> None:
-        """Pause a recording; of a run that is on, freeze what is shown of it."""
+    def action_freeze(self) -> None:
+        """Pause or resume a recording; freeze or unfreeze the view of a live run."""
         replay = self._feed.replay()
         if replay is not None:
             self._feed.control(paused=not replay["paused"])
         else:
             self._frozen = self._feed.now() if self._frozen is None else None
-        self.look()
+        self.update_view()
 
     def _table(self) -> Table | None:
         pane = self._pane(_PANES[self._active])
@@ -254,26 +255,26 @@ class Screen(App[None]):
     def on_input_changed(self, event: Input.Changed) -> None:
         if (table := self._table()) and self._typing():
             table.filter = event.value
-            table.again()
+            table.redraw()
 
     def on_input_submitted(self) -> None:
-        self._typed()
+        self._close_input()
 
-    def _typed(self) -> None:
+    def _close_input(self) -> None:
         self.query_one(Input).display = False
         self._pane(_PANES[self._active]).focus()
 
     def action_clear(self) -> None:
-        """Back from a page; in a table, all rows again."""
-        if isinstance(self.screen, Page):
+        """Close an overlay; in a table, remove the filter."""
+        if isinstance(self.screen, Overlay):
             self.pop_screen()
             self.call_after_refresh(self._fill)
             return
         if table := self._table():
             table.filter = ""
-            table.again()
+            table.redraw()
         if self._typing():
-            self._typed()
+            self._close_input()
 
     def action_help(self) -> None:
         self._open(Help())
@@ -282,16 +283,16 @@ class Screen(App[None]):
         if self._active == 0:
             self._open(Detail(event.row))
 
-    def _open(self, page: Page) -> None:
+    def _open(self, page: Overlay) -> None:
         if not isinstance(self.screen, type(page)):
             self.push_screen(page)
             self.call_after_refresh(self._fill)
 
-    def action_beside(self, step: int) -> None:
+    def action_neighbor(self, step: int) -> None:
         if isinstance(self.screen, Detail):
             table = self._pane("variations")
             assert isinstance(table, Table)
-            self.screen.variation = table.beside(step) or self.screen.variation
+            self.screen.variation = table.move(step) or self.screen.variation
             self._fill()
 
     def action_speed(self, factor: float) -> None:
@@ -300,14 +301,14 @@ class Screen(App[None]):
             self._fill()
 
     def action_seek(self, direction: int) -> None:
-        """A twentieth of the recording back or on."""
+        """Seek back or forward by a twentieth of the recording."""
         if replay := self._feed.replay():
             self._feed.control(at=replay["at"] + direction * (replay["end"] - replay["begin"]) / 20)
             self._fill()
 
 
 def watch(feed: Feed) -> int:
-    """Show a run until it is left; returns the exit code."""
-    app: Any = Screen(feed)
+    """Show a run in the terminal until the user quits; returns the exit code."""
+    app: Any = MonitorApp(feed)
     app.run(mouse=False)
     return int(app.return_code or 0)

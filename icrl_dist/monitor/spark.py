@@ -1,4 +1,4 @@
-"""Numbers drawn in characters: sparklines, bars, small plots, and rooms seen from above."""
+"""Text drawings: sparklines, progress bars, small plots, and Dark Rooms from above."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 from collections.abc import Sequence
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
-"""Nothing to full, an eighth at a time."""
+"""From empty to full in steps of an eighth."""
 _EIGHTHS = len(BLOCKS) - 1
 
 Values = Sequence[float | None]
 
 
 def bounds(values: Values, ceiling: float | None = None) -> tuple[float, float]:
-    """Where a drawing of returns begins and ends: zero, the values and what can be reached are within."""
+    """Lower and upper bound of a plot of returns: they include zero, the values and ``ceiling`` (the optimum)."""
     known = [value for value in values if value is not None]
     low = min([0.0, *known])
     high = max([0.0, *known, *([ceiling] if ceiling is not None else [])])
@@ -21,7 +21,7 @@ def bounds(values: Values, ceiling: float | None = None) -> tuple[float, float]:
 
 
 def resample(values: Values, width: int) -> list[float | None]:
-    """At most ``width`` values: means of as many buckets, each of adjacent values; None where nothing is known."""
+    """At most ``width`` values: the means of equal buckets of adjacent values; None where a bucket has no value."""
     if len(values) <= width:
         return list(values)
     means: list[float | None] = []
@@ -33,7 +33,7 @@ def resample(values: Values, width: int) -> list[float | None]:
 
 
 def spark(values: Values, width: int, low: float, high: float) -> str:
-    """A line of at most ``width`` blocks; the lowest is seen, a value that is not known is a space."""
+    """A line of at most ``width`` blocks; the lowest value is one eighth high, an unknown value is a space."""
     return "".join(
         " " if value is None else BLOCKS[1 + min(_EIGHTHS - 1, _eighths(value, low, high, _EIGHTHS))]
         for value in resample(values, width)
@@ -41,33 +41,33 @@ def spark(values: Values, width: int, low: float, high: float) -> str:
 
 
 def plot(values: Values, width: int, height: int, low: float, high: float) -> list[str]:
-    """``height`` lines of at most ``width`` columns, the top one first; the lowest value is seen."""
+    """``height`` lines of at most ``width`` columns, top line first; the lowest value is one eighth high."""
     whole = height * _EIGHTHS
     tops = [0 if value is None else 1 + min(whole - 1, _eighths(value, low, high, whole)) for value in resample(values, width)]
     return ["".join(BLOCKS[min(_EIGHTHS, max(0, top - row * _EIGHTHS))] for top in tops) for row in range(height - 1, -1, -1)]
 
 
 def _eighths(value: float, low: float, high: float, whole: int) -> int:
-    """How many of ``whole`` equal steps from low to high are behind a value."""
+    """Number of the ``whole`` equal steps from low to high that lie below a value."""
     share = (value - low) / (high - low) if high > low else 0.0
     return math.floor(min(1.0, max(0.0, share)) * whole + 1e-9)
 
 
 def bar(share: float, width: int) -> tuple[str, str]:
-    """The part of a bar that is done, and the part that is left."""
+    """The done part and the remaining part of a progress bar."""
     done = round(min(1.0, max(0.0, share)) * width)
     return "━" * done, "─" * (width - done)
 
 
 Mark = tuple[str, str]
-"""A cell's characters and what it is: ``goal``, ``start``, ``path``, ``moved`` (by the adversary) or ``empty``."""
+"""A cell's text and its kind: ``goal``, ``start``, ``path``, ``moved`` (by the adversary) or ``empty``."""
 
 
 def room(size: int, goal: Sequence[int], path: Sequence[Sequence[int]], overridden: Sequence[bool]) -> list[list[Mark]]:
-    """A Dark Room episode from above, x to the right and y upwards, the top row first.
+    """A Dark Room episode from above: x to the right, y upwards, top row first.
 
-    A cell holds the step at which it was first entered, 0 at the start; a goal that was never
-    met holds ``G``.
+    A cell contains the step at which it was first entered, 0 at the start; a goal that was never
+    entered contains ``G``.
     """
     entered: dict[tuple[int, int], int] = {}
     for number, (x, y) in enumerate(path):

@@ -1,4 +1,4 @@
-"""The view's two tables, of workers and of variations: sorted, filtered, and only the rows in sight are made."""
+"""The tables of workers and of variations: sorted, filtered; only the visible rows are drawn."""
 
 from __future__ import annotations
 
@@ -28,88 +28,89 @@ from icrl_dist.monitor.lines import (
     fit,
     spread,
 )
-from icrl_dist.monitor.seen import Row, matches, number
 from icrl_dist.monitor.spark import bounds, spark
+from icrl_dist.monitor.view_state import Row, matches, number
 
 _HEAD = 2
 """Lines above the rows."""
 
 
 @dataclass(frozen=True)
-class Kind:
-    """What a table is of."""
+class TableSpec:
+    """Definition of a table: its columns, sort orders and texts."""
 
     title: str
     columns: tuple[Column, ...]
     orders: dict[str, Callable[[Row], Any]]
-    """Ways to sort, by name: of each, what is compared; the first is the default."""
+    """Sort keys by name of the order; the first order is the default."""
     draw: Callable[[Row, str, int], Part]
-    """A row's cell in the named column, so many cells wide."""
-    across: Callable[[Row], str]
-    """What to say of a row instead of its figures, if anything."""
-    named: tuple[str, ...]
-    """The columns that are no figures."""
+    """Text and style of a row's cell, given row, column name and width in cells."""
+    notice: Callable[[Row], str]
+    """A text that replaces a row's figures, or an empty text."""
+    text_columns: tuple[str, ...]
+    """The columns that a notice does not replace."""
     empty: str
-    """What to say as long as there are none."""
+    """Text of an empty table."""
 
 
 class Table(Lines, can_focus=True):
     """A table with a cursor."""
 
     class Opened(Message):
-        """A row was chosen; ``row`` is its name."""
+        """The user opened a row; ``row`` is its name."""
 
         def __init__(self, row: str) -> None:
             super().__init__()
             self.row = row
 
-    def __init__(self, name: str, kind: Kind) -> None:
+    def __init__(self, name: str, spec: TableSpec) -> None:
         super().__init__(name)
-        self._kind = kind
+        self._spec = spec
         self._rows: list[Row] = []
         self._total = self._top = self._cursor = 0
-        self._at = ""
-        self._order, self._reverse = next(iter(kind.orders)), False
+        self._selected = ""
+        """Name of the row at the cursor."""
+        self._order, self._reverse = next(iter(spec.orders)), False
         self.filter = ""
-        """What rows must match, as it was typed."""
+        """The filter as typed; only rows that match it are shown."""
         self.note = ""
         """Added to the title."""
         self._all: list[Row] = []
 
     def fill(self, rows: Iterable[Row]) -> None:
-        """Show these rows; the cursor stays on the row that it is on, wherever that goes."""
+        """Replace the rows; the cursor stays on its row, wherever sorting moves that row."""
         self._all = list(rows)
         self._total = len(self._all)
         shown = [row for row in self._all if matches(row, self.filter)] if self.filter else self._all
-        key = self._kind.orders[self._order]
+        key = self._spec.orders[self._order]
         self._rows = sorted(shown, key=key, reverse=self._reverse)
-        if self._at and self._cursor:  # on the first row it stays on the first row
-            places = {row["name"]: index for index, row in enumerate(self._rows)}
-            self._cursor = places.get(self._at, self._cursor)
+        if self._selected and self._cursor:  # a cursor at the top stays at the top
+            indices = {row["name"]: index for index, row in enumerate(self._rows)}
+            self._cursor = indices.get(self._selected, self._cursor)
         self._draw()
 
-    def again(self) -> None:
-        """Sort, filter and draw once more."""
+    def redraw(self) -> None:
+        """Sort, filter and draw the present rows again."""
         self.fill(self._all)
 
     def sort_next(self) -> None:
-        """Sort by the next of the ways that there are."""
-        names = list(self._kind.orders)
+        """Switch to the next sort order."""
+        names = list(self._spec.orders)
         self._order, self._reverse = names[(names.index(self._order) + 1) % len(names)], False
-        self.again()
+        self.redraw()
 
     def sort_reverse(self) -> None:
-        """Sort the other way round."""
+        """Reverse the sort order."""
         self._reverse = not self._reverse
-        self.again()
+        self.redraw()
 
-    def beside(self, step: int) -> str:
-        """The name of the row so many further, which the cursor goes to."""
-        self._move(self._cursor + step)
-        return self._at
+    def move(self, step: int) -> str:
+        """Move the cursor by ``step`` rows; returns the name of its row."""
+        self._move_to(self._cursor + step)
+        return self._selected
 
     def on_resize(self) -> None:
-        self.again()
+        self.redraw()
 
     def on_focus(self) -> None:
         self._draw()
@@ -122,77 +123,79 @@ class Table(Lines, can_focus=True):
         steps = {"up": -1, "k": -1, "down": 1, "j": 1, "pageup": -page, "pagedown": page, "home": -(10**9), "end": 10**9}
         if event.key in steps:
             event.stop()
-            self._move(self._cursor + steps[event.key])
+            self._move_to(self._cursor + steps[event.key])
         elif event.key == "enter" and self._rows:
             event.stop()
             self.post_message(self.Opened(self._rows[self._cursor]["name"]))
 
-    def _move(self, to: int) -> None:
-        self._cursor = min(max(0, to), max(0, len(self._rows) - 1))
-        self._at = self._rows[self._cursor]["name"] if self._rows else ""
+    def _move_to(self, index: int) -> None:
+        self._cursor = min(max(0, index), max(0, len(self._rows) - 1))
+        self._selected = self._rows[self._cursor]["name"] if self._rows else ""
         self._draw()
 
     def _draw(self) -> None:
-        width, room = self.size.width, max(0, self.size.height - _HEAD)
+        width, height = self.size.width, max(0, self.size.height - _HEAD)
         if not width:
             return
         count = len(self._rows)
         self._cursor = min(self._cursor, max(0, count - 1))
-        self._at = self._rows[self._cursor]["name"] if self._rows else ""
-        self._top = max(0, min(max(min(self._top, self._cursor), self._cursor - room + 1), max(0, count - room)))
-        fitted = fit(self._kind.columns, width)
-        self.show([self._title(width, room), self._header(fitted), *self._body(fitted, width, room)])
+        self._selected = self._rows[self._cursor]["name"] if self._rows else ""
+        self._top = max(0, min(max(min(self._top, self._cursor), self._cursor - height + 1), max(0, count - height)))
+        fitted = fit(self._spec.columns, width)
+        self.show([self._title(width, height), self._header(fitted), *self._body(fitted, width, height)])
 
-    def _title(self, width: int, room: int) -> Line:
+    def _title(self, width: int, height: int) -> Line:
         arrow = "▲" if self._reverse else "▼"
-        title: Line = [(self._kind.title, TITLE), (f" {self._total:,}", BOLD), (f"  by {self._order} {arrow}", DIM)]
+        title: Line = [(self._spec.title, TITLE), (f" {self._total:,}", BOLD), (f"  by {self._order} {arrow}", DIM)]
         if self.filter:
             title += [("  only ", DIM), (f"{self.filter}: {len(self._rows):,}", WARNING)]
         if self.note:
             title.append((f"  {self.note}", WARNING))
-        more = len(self._rows) - self._top - room
-        where = f"{self._top + 1:,}-{min(len(self._rows), self._top + room):,} of {len(self._rows):,}"
-        return spread(title, [(f"{where}, {more:,} more below" if more > 0 else where, DIM)] if self._rows else [], width)
+        more = len(self._rows) - self._top - height
+        shown = f"{self._top + 1:,}-{min(len(self._rows), self._top + height):,} of {len(self._rows):,}"
+        return spread(title, [(f"{shown}, {more:,} more below" if more > 0 else shown, DIM)] if self._rows else [], width)
 
     def _header(self, fitted: list[tuple[Column, int]]) -> Line:
         return [(cell(column.title, width, column.right) + " ", DIM) for column, width in fitted]
 
-    def _body(self, fitted: list[tuple[Column, int]], width: int, room: int) -> list[Line]:
+    def _body(self, fitted: list[tuple[Column, int]], width: int, height: int) -> list[Line]:
         if not self._rows:
-            return [[("none matches; Esc shows all" if self._total else self._kind.empty, DIM)]]
+            return [[("no row matches; Esc shows all rows" if self._total else self._spec.empty, DIM)]]
         lines: list[Line] = []
-        for index in range(self._top, min(len(self._rows), self._top + room)):
+        for index in range(self._top, min(len(self._rows), self._top + height)):
             row, line, used = self._rows[index], [], 0
-            across = self._kind.across(row)
-            for column, wide in fitted:
-                if across and column.name not in self._kind.named:
-                    line.append((cell(across, width - used), TROUBLE))
+            notice = self._spec.notice(row)
+            for column, cells in fitted:
+                if notice and column.name not in self._spec.text_columns:
+                    line.append((cell(notice, width - used), TROUBLE))
                     break
-                text, style = self._kind.draw(row, column.name, wide)
-                line.append((cell(text, wide, column.right) + " ", style))
-                used += wide + 1
+                text, style = self._spec.draw(row, column.name, cells)
+                line.append((cell(text, cells, column.right) + " ", style))
+                used += cells + 1
             if index == self._cursor and self.has_focus:
                 line = [(text, style + CURSOR) for text, style in spread(line, [("", PLAIN)], width)]
             lines.append(line)
         return lines
 
 
-_TROUBLE = ("gone", "silent", "waiting", "working", "done")
+_STATES = ("gone", "silent", "waiting", "working", "done")
+"""States of a worker, in the order of the table."""
 
 
 def worker_row(row: Row) -> Row:
-    """A worker's row with what is searched."""
+    """A worker's row, with ``search_text``, ``task`` and ``variation`` for filters."""
     parts = row["job"].split("/")
-    found = " ".join((row["name"], row["state"], row["job"], row["doing"])).casefold()
-    return row | {"found": found, "task": parts[2] if len(parts) > 2 else "", "variation": parts[3] if len(parts) > 3 else ""}
+    search_text = " ".join((row["name"], row["state"], row["job"], row["doing"])).casefold()
+    task, variation = (parts[2] if len(parts) > 2 else ""), (parts[3] if len(parts) > 3 else "")
+    return row | {"search_text": search_text, "task": task, "variation": variation}
 
 
 def _draw_worker(row: Row, column: str, width: int) -> Part:
     state = row["state"]
     style = TROUBLE if state in ("gone", "silent") else DIM if state in ("waiting", "done") else PLAIN
     if column == "state":
-        told = f"{state} {row['silent_s']:.0f} s" if state in ("gone", "silent") else state
-        return told, GOOD if state == "working" else style
+        text = f"{state} {row['silent_s']:.0f} s" if state in ("gone", "silent") else state
+        return text, GOOD if state == "working" else style
     if column == "steps_per_s":
         return number(row["steps_per_s"], 0), style
     if column == "memory_mb":
@@ -204,7 +207,7 @@ def _draw_worker(row: Row, column: str, width: int) -> Part:
     return row[column] or "-", style
 
 
-WORKERS = Kind(
+WORKERS = TableSpec(
     title="WORKERS",
     columns=(
         Column("state", "state", 11),
@@ -220,7 +223,7 @@ WORKERS = Kind(
         Column("memory_mb", "memory", 8, rank=7, right=True),
     ),
     orders={
-        "trouble": lambda row: (_TROUBLE.index(row["state"]), -row["restarts"], row["name"]),
+        "trouble": lambda row: (_STATES.index(row["state"]), -row["restarts"], row["name"]),
         "name": lambda row: row["name"],
         "episodes": lambda row: (-row["episodes"], row["name"]),
         "steps/s": lambda row: (-row["steps_per_s"], row["name"]),
@@ -228,9 +231,9 @@ WORKERS = Kind(
         "memory": lambda row: (-row["memory_mb"], row["name"]),
     },
     draw=_draw_worker,
-    across=lambda row: "",
-    named=(),
-    empty="none has been heard of yet",
+    notice=lambda row: "",
+    text_columns=(),
+    empty="no worker yet",
 )
 
 
@@ -245,8 +248,8 @@ def _draw_variation(row: Row, column: str, width: int) -> Part:
         return number(row[column]), DIM if column == "optimum" else style
     if column == "episodes":
         return f"{row['episodes']:,}", style
-    if column == "played":
-        return row["played"], style if row["quarantine"] else ACCENT
+    if column == "adversary_text":
+        return row["adversary_text"], style if row["quarantine"] else ACCENT
     return str(row[column]), style
 
 
@@ -254,20 +257,20 @@ def _share_style(share: float | None, style: Any) -> Any:
     return style if share is None else GOOD if share >= 0.9 else WARNING if share < 0.5 else PLAIN
 
 
-def _place(row: Row) -> tuple[int, int]:
+def _key(row: Row) -> tuple[int, int]:
     return row["task"], row["variation"]
 
 
-def _known(value: float | None) -> float:
+def _unknown_last(value: float | None) -> float:
     return float("inf") if value is None else value
 
 
-VARIATIONS = Kind(
+VARIATIONS = TableSpec(
     title="VARIATIONS",
     columns=(
         Column("name", "task", 7),
-        Column("where", "parameters", 14, rank=6, stretch=1),
-        Column("played", "adversary", 13, rank=1, stretch=2),
+        Column("parameters_text", "parameters", 14, rank=6, stretch=1),
+        Column("adversary_text", "adversary", 13, rank=1, stretch=2),
         Column("phase", "phase", 10, rank=4),
         Column("episodes", "eps", 5, rank=5, right=True),
         Column("last", "last", 7, rank=2, right=True),
@@ -277,15 +280,15 @@ VARIATIONS = Kind(
         Column("returns", "returns, by episode", 12, stretch=3),
     ),
     orders={
-        "task": lambda row: (not row["quarantine"], _place(row)),
-        "share": lambda row: (not row["quarantine"], _known(row["share"]), _place(row)),
-        "mean": lambda row: (_known(row["mean"]), _place(row)),
-        "last": lambda row: (_known(row["last"]), _place(row)),
-        "adversary": lambda row: (row["played"], _place(row)),
-        "episodes": lambda row: (-row["episodes"], _place(row)),
+        "task": lambda row: (not row["quarantine"], _key(row)),
+        "share": lambda row: (not row["quarantine"], _unknown_last(row["share"]), _key(row)),
+        "mean": lambda row: (_unknown_last(row["mean"]), _key(row)),
+        "last": lambda row: (_unknown_last(row["last"]), _key(row)),
+        "adversary": lambda row: (row["adversary_text"], _key(row)),
+        "episodes": lambda row: (-row["episodes"], _key(row)),
     },
     draw=_draw_variation,
-    across=lambda row: f"QUARANTINED: {row['quarantine']}" if row["quarantine"] else "",
-    named=("name", "where", "played"),
-    empty="none has been heard of yet: a trajectory tells of its variation",
+    notice=lambda row: f"QUARANTINED: {row['quarantine']}" if row["quarantine"] else "",
+    text_columns=("name", "parameters_text", "adversary_text"),
+    empty="no episode yet: a variation is listed after its first episode",
 )

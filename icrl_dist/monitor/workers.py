@@ -1,4 +1,4 @@
-"""The workers as the live view knows them: from their heartbeats and the learner's word."""
+"""State of the workers, from their heartbeats and the learner's events."""
 
 from __future__ import annotations
 
@@ -7,117 +7,117 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from icrl_dist.monitor import validation
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.telemetry import crash_reports
 
 SILENT_S = 2.0
-"""A worker whose last heartbeat is older is called silent; they come twice a second."""
-_MOST = 1024
+"""A worker is ``silent`` if its last heartbeat is older; heartbeats arrive twice a second."""
+_MAX_WORKERS = 1024
 _SPAN_S = 3.0
-"""Rates are means over about so long."""
+"""Rates are means over about this time."""
 _COUNTS = ("episodes", "steps", "resent", "trajectories", "pid")
 
 
 @dataclass(slots=True)
-class _Row:
-    beaten: float
+class _Worker:
+    last_heartbeat: float
     alive: bool = True
     restarts: int = 0
-    said: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(_COUNTS, 0) | _NOTHING)
-    marks: deque[tuple[float, int, int]] = field(default_factory=deque)
-    """When it had done how many steps and episodes."""
+    heartbeat: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(_COUNTS, 0) | _IDLE)
+    """Fields of its newest heartbeat."""
+    history: deque[tuple[float, int, int]] = field(default_factory=deque)
+    """Time, steps and episodes at recent ticks."""
 
 
-_NOTHING: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0, "policy_version": -1}
+_IDLE: dict[str, Any] = {"job": "", "doing": "", "memory_mb": 0.0, "peak_mb": 0.0, "policy_version": -1}
 
 
-class Staff:
-    """A bounded table of workers."""
+class WorkerTable:
+    """A table of workers with a limit on their number."""
 
-    def __init__(self, beats: bool = True) -> None:
-        """``beats``: there are heartbeats, so that a worker without them is silent; else it waits."""
-        self._rows: dict[str, _Row] = {}
-        self._beats = beats
+    def __init__(self, heartbeats: bool = True) -> None:
+        """``heartbeats``: False if heartbeats are not recorded; a worker is then ``waiting`` instead of ``silent``."""
+        self._workers: dict[str, _Worker] = {}
+        self._heartbeats = heartbeats
 
-    def beat(self, message: dict[str, Any], now: float) -> None:
-        """A heartbeat."""
-        said: dict[str, Any] = {name: validation.integer(message.get(name), 0) for name in _COUNTS}
-        said |= {name: validation.text(message.get(name)) for name in ("job", "doing")}
-        said |= {name: validation.number(message.get(name)) for name in ("memory_mb", "peak_mb")}
-        said["policy_version"] = validation.integer(message.get("policy_version", -1), -1)
-        row = self._row(validation.text(message.get("worker")), now)
-        if row.said["pid"] not in (0, said["pid"]):
-            row.restarts += 1
-            row.marks.clear()
-        row.said, row.beaten, row.alive = said, now, True
+    def heartbeat(self, message: dict[str, Any], now: float) -> None:
+        """Take in a ``worker`` message.  Raises InvalidMessageError."""
+        fields: dict[str, Any] = {name: validation.integer(message.get(name), 0) for name in _COUNTS}
+        fields |= {name: validation.text(message.get(name)) for name in ("job", "doing")}
+        fields |= {name: validation.number(message.get(name)) for name in ("memory_mb", "peak_mb")}
+        fields["policy_version"] = validation.integer(message.get("policy_version", -1), -1)
+        worker = self._worker(validation.text(message.get("worker")), now)
+        if worker.heartbeat["pid"] not in (0, fields["pid"]):
+            worker.restarts += 1
+            worker.history.clear()
+        worker.heartbeat, worker.last_heartbeat, worker.alive = fields, now, True
 
-    def came(self, worker: str, alive: bool, now: float) -> None:
-        """The learner says that it joined, or is gone."""
-        row = self._row(worker, now)
-        row.alive = alive
+    def set_alive(self, name: str, alive: bool, now: float) -> None:
+        """Take in the learner's event that a worker joined or left.  Raises InvalidMessageError."""
+        worker = self._worker(name, now)
+        worker.alive = alive
         if alive:
-            row.beaten = now
+            worker.last_heartbeat = now
         else:
-            row.said |= {"job": "", "doing": ""}
+            worker.heartbeat |= {"job": "", "doing": ""}
 
-    def _row(self, worker: str, now: float) -> _Row:
-        row = self._rows.get(worker)
-        if row is None:
-            if len(self._rows) >= _MOST:
-                raise Odd("too many workers")
-            row = self._rows[worker] = _Row(now)
-            before = crash_reports.predecessor(worker)
-            if before is not None and before in self._rows and not self._rows[before].alive:
-                row.restarts = self._rows.pop(before).restarts + 1
-        return row
+    def _worker(self, name: str, now: float) -> _Worker:
+        worker = self._workers.get(name)
+        if worker is None:
+            if len(self._workers) >= _MAX_WORKERS:
+                raise InvalidMessageError("too many workers")
+            worker = self._workers[name] = _Worker(now)
+            before = crash_reports.predecessor(name)
+            if before is not None and before in self._workers and not self._workers[before].alive:
+                worker.restarts = self._workers.pop(before).restarts + 1
+        return worker
 
     def tick(self, now: float) -> None:
-        """Rates are taken from where the counts stood some seconds ago."""
-        for row in self._rows.values():
-            while row.marks and row.marks[-1][0] >= now:  # a recording stands still, or a clock was set back
-                row.marks.pop()
-            row.marks.append((now, row.said["steps"], row.said["episodes"]))
-            while len(row.marks) > 2 and now - row.marks[1][0] >= _SPAN_S:
-                row.marks.popleft()
+        """Record the counts, from which ``rows`` computes rates."""
+        for worker in self._workers.values():
+            history = worker.history
+            while history and history[-1][0] >= now:  # a recording is paused, or a clock was set back
+                history.pop()
+            history.append((now, worker.heartbeat["steps"], worker.heartbeat["episodes"]))
+            while len(history) > 2 and now - history[1][0] >= _SPAN_S:
+                history.popleft()
 
     def rows(self, now: float, over: bool = False, version: int = -1) -> list[dict[str, Any]]:
-        """A row a worker, by name; ``state`` is gone, silent, waiting or working, and done once the run is ``over``.
+        """One row a worker, sorted by name.
 
-        ``version``: the newest of the weights; ``lag`` says how many versions older those are that
-        act in a worker's job, 0 if none do.
+        ``state`` is gone, silent, waiting or working, or done if the run is ``over``.  ``lag`` is the
+        number of versions between the newest weights, ``version``, and the weights of the worker's
+        job; 0 if the job uses none.
         """
-        rows = [_told(name, row, now, over, self._beats) for name, row in sorted(self._rows.items())]
+        rows = [_row(name, worker, now, over, self._heartbeats) for name, worker in sorted(self._workers.items())]
         for row in rows:
             row["lag"] = max(0, version - row["policy_version"]) if row["policy_version"] >= 0 and row["job"] else 0
         return rows
 
 
-def _told(name: str, row: _Row, now: float, over: bool, beats: bool) -> dict[str, Any]:
-    silent = max(0.0, now - row.beaten)
-    state = (
-        "done"
-        if over
-        else "gone"
-        if not row.alive
-        else ("silent" if beats else "waiting")
-        if silent > SILENT_S
-        else "working"
-        if row.said["job"]
-        else "waiting"
-    )
+def _row(name: str, worker: _Worker, now: float, over: bool, heartbeats: bool) -> dict[str, Any]:
+    silent, fields, history = max(0.0, now - worker.last_heartbeat), worker.heartbeat, worker.history
+    if over:
+        state = "done"
+    elif not worker.alive:
+        state = "gone"
+    elif silent > SILENT_S:
+        state = "silent" if heartbeats else "waiting"
+    else:
+        state = "working" if fields["job"] else "waiting"
     steps_per_s = episodes_per_s = 0.0
-    if len(row.marks) > 1 and state in ("working", "waiting"):
-        then, steps, episodes = row.marks[0]
-        span = max(1e-3, row.marks[-1][0] - then)
-        steps_per_s = max(0, row.marks[-1][1] - steps) / span
-        episodes_per_s = max(0, row.marks[-1][2] - episodes) / span
+    if len(history) > 1 and state in ("working", "waiting"):
+        began, steps, episodes = history[0]
+        span = max(1e-3, history[-1][0] - began)
+        steps_per_s = max(0, history[-1][1] - steps) / span
+        episodes_per_s = max(0, history[-1][2] - episodes) / span
     return {
         "name": name,
         "state": state,
-        **(row.said | {"job": ""} if state == "waiting" else row.said),
+        **(fields | {"job": ""} if state == "waiting" else fields),
         "steps_per_s": steps_per_s,
         "episodes_per_s": episodes_per_s,
-        "unstored": max(0, row.said["episodes"] - row.said["trajectories"]),
-        "restarts": row.restarts,
+        "unstored": max(0, fields["episodes"] - fields["trajectories"]),
+        "restarts": worker.restarts,
         "silent_s": round(silent, 1),
     }

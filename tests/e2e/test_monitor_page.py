@@ -1,4 +1,4 @@
-"""The live view in a real browser: a real run, a killed worker, hostile messages, a server that comes back."""
+"""The live view in a browser: tables, hostile messages, a restarted server, recordings, a real run with a killed worker."""
 
 import contextlib
 import os
@@ -11,14 +11,14 @@ import msgpack
 import numpy as np
 import pytest
 
-from icrl_dist.monitor import curves
+from icrl_dist.monitor import variations
 from icrl_dist.monitor.drawing import optimum
 from icrl_dist.monitor.feed import LiveFeed
-from icrl_dist.monitor.page import showing
+from icrl_dist.monitor.page import serving_run
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
-from tests.monitor.test_page import Run
+from tests.monitor.test_page import CountingFeed
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -45,49 +45,49 @@ def browser():
 
 @pytest.fixture
 def page(browser):
-    """A page that may not complain; ``page.forgiven`` says which complaints are part of the test."""
+    """A page that must log no errors or warnings, except those that match ``page.allowed_errors``."""
     page = browser.new_page(viewport={"width": 1440, "height": 900})
     page.set_default_timeout(1000 * SHORT_S)
-    page.patience = SHORT_S
-    complaints, page.forgiven = [], r"(?!)"
-    page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+    page.timeout_s = SHORT_S
+    errors, page.allowed_errors = [], r"(?!)"
+    page.on("console", lambda message: errors.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("dialog", lambda dialog: (errors.append(f"dialog: {dialog.message}"), dialog.dismiss()))
     yield page
     assert page.evaluate("window.__pwned") is None
     page.close()
-    assert [each for each in complaints if not re.search(page.forgiven, each)] == []
+    assert [error for error in errors if not re.search(page.allowed_errors, error)] == []
 
 
-class Plane:
-    """A monitor plane in this process, and a feed that listens to it."""
+class MonitorPlane:
+    """A monitor plane in this process, and a feed that subscribes to it."""
 
     def __init__(self, name):
         self.hub = MemoryHub()
         self.link, self.name = self.hub.link(), name
         self.feed = LiveFeed(self.hub.link())
         self.progress()
-        wait_for(lambda: self.feed.picture.snapshot(0.0)["run"]["name"], "the run is known", SHORT_S)
+        wait_for(lambda: self.feed.state.snapshot(0.0)["run"]["name"], "the name of the run", SHORT_S)
 
     def put(self, payload, topic="any", run=None):
         self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
 
-    def say(self, kind, **fields):
+    def send(self, kind, **fields):
         self.put(wire.encode_message(kind, **{"time": time.time(), "worker": "w0", **fields}))
 
     def progress(self, **fields):
         counts = {"round": 0, "step": 5, "steps": 10, "version": 0, "trajectories": 5, "workers": 1, "lag": 0}
-        self.say("learner", **{"stage": "collect", "phase": "adapt", "drops": {}, "doing": [], **counts, **fields})
+        self.send("learner", **{"stage": "collect", "phase": "adapt", "drops": {}, "doing": [], **counts, **fields})
 
-    def returned(self, *about, **fields):
-        self.put(self.told(*about, **fields))
+    def send_return(self, *positional, **fields):
+        self.put(self.trajectories(*positional, **fields))
 
-    def told(self, variation, trial, earned, kind="uniform", problem="darkroom", round=0, p=0.25, **fields):
+    def trajectories(self, variation, trial, total, kind="uniform", problem="darkroom", round=0, p=0.25, **fields):
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
         adversary = {"kind": kind} if kind == "null" else {"kind": kind, "p": p}
-        about = {"problem": problem, "task": room, "adversary": adversary, "policy_version": 0, "weights_digest": "ab" * 32}
-        told = {"identity": f"adapt/{round}/{variation}", **about, "trials": [trial], "returns": [earned], "steps": [8]}
-        return wire.encode_message("trajectories", **{"worker": "w0", "time": time.time(), "variations": [told], **fields})
+        info = {"problem": problem, "task": room, "adversary": adversary, "policy_version": 0, "weights_digest": "ab" * 32}
+        entry = {"identity": f"adapt/{round}/{variation}", **info, "trials": [trial], "returns": [total], "steps": [8]}
+        return wire.encode_message("trajectories", **{"worker": "w0", "time": time.time(), "variations": [entry], **fields})
 
     def close(self):
         self.feed.close()
@@ -96,41 +96,41 @@ class Plane:
 
 @contextlib.contextmanager
 def plane(name="a-run"):
-    with contextlib.closing(Plane(name)) as one:
-        yield one
+    with contextlib.closing(MonitorPlane(name)) as run:
+        yield run
 
 
 @contextlib.contextmanager
 def shown(page, feed):
-    """The page's URL; the page is left before its server goes, of which it would complain."""
-    with showing(feed, "127.0.0.1", 0) as url:
+    """Serves a feed and yields the URL; leaves the page before the server ends, which the page would log as an error."""
+    with serving_run(feed, "127.0.0.1", 0) as url:
         yield url
         assert page.evaluate("window.__pwned") is None
         page.goto("about:blank")
 
 
 def until(page, expression):
-    """Wait for the page, which forbids what Playwright's own waiting for an expression needs (eval)."""
-    return wait_for(lambda: page.evaluate(expression), expression, page.patience)
+    """Wait for an expression.  Playwright's own wait needs eval, which the page's security policy forbids."""
+    return wait_for(lambda: page.evaluate(expression), expression, page.timeout_s)
 
 
 def cells(page, column):
     return page.locator(f"#variation-table tbody tr > :nth-child({column})").all_text_contents()
 
 
-def test_sorting_filters_and_one_variation(page):
+def test_sorting_filters_and_the_dialog_of_a_variation(page):
     with plane() as run, shown(page, run.feed) as url:
-        for task, earned in ((0, 4.0), (1, 6.0), (2, 5.0)):
+        for task, total in ((0, 4.0), (1, 6.0), (2, 5.0)):
             for variation, kind in enumerate(("null", "uniform")):
-                run.returned(f"{task}/{variation}", 0, 0.0, kind)
-                run.returned(f"{task}/{variation}", 1, earned - variation, kind)
-        run.say("event", what="quarantine", text="variation 2/1 ended three workers", identity="adapt/0/2/1")
+                run.send_return(f"{task}/{variation}", 0, 0.0, kind)
+                run.send_return(f"{task}/{variation}", 1, total - variation, kind)
+        run.send("event", what="quarantine", text="variation 2/1 ended three workers", identity="adapt/0/2/1")
         states = np.array([[0, 0], [0, 1], [1, 1]], np.float32)
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
         drawn = {"every": 1, "observations": wire.from_array(states), "adversary": wire.from_array(np.array([-1, 2], "<f4"))}
-        run.say("episode", identity="adapt/0/1/1/1", problem="darkroom", task=room, episode_return=5.0, **drawn)
-        law = np.eye(9)[4].tolist()
-        run.say("belief", identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=[1 / 9] * 9, exact=law)
+        run.send("episode", identity="adapt/0/1/1/1", problem="darkroom", task=room, episode_return=5.0, **drawn)
+        probs = np.eye(9)[4].tolist()
+        run.send("belief", identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=[1 / 9] * 9, exact=probs)
         run.progress()
         page.goto(url)
         until(page, "document.querySelectorAll('#variation-table tbody tr').length === 6")
@@ -145,9 +145,9 @@ def test_sorting_filters_and_one_variation(page):
         page.get_by_label("Adversary").select_option("uniform")
         assert cells(page, 2) == ["uniform p 0.25"] * 3
         page.get_by_label("Task").fill("1")
-        assert cells(page, 1) == ["1/1"] and page.locator("#variation-count").inner_text() == "1 chosen of 6"
+        assert cells(page, 1) == ["1/1"] and page.locator("#variation-count").inner_text() == "1 selected of 6"
         page.get_by_role("button", name="Quarantined").click()
-        assert cells(page, 1) == [] and "no variation passes" in page.locator("#variation-more").inner_text()
+        assert cells(page, 1) == [] and "no variation matches" in page.locator("#variation-more").inner_text()
         page.get_by_role("button", name="Quarantined").click()
 
         page.locator("#variation-table tbody tr").focus()
@@ -171,19 +171,19 @@ def test_sorting_filters_and_one_variation(page):
         assert page.evaluate("document.documentElement.dataset.theme") == "light"
 
 
-def test_hostile_messages_are_text_or_nothing(page):
+def test_hostile_messages_are_shown_as_text_or_ignored(page):
     name = MARKUP.replace("/", "").replace("*", "")
     with plane(name) as run, shown(page, run.feed) as url:
         run.progress(doing=[MARKUP], drops={MARKUP: 1})
         counts = dict.fromkeys(("episodes", "steps", "resent", "trajectories", "pid"), 1)
-        said = {"job": MARKUP, "doing": MARKUP, "memory_mb": 1.0, "peak_mb": 1.0}
-        run.say("worker", **{**counts, **said, "worker": MARKUP})
-        run.returned("0/0", 0, 1.0, kind=MARKUP, problem=MARKUP, worker=MARKUP, weights_digest=MARKUP)
-        run.returned("0/0", 2**40, 1.0, kind=MARKUP, problem=MARKUP)
-        run.say("event", what=MARKUP, text=MARKUP, time=1e300)
-        run.say("event", what="alert", alert=MARKUP, active=True, text=MARKUP)
-        run.say("run", **ABOUT | {"method": MARKUP, "problem": MARKUP})
-        run.say("run", **ABOUT | {"began": 1e308})
+        fields = {"job": MARKUP, "doing": MARKUP, "memory_mb": 1.0, "peak_mb": 1.0}
+        run.send("worker", **{**counts, **fields, "worker": MARKUP})
+        run.send_return("0/0", 0, 1.0, kind=MARKUP, problem=MARKUP, worker=MARKUP, weights_digest=MARKUP)
+        run.send_return("0/0", 2**40, 1.0, kind=MARKUP, problem=MARKUP)
+        run.send("event", what=MARKUP, text=MARKUP, time=1e300)
+        run.send("event", what="alert", alert=MARKUP, active=True, text=MARKUP)
+        run.send("run", **ABOUT | {"method": MARKUP, "problem": MARKUP})
+        run.send("run", **ABOUT | {"began": 1e308})
         run.put(b"\xff" * 100)
         run.put(msgpack.packb({"v": 1, "kind": "event", "text": "x" * (2 << 20)}))
         run.put(msgpack.packb({"v": 1, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
@@ -198,59 +198,59 @@ def test_hostile_messages_are_text_or_nothing(page):
         page.locator("#detail-lineage").get_by_text(MARKUP).first.wait_for()
         page.keyboard.press("Escape")
         until(page, "document.querySelector('#ignored').textContent.includes('another run 1')")
-        run.say("event", what="version", text="it still goes on", version=1)  # after all that
-        page.get_by_text("it still goes on").wait_for()
+        run.send("event", what="version", text="the view still works", version=1)
+        page.get_by_text("the view still works").wait_for()
 
 
-def test_more_variations_than_are_kept_and_a_server_that_comes_back(page, monkeypatch):
-    monkeypatch.setattr(curves, "VARIATIONS", 700)
-    page.forgiven = r"ERR_(CONNECTION_REFUSED|INCOMPLETE_CHUNKED_ENCODING|CONNECTION_RESET|EMPTY_RESPONSE)"
+def test_variations_beyond_the_limit_and_a_restarted_server(page, monkeypatch):
+    monkeypatch.setattr(variations, "MAX_VARIATIONS", 700)
+    page.allowed_errors = r"ERR_(CONNECTION_REFUSED|INCOMPLETE_CHUNKED_ENCODING|CONNECTION_RESET|EMPTY_RESPONSE)"
     with plane() as run:
         run.progress()
-        for number in range(1000):  # at once: a link would drop some
-            payload = run.told(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
-            run.feed.picture.hear("icrl/a-run/mon/trajectories/w0", payload, time.time())
-        with showing(run.feed, "127.0.0.1", 0) as url:
+        for number in range(1000):  # directly, because a link would drop some
+            payload = run.trajectories(f"{number // 8}/{number % 8}", 0, float(number % 97), problem="unknown")
+            run.feed.state.receive("icrl/a-run/mon/trajectories/w0", payload, time.time())
+        with serving_run(run.feed, "127.0.0.1", 0) as url:
             page.goto(url)
             until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")
-            words = page.locator("#variation-more").inner_text()
-            assert words == "600 more rows not shown; 300 beyond what is kept"
+            note = page.locator("#variation-more").inner_text()
+            assert note == "600 more rows not shown; 300 beyond the limit"
             assert page.locator("#variation-count").inner_text() == "1,000"
             page.get_by_role("button", name="Last", exact=True).click()
             assert cells(page, 4) == [str(value) for value in range(96, 81, -1) for _ in range(7)][:100]
             page.get_by_role("button", name="Show more").click()
             assert page.locator("#variation-table tbody tr").count() == 200
         until(page, f"!({CLEAR})")
-        run.returned("0/0", 1, 1000.0, problem="unknown")
-        with showing(run.feed, "127.0.0.1", int(url.rstrip("/").rpartition(":")[2])):
+        run.send_return("0/0", 1, 1000.0, problem="unknown")
+        with serving_run(run.feed, "127.0.0.1", int(url.rstrip("/").rpartition(":")[2])):
             until(page, CLEAR)
             until(page, "document.querySelector('#variation-table tbody th').textContent === '0/0'")
 
 
-def test_every_round_is_over_its_own_optimum_and_many_alerts_leave_room_for_it(page):
+def test_every_round_is_divided_by_its_own_optimum_and_many_alerts_leave_room(page):
     with plane() as run, shown(page, run.feed) as url:
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
         strengths = {0: 0.1, 1: 0.7}
         best = {n: optimum("darkroom", room, {"kind": "uniform", "p": p}) for n, p in strengths.items()}
         for number, p in strengths.items():
-            run.returned("0/0", 0, 0.5 * best[number], round=number, p=p)
-        law = np.eye(9)[4].tolist()
+            run.send_return("0/0", 0, 0.5 * best[number], round=number, p=p)
+        probs = np.eye(9)[4].tolist()
         for worker in ("w0", "w1"):
-            run.say("belief", worker=worker, identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=law, exact=law)
+            run.send("belief", worker=worker, identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=probs, exact=probs)
         page.goto(url)
-        words = "document.querySelector('#adaptation-summary').textContent"
-        until(page, f"/^adapt.1: 0.50 in the first episode.*adapt.0 ended at 0.50[.] Shaded/.test({words})")
+        summary = "document.querySelector('#adaptation-summary').textContent"
+        until(page, f"/^adapt.1: 0.50 in the first episode.*adapt.0 ended at 0.50[.] Shaded/.test({summary})")
         page.locator("#variation-table tbody tr").click()
         page.locator("#detail-facts").get_by_text("uniform: p 0.1").wait_for()
-        told = re.findall(r"optimal ([\d.]+)", page.locator("#detail-summary").inner_text())
-        assert [float(one) for one in told] == pytest.approx([*best.values()], 0.02)
+        optima = re.findall(r"optimal ([\d.]+)", page.locator("#detail-summary").inner_text())
+        assert [float(text) for text in optima] == pytest.approx([*best.values()], 0.02)
         page.keyboard.press("Escape")
         assert page.locator("#beliefs canvas").count() == 4
-        run.say("event", what="worker", text="w1 is gone", worker="w1", alive=False)
+        run.send("event", what="worker", text="w1 is gone", worker="w1", alive=False)
         until(page, "document.querySelectorAll('#beliefs canvas').length === 2")
 
         for number in range(100):
-            run.say("event", what="alert", alert=f"silent w{number}", active=True, text=f"worker w{number} is silent")
+            run.send("event", what="alert", alert=f"silent w{number}", active=True, text=f"worker w{number} is silent")
         until(page, "document.querySelectorAll('#alerts p').length === 100")
         alerts, table = page.locator("#alerts"), page.locator("#variation-table")
         assert alerts.bounding_box()["height"] <= 900 / 4 and table.bounding_box()["height"] > 80
@@ -258,12 +258,12 @@ def test_every_round_is_over_its_own_optimum_and_many_alerts_leave_room_for_it(p
         assert page.evaluate("document.activeElement.id") == "alerts"
         page.keyboard.press("End")
         until(page, "document.querySelector('#alerts').scrollTop > 1000")
-        run.say("run", **ABOUT, alerts=[])  # what the learner repeats is what is on
+        run.send("run", **ABOUT, alerts=[])  # the list in a run message replaces the alerts
         until(page, "document.querySelectorAll('#alerts p').length === 0")
 
 
-def test_a_recording_is_steered_by_keyboard(page):
-    run = Run()
+def test_a_recording_is_controlled_by_keyboard(page):
+    run = CountingFeed()
     run.recording = {"begin": 1000.0, "end": 1100.0, "at": 1010.0, "speed": 10.0, "paused": False}
     run.tick()
     with shown(page, run) as url:
@@ -273,13 +273,12 @@ def test_a_recording_is_steered_by_keyboard(page):
         page.keyboard.press("Enter")
         until(page, "document.querySelector('#pause').textContent === 'Play'")
         page.get_by_label("Speed").select_option("50")
-        wait_for(lambda: len(run.controls) == 2, "the speed", page.patience)
-        page.get_by_label("Moment in the recording").press("End")
+        wait_for(lambda: len(run.controls) == 2, "the speed", page.timeout_s)
+        page.get_by_label("Position in the recording").press("End")
         until(page, "document.querySelector('#pause').textContent === 'Play again'")
         button.press("Enter")
         until(page, "document.querySelector('#pause').textContent === 'Pause'")
-        paused, hurried, wound = {"paused": True}, {"speed": 50}, {"at": 1100}
-        assert run.controls == [paused, hurried, wound, {"at": 1000, "paused": False}]
+        assert run.controls == [{"paused": True}, {"speed": 50}, {"at": 1100}, {"at": 1000, "paused": False}]
 
 
 def test_a_real_run_and_a_killed_worker(page, tmp_path):
@@ -292,7 +291,7 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         view = start("monitor", folder, "--web", "0")
         url = re.search(r"http://\S+", view.stdout.readline())[0]
         page.set_default_timeout(120_000)
-        page.patience = 120
+        page.timeout_s = 120
         page.goto(url)
         until(page, "document.querySelectorAll('#worker-table tbody tr[data-state=working]').length === 2")
         until(page, "document.querySelector('#variation-count').textContent === '14'")
@@ -302,13 +301,13 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         until(page, f"{grown} > 0")
         before = page.evaluate(grown)
         until(page, f"{grown} !== {before}")
-        # Of the newest round alone: those that have begun it, and whose optimum in it is known.
-        words = "document.querySelector('#adaptation-summary').textContent"
-        until(page, f"/mean of (8|9|1[0-4]) variations/.test({words})")
+        # Only variations that have started the newest round and whose optimum in it is computed.
+        summary = "document.querySelector('#adaptation-summary').textContent"
+        until(page, f"/mean of (8|9|1[0-4]) variations/.test({summary})")
         assert page.locator("#adaptation canvas").count() == 1
 
         victim = workers_of(training)[0]
-        training.send_signal(signal.SIGSTOP)  # so that nobody replaces it before it was seen; the learner goes on
+        training.send_signal(signal.SIGSTOP)  # delays the restart of the worker; the learner continues
         os.kill(victim.pid, signal.SIGKILL)
         killed = time.monotonic()
         troubled = "#worker-table tbody tr.troubled"
@@ -316,8 +315,8 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         print(f"red after {time.monotonic() - killed:.2f} s")
         name, state = row.query_selector("th").inner_text(), row.query_selector(".badge").inner_text()
         assert state == "gone" and name in ("w0", "w1")
-        colours = "e => [getComputedStyle(e.querySelector('.badge')).color, getComputedStyle(document.body).color]"
-        assert len(set(row.evaluate(colours))) == 2
+        colors = "e => [getComputedStyle(e.querySelector('.badge')).color, getComputedStyle(document.body).color]"
+        assert len(set(row.evaluate(colors))) == 2
         training.send_signal(signal.SIGCONT)
         page.wait_for_selector(f"#worker-table tbody tr:has-text('{name}-1')[data-state=working]")
         print(f"back after {time.monotonic() - killed:.2f} s")
@@ -325,7 +324,7 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         until(page, f"document.querySelectorAll('{troubled}').length === 0 && {rows} === 2")
     finally:
         if view is not None:
-            page.goto("about:blank")  # before the server goes, which the page would say
+            page.goto("about:blank")  # before the server ends, which the page would log as an error
             view.send_signal(signal.SIGINT)
             assert finish(view) is not None and view.returncode == 0
         kill_the_tree(training)

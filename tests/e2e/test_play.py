@@ -1,4 +1,4 @@
-"""``icrl-dist play`` in a real browser: a person moves the goal and overrides actions, and sees the agent adapt."""
+"""``icrl-dist play`` in a browser: a person moves the goal and overrides actions, and the agent adapts."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright
 CHROMIUM = Path("/usr/bin/chromium")
 QUIET = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
 QUIET += ("--disable-background-networking", "--disable-component-update")
-PATIENT_MS = 60_000
+TIMEOUT_MS = 60_000
 
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}")
 
@@ -46,25 +46,25 @@ def browser():
 
 @contextlib.contextmanager
 def viewer(browser, url):
-    """A page of the game, none of whose scripts may complain."""
-    page, complaints = browser.new_page(viewport={"width": 1000, "height": 700}), []
-    page.set_default_timeout(PATIENT_MS)
-    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
+    """A page of the game that must log no errors."""
+    page, errors = browser.new_page(viewport={"width": 1000, "height": 700}), []
+    page.set_default_timeout(TIMEOUT_MS)
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(url)
     expect(page, "#status").to_have_text("live")
     yield page
-    assert not complaints
+    assert not errors
     page.close()
 
 
 def expect(page, what):
-    playwright.expect.set_options(timeout=PATIENT_MS)
+    playwright.expect.set_options(timeout=TIMEOUT_MS)
     return playwright.expect(page.locator(what))
 
 
 def finish(page, episode):
-    """Go to the end of an episode; its return, the oracle's, and how many steps were overridden."""
+    """Play to the end of an episode; its return, the expected optimum, and the number of overridden steps."""
     page.click("#through")
     expect(page, "#returns tr").to_have_count(episode)
     cells = page.locator("#returns tr").first.locator("td").all_text_contents()
@@ -72,8 +72,8 @@ def finish(page, episode):
     return [float(text) for text in cells[1:4]]
 
 
-def painted(page, colour):
-    """How many pixels of the room are of one of the style's colours."""
+def painted(page, color):
+    """Number of the room's pixels in a color of the theme."""
     script = """(name) => {
         const probe = document.createElement("span");
         document.body.append(probe);
@@ -86,15 +86,15 @@ def painted(page, colour):
         for (let i = 0; i < data.length; i += 4) if (wanted.every((c, k) => Math.abs(c - data[i + k]) < 40)) count++;
         return count;
     }"""
-    return page.evaluate(script, colour)
+    return page.evaluate(script, color)
 
 
-def test_a_person_moves_the_goal_and_disturbs_the_agent_which_adapts(served, browser):
+def test_the_agent_adapts_to_a_moved_goal_and_overrides(served, browser):
     _, url = served
     with viewer(browser, url) as page:
         assert page.get_attribute("#room", "aria-label").startswith("A room of 10 by 10 cells. Agent at (0, 0), goal at (5, 7)")
         undisturbed = [finish(page, episode) for episode in (1, 2)]
-        assert [oracle for _, oracle, _ in undisturbed] == [89.0, 89.0] and undisturbed[1][0] > 80
+        assert [optimum for _, optimum, _ in undisturbed] == [89.0, 89.0] and undisturbed[1][0] > 80
         assert painted(page, "--series-2") == 0
 
         box = page.locator("#room").bounding_box()
@@ -102,10 +102,10 @@ def test_a_person_moves_the_goal_and_disturbs_the_agent_which_adapts(served, bro
         expect(page, "#room").to_have_attribute("aria-label", contains("goal at (2, 2)"))
         page.locator("#p").fill("0.5")
         disturbed = [finish(page, episode) for episode in range(3, 9)]
-        returns, oracles, overridden = zip(*disturbed, strict=True)
-        assert set(oracles) == {45.7}
+        returns, optima, overridden = zip(*disturbed, strict=True)
+        assert set(optima) == {45.7}
         assert all(30 < count < 70 for count in overridden) and painted(page, "--series-2") > 100
-        assert sum(returns[2:]) / 4 > 0.8 * oracles[0], "a fifth below the oracle from the third episode on"
+        assert sum(returns[2:]) / 4 > 0.8 * optima[0], "at least 80% of the optimum from the third episode on"
         expect(page, "#implied").to_have_attribute("aria-label", contains("most likely (2, 2)"))
         expect(page, "#exact").to_have_attribute("aria-label", contains("most likely (2, 2) with 100 %"))
         expect(page, "#surprise").to_have_attribute("aria-valuetext", contains("training"))
@@ -116,7 +116,7 @@ def test_a_person_moves_the_goal_and_disturbs_the_agent_which_adapts(served, bro
             expect(page, "#returns tr").to_have_count(0)
 
 
-def test_by_keyboard_alone_and_live(served, browser):
+def test_the_page_works_by_keyboard(served, browser):
     _, url = served
     with viewer(browser, url) as page:
         page.focus("#new")
@@ -145,7 +145,7 @@ def test_by_keyboard_alone_and_live(served, browser):
         assert page.locator(unlabelled).count() == 0
 
 
-def test_hostile_commands_are_refused_and_the_game_goes_on(served):
+def test_hostile_commands_are_refused_and_the_game_continues(served):
     _, url = served
 
     def post(body, **headers):

@@ -1,11 +1,11 @@
-"""Drawings: stick figures stand where MuJoCo's bodies stand, paths where hand and object are."""
+"""Drawings: limbs are where MuJoCo places them, and paths follow hand and object."""
 
 import mujoco
 import numpy as np
 import pytest
 
 from icrl_dist.monitor import drawing
-from icrl_dist.monitor.validation import Odd
+from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.problems import registry
 from icrl_dist.problems.dmc import domains, picture
 from icrl_dist.problems.dmc.simulation import DMC
@@ -17,8 +17,8 @@ from icrl_dist.types import Variation
     "kind",
     ["dmc-cartpole-swingup", "dmc-cheetah-run", "dmc-hopper-hop", "dmc-quadruped-walk", "dmc-reacher-hard", "dmc-walker-run"],
 )
-def test_limbs_stand_as_the_simulation_has_them(kind):
-    """Up to where the whole figure stands, which nobody observes."""
+def test_limbs_are_drawn_where_the_simulation_places_them(kind):
+    """Compares up to a common offset, because the position of the whole figure is not observed."""
     game = DMC([domains.task(kind)])
     state = game.reset([np.random.default_rng(3)])
     rng = np.random.default_rng(4)
@@ -53,15 +53,15 @@ def message(problem, task, states, **changes):
     return {"problem": problem, "task": dict(task), "every": 2} | arrays | changes
 
 
-def test_a_swing_of_force_is_drawn_a_frame():
+def test_every_frame_has_a_force():
     drawn = drawing.of(message("dmc-cartpole-balance", {}, np.tile([0, 1, 0, 0, 0], (4, 1))))
     assert drawn["kind"] == "sticks" and drawn["force"] == [0.5] * 4 and drawn["frame_s"] == pytest.approx(0.02)
     cart, pole = drawn["frames"][0]
-    assert pole[0] == pole[2] == 0.0 and abs(pole[3] - pole[1]) == pytest.approx(1.0, abs=1e-3), "upright, a metre long"
+    assert pole[0] == pole[2] == 0.0 and abs(pole[3] - pole[1]) == pytest.approx(1.0, abs=1e-3), "upright, one meter long"
     assert cart[1] == cart[3]
 
 
-def test_hand_and_object_are_seen_from_above():
+def test_hand_and_object_are_drawn_from_above():
     states = np.zeros((3, 39))
     states[:, :3], states[:, 4:7] = [0.1, 0.6, 0.2], [[0.0, 0.6, 0.02], [0.01, 0.65, 0.02], [0.02, 0.7, 0.02]]
     drawn = drawing.of(message("metaworld-pick-place", {"goal": [0.1, 0.8, 0.2], "object": [0.0, 0.6, 0.02]}, states))
@@ -84,17 +84,17 @@ def test_hand_and_object_are_seen_from_above():
         {"observations": validation.from_array(np.zeros((0, 2), np.float32))},
     ],
 )
-def test_what_is_no_episode_is_not_drawn(changes):
+def test_invalid_episodes_are_refused(changes):
     good = message("darkroom", {"goal": [1, 1], "size": 4}, np.zeros((3, 2)))
     assert drawing.of(good)["path"] == [[0, 0]] * 3
-    with pytest.raises(Odd):
+    with pytest.raises(InvalidMessageError):
         drawing.of(good | changes)
 
 
-def test_only_a_room_of_some_size_has_an_optimum_worth_its_time():
+def test_the_optimum_is_computed_for_small_valid_rooms_only():
     task, adversary = {"goal": [1, 1], "size": 4, "horizon": 9}, {"kind": "null"}
     assert drawing.optimum("darkroom", task, adversary) > 0
-    for odd in (
+    for invalid in (
         {"size": 1000},
         {"horizon": 10**9},
         {"goal": [9, 9]},
@@ -103,7 +103,7 @@ def test_only_a_room_of_some_size_has_an_optimum_worth_its_time():
         {"start": "x"},
         {"size": "4"},
     ):
-        assert drawing.optimum("darkroom", task | odd, adversary) is None
+        assert drawing.optimum("darkroom", task | invalid, adversary) is None
     assert drawing.optimum("darkroom", task, {"kind": "dirichlet", "p": 3.0}) is None
     assert drawing.optimum("dmc-cheetah-run", {}, {}) is None
     assert {registry.spec(Variation(domains.task("dmc-walker-run")).task).observation} == {24}

@@ -1,4 +1,4 @@
-"""The game of ``icrl-dist play`` without a server: what a person can do to an agent, and what is shown of it."""
+"""The game of ``icrl-dist play`` without a server: commands of a viewer, the steps of the game, and its JSON."""
 
 import json
 from threading import Event, Thread
@@ -11,8 +11,8 @@ from icrl_dist.agent.loading import load_agent
 from icrl_dist.cli.main import main
 from icrl_dist.config.run import dumps, load, parse
 from icrl_dist.monitor import player
+from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.player import Player
-from icrl_dist.monitor.serve import EventStream
 from icrl_dist.problems.darkroom.game import HELD_S, PlayGame
 from icrl_dist.problems.darkroom.room import MOVES, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
@@ -28,29 +28,29 @@ class Clock:
 
 
 class Agent(InContextAgent):
-    """One that always does the same and remembers what it was told."""
+    """Selects one fixed action and records its transitions."""
 
     def __init__(self, action=UP, deploy="committed"):
         self.outcomes, self.action, self.deploy = None, action, deploy
-        self.manifest, self.told, self.forgot = {"test_goals": [[2, 1]]}, [], 0
+        self.manifest, self.observed, self.resets = {"test_goals": [[2, 1]]}, [], 0
 
     def reset_context(self):
-        self.told.clear()
-        self.forgot += 1
+        self.observed.clear()
+        self.resets += 1
 
     def act(self, observation):
         return np.array([self.action])
 
     def observe(self, *transition):
-        self.told.append(tuple(np.asarray(column)[0] for column in transition))
+        self.observed.append(tuple(np.asarray(column)[0] for column in transition))
 
     def law(self, states, row=0):
         return np.full((len(states), 5), 0.2)
 
     def context(self, row=0):
-        ended = [i for i, t in enumerate(self.told) if t[4]]
-        known = self.told if self.deploy == "committed" else self.told[: ended[-1] + 1 if ended else 0]
-        before, action, reward, after = (np.array([t[i] for t in known]) for i in range(4))
+        ended = [i for i, t in enumerate(self.observed) if t[4]]
+        visible = self.observed if self.deploy == "committed" else self.observed[: ended[-1] + 1 if ended else 0]
+        before, action, reward, after = (np.array([t[i] for t in visible]) for i in range(4))
         return before.reshape(-1, 2), action.astype(np.int64), after.reshape(-1, 2), reward
 
 
@@ -68,18 +68,18 @@ def play(g, steps):
         g.step()
 
 
-def test_the_agent_is_told_what_came_of_its_own_action_and_no_more(run):
+def test_the_agent_observes_its_own_action_and_the_outcome_only(run):
     g = game(run)
     g.command({"do": "goal", "value": [1, 0]})
     g.command({"do": "push", "value": RIGHT})
     play(g, 2)
-    (before, action, reward, after, done), (_, _, second, end, _) = g.agent.told
+    (before, action, reward, after, done), (_, _, second, end, _) = g.agent.observed
     assert (before.tolist(), action, reward, after.tolist(), done) == ([0, 0], UP, 1, [1, 0], False)
     assert (second, end.tolist()) == (0, [1, 1])
     assert g.path == [(3, "hand"), (4, "agent")] and g.total == 1
 
 
-def test_every_step_is_a_move_and_walls_stop_it(run):
+def test_every_step_is_a_legal_move(run):
     g = game(run)
     g.command({"do": "p", "value": 0.7})
     at = np.zeros(2)
@@ -90,7 +90,7 @@ def test_every_step_is_a_move_and_walls_stop_it(run):
         assert at.tolist() in moved
 
 
-def test_the_law_overrides_as_often_and_with_what_it_says(run):
+def test_random_overrides_have_the_chosen_probability_and_action(run):
     g = game(run)
     g.command({"do": "p", "value": 0.4})
     g.command({"do": "law", "value": RIGHT})
@@ -102,7 +102,7 @@ def test_the_law_overrides_as_often_and_with_what_it_says(run):
     assert [cell for cell, _ in g.path] == [3] + [6] * 7 and {cause for _, cause in g.path} == {"law"}
 
 
-def test_a_hand_that_holds_goes_on_until_it_lets_go_or_is_lost(run):
+def test_a_held_override_lasts_until_release_or_timeout(run):
     clock = Clock()
     g = game(run, clock=clock)
     g.command({"do": "hold", "value": STAY})
@@ -119,7 +119,7 @@ def test_a_hand_that_holds_goes_on_until_it_lets_go_or_is_lost(run):
     assert [cause for _, cause in g.path] == ["hand"] * 3 + ["agent", "hand", "agent"]
 
 
-def test_a_short_tap_between_two_steps_is_not_lost(run):
+def test_a_hold_between_two_steps_overrides_one_step(run):
     g = game(run)
     g.command({"do": "hold", "value": RIGHT})
     g.command({"do": "hold", "value": None})
@@ -127,7 +127,7 @@ def test_a_short_tap_between_two_steps_is_not_lost(run):
     assert [cause for _, cause in g.path] == ["hand", "agent"]
 
 
-def test_the_optimum_is_the_oracles_for_this_goal_and_law(run):
+def test_the_optimum_is_the_exact_return_for_goal_and_overrides(run):
     g = game(run)
     for p, law, q in ((0.0, None, [0.2] * 5), (0.5, None, [0.2] * 5), (0.5, LEFT, [0, 1, 0, 0, 0])):
         g.command({"do": "p", "value": p})
@@ -149,23 +149,23 @@ def test_an_episode_in_which_the_task_changed_has_no_optimum(run):
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_a_goal_that_moves_is_another_task_unless_the_context_is_kept(run, keep):
+def test_a_moved_goal_clears_the_context_unless_it_is_kept(run, keep):
     g = game(run, Agent(STAY))
     g.command({"do": "keep", "value": keep})
-    forgot = g.agent.forgot
+    resets = g.agent.resets
     play(g, 5)
     g.command({"do": "goal", "value": [0, 0]})
-    assert g.agent.forgot == forgot + (not keep)
+    assert g.agent.resets == resets + (not keep)
     play(g, 2)
     read = g.belief()
     assert read.transitions == (7 if keep else 2)
-    assert read.exact[0] == pytest.approx(1), "the exact posterior is told of the move: it would be refuted"
+    assert read.exact[0] == pytest.approx(1), "the exact posterior starts again when the goal moves"
     g.command({"do": "goal", "value": [0, 1]})
     assert g.belief().exact == pytest.approx(np.full(9, 1 / 9))
 
 
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
-def test_the_exact_posterior_is_given_what_the_agents_context_holds(run, deploy):
+def test_the_exact_posterior_uses_the_transitions_in_the_context(run, deploy):
     g = game(run, Agent(STAY, deploy))
     g.command({"do": "keep", "value": True})
     play(g, 12)
@@ -192,7 +192,7 @@ def test_the_same_commands_between_the_same_steps_give_the_same_game():
     assert len(first[0]) == 5 and first[1]["surprise"] is not None
 
 
-def test_all_that_is_shown_is_json_and_stays_small(run):
+def test_snapshots_are_json_and_bounded(run):
     g = game(run, Agent(STAY))
     play(g, 8 * 405)
     history = g.history()
@@ -206,7 +206,7 @@ def test_all_that_is_shown_is_json_and_stays_small(run):
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({}, "do='None': expected one of goal, p, law"),
         ({"do": "reset"}, "do='reset'"),
@@ -227,33 +227,33 @@ def test_all_that_is_shown_is_json_and_stays_small(run):
         ({"do": "x" * 5000}, "do='xxxx"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_a_short_line_and_changes_nothing(run, fields, said):
+def test_invalid_commands_are_refused_in_one_short_line_and_change_nothing(run, fields, message):
     g = game(run)
     before = g.snapshot()
     with pytest.raises(ValueError) as error:
         g.command(fields)
-    assert said in str(error.value) and len(str(error.value).splitlines()) == 1 and len(str(error.value)) < 200
+    assert message in str(error.value) and len(str(error.value).splitlines()) == 1 and len(str(error.value)) < 200
     assert g.snapshot() == before
 
 
-class Told(EventStream):
-    """A stream that somebody looks at."""
+class RecordingStream(EventStream):
+    """A stream with one viewer that records all events."""
 
     viewers = 1
 
     def __init__(self):
         super().__init__()
-        self.told = []
+        self.published = []
 
     def publish(self, event, data, state=False):
         super().publish(event, data, state)
-        self.told.append((event, json.loads(json.dumps(data))))
+        self.published.append((event, json.loads(json.dumps(data))))
 
 
-def test_one_thread_has_the_game_and_viewers_wait_for_its_answer(run, monkeypatch):
+def test_commands_run_in_the_thread_of_the_game_and_wait_for_it(run, monkeypatch):
     monkeypatch.setattr(player, "FRAME_S", 0.0)
     monkeypatch.setattr(player, "BELIEF_S", 0.0)
-    g, stream, over = game(run), Told(), Event()
+    g, stream, over = game(run), RecordingStream(), Event()
     g.paused = True
     p = Player(g, stream)
     thread = Thread(target=p.run, args=(over,))
@@ -268,14 +268,14 @@ def test_one_thread_has_the_game_and_viewers_wait_for_its_answer(run, monkeypatc
     finally:
         over.set()
         thread.join()
-    events = [event for event, _ in stream.told]
+    events = [event for event, _ in stream.published]
     assert {"room", "belief", "episodes"} <= set(events)
-    assert [data["p"] for event, data in stream.told if event == "room"][-1] == 0.25
-    (belief, *_) = (data for event, data in stream.told if event == "belief")
+    assert [data["p"] for event, data in stream.published if event == "room"][-1] == 0.25
+    (belief, *_) = (data for event, data in stream.published if event == "belief")
     assert len(belief["implied"]) == len(belief["exact"]) == 9 and 0 <= belief["apart"] <= 1
 
 
-def test_nothing_moves_while_nobody_looks_on(run):
+def test_the_game_pauses_without_viewers(run):
     g, stream, over = game(run), EventStream(), Event()
     p = Player(g, stream)
     thread = Thread(target=p.run, args=(over,))
@@ -288,25 +288,25 @@ def test_nothing_moves_while_nobody_looks_on(run):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "play: name a run folder or a checkpoint file, or --pretrained darkroom"),
         (["here", "--pretrained", "darkroom"], "play: name a run folder"),
         (["--pretrained", "lightroom"], "no agent of that name is shipped; there are darkroom"),
         (["nowhere"], "nowhere: no such run folder or checkpoint"),
-        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port is 0 (any free one) to 65535"),
+        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port must be 0 (any free port) to 65535"),
         (["--pretrained", "darkroom", "--host", "nowhere.invalid"], "name an address of this machine"),
     ],
 )
-def test_what_cannot_be_played_is_said_in_a_line(words, said, capsys):
+def test_wrong_arguments_of_play_give_one_line(words, message, capsys):
     assert main(["play", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
+    assert message in line
 
 
-def test_only_a_dark_room_can_be_played(monkeypatch, capsys):
+def test_play_refuses_agents_of_other_problems(monkeypatch, capsys):
     agent = Agent()
     agent.manifest = {"run": dumps(load("dmc-cheetah-run"))}
     monkeypatch.setattr(player, "load_agent", lambda *_: agent)
     assert main(["play", "runs/cheetah"]) == 2
-    assert "play runs/cheetah: its agent knows dmc-cheetah-run; only a Dark Room can be played" in capsys.readouterr().err
+    assert "play runs/cheetah: its agent is for dmc-cheetah-run; play needs an agent for Dark Room" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The live view's server: events to several viewers, commands from its own page only."""
+"""The HTTP server of the live view: events for many viewers, commands from its own page only."""
 
 import asyncio
 import http.client
@@ -11,45 +11,46 @@ from urllib.parse import urlsplit
 import pytest
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.monitor import serve
-from icrl_dist.monitor.serve import EventStream, application, serving
+from icrl_dist.monitor import event_stream, serve
+from icrl_dist.monitor.event_stream import EventStream
+from icrl_dist.monitor.serve import application, serving
 
 
-class Page:
-    """A page with an echo for a command."""
+class PageClient:
+    """Sends requests to a page; `commands` are those that the page has executed."""
 
-    def __init__(self, url, stream, heard):
-        self.stream, self.heard = stream, heard
+    def __init__(self, url, stream, commands):
+        self.stream, self.commands = stream, commands
         self.host, self.port = urlsplit(url).hostname, urlsplit(url).port
 
-    def ask(self, method, path, body=None, **headers):
+    def request(self, method, path, body=None, **headers):
         connection = http.client.HTTPConnection(self.host, self.port, timeout=5)
         try:
             connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-            answer = connection.getresponse()
-            return answer.status, dict(answer.getheaders()), answer.read()
+            response = connection.getresponse()
+            return response.status, dict(response.getheaders()), response.read()
         finally:
             connection.close()
 
-    def order(self, body, **headers):
+    def command(self, body, **headers):
         headers = {"content_type": "application/json", **headers}
-        status, _, text = self.ask("POST", "/command", body, **headers)
+        status, _, text = self.request("POST", "/command", body, **headers)
         return status, text.decode()
 
-    def watch(self):
+    def connect(self):
         connection = http.client.HTTPConnection(self.host, self.port, timeout=5)
         connection.request("GET", "/events")
-        return Viewer(connection, connection.getresponse())
+        return ViewerClient(connection, connection.getresponse())
 
 
-class Viewer:
-    def __init__(self, connection, answer):
-        self.connection, self.answer = connection, answer
+class ViewerClient:
+    def __init__(self, connection, response):
+        self.connection, self.response = connection, response
 
     def next(self):
-        """The next event: its name and data; None at the end."""
+        """Name and data of the next event; None at the end of the stream."""
         event = None
-        while line := self.answer.readline():
+        while line := self.response.readline():
             field, _, value = line.decode().strip().partition(": ")
             if field == "event":
                 event = value
@@ -60,15 +61,15 @@ class Viewer:
 
 @pytest.fixture
 def page():
-    stream, heard = EventStream(), []
+    stream, commands = EventStream(), []
 
     def command(fields):
         if "bad" in fields:
-            raise ValueError(f"bad={fields['bad']}: not that")
-        heard.append(fields)
+            raise ValueError(f"bad={fields['bad']}: refused")
+        commands.append(fields)
 
     with serving(application("play.html", stream, command), stream, "127.0.0.1", 0) as url:
-        yield Page(url, stream, heard)
+        yield PageClient(url, stream, commands)
 
 
 def wait_for(condition):
@@ -78,79 +79,111 @@ def wait_for(condition):
         time.sleep(0.005)
 
 
-def test_every_viewer_hears_the_state_first_and_then_what_happens(page):
+def test_viewers_receive_the_state_first_and_then_new_events(page):
     page.stream.publish("room", {"step": 1}, state=True)
-    page.stream.publish("said", {"to": "nobody"})
-    viewers = [page.watch() for _ in range(3)]
+    page.stream.publish("note", {"to": "nobody"})
+    viewers = [page.connect() for _ in range(3)]
     wait_for(lambda: page.stream.viewers == 3)
-    page.stream.publish("said", {"to": "all"})
+    page.stream.publish("note", {"to": "all"})
     for viewer in viewers:
         assert viewer.next() == ("room", {"step": 1})
-        assert viewer.next() == ("said", {"to": "all"})
+        assert viewer.next() == ("note", {"to": "all"})
         viewer.connection.close()
-        viewer.answer.close()
-    wait_for(lambda: page.stream.publish("said", 0) is None and page.stream.viewers == 0)
+        viewer.response.close()
+    wait_for(lambda: page.stream.publish("note", 0) is None and page.stream.viewers == 0)
 
 
-def test_a_slow_viewer_misses_the_oldest_and_no_state():
-    async def slow():
-        viewer = serve._Viewer(asyncio.get_running_loop())
-        for number in range(serve.QUEUED + 50):
-            viewer.put("said", str(number), False)
-            viewer.put("room", str(number), True)
+def test_a_slow_viewer_loses_the_oldest_events_but_no_state():
+    async def receive_late():
+        viewer = event_stream._Viewer(asyncio.get_running_loop())
+        for number in range(event_stream.MAX_QUEUED + 50):
+            viewer.put("note", event_stream._encoded("note", str(number)), False)
+            viewer.put("room", event_stream._encoded("room", str(number)), True)
         return await viewer.next()
 
-    lines = [line for line in asyncio.run(slow()).splitlines() if line.startswith("data")]
-    said = range(51, serve.QUEUED + 50)
-    assert lines == [*(f"data: {number}" for number in said), f"data: {serve.QUEUED + 49}"]
+    lines = [line for line in asyncio.run(receive_late()).decode().splitlines() if line.startswith("data")]
+    kept = range(51, event_stream.MAX_QUEUED + 50)
+    assert lines == [*(f"data: {number}" for number in kept), f"data: {event_stream.MAX_QUEUED + 49}"]
 
 
-def test_no_more_viewers_than_there_is_room_for(page, monkeypatch):
-    monkeypatch.setattr(serve, "VIEWERS", 1)
-    first = page.watch()
+def test_a_viewer_that_does_not_read_delays_nobody_and_is_removed_when_it_disconnects():
+    stream, payload = EventStream(), "x" * 100_000
+    with serving(application("play.html", stream), stream, "127.0.0.1", 0) as url:
+        stuck, reader = (PageClient(url, stream, []).connect() for _ in range(2))
+        wait_for(lambda: stream.viewers == 2)
+        began = time.monotonic()
+        for _ in range(2 * event_stream.MAX_QUEUED):
+            stream.publish("note", payload)
+        assert time.monotonic() - began < 5
+        assert max(len(viewer._queue) for viewer in stream._viewers) <= event_stream.MAX_QUEUED
+        stream.publish("last", 1)
+        while (event := reader.next())[0] != "last":
+            assert event == ("note", payload)
+        stuck.connection.close()
+        stuck.response.close()
+        wait_for(lambda: stream.viewers == 1)
+    assert reader.next() is None
+    reader.connection.close()
+    reader.response.close()
+
+
+def test_a_quiet_stream_carries_pings(monkeypatch):
+    monkeypatch.setattr(event_stream, "_PING_S", 0.05)
+    stream = EventStream()
+    with serving(application("play.html", stream), stream, "127.0.0.1", 0) as url:
+        viewer = PageClient(url, stream, []).connect()
+        lines = [viewer.response.readline() for _ in range(6)]
+    assert lines == [b"retry: 1000\n", b"\n", *([b": ping\n", b"\n"] * 2)]
+    viewer.connection.close()
+    viewer.response.close()
+
+
+def test_viewers_beyond_the_limit_are_refused(page, monkeypatch):
+    monkeypatch.setattr(event_stream, "MAX_VIEWERS", 1)
+    first = page.connect()
     wait_for(lambda: page.stream.viewers == 1)
-    assert page.ask("GET", "/events")[0] == 503
+    assert page.request("GET", "/events")[0] == 503
     first.connection.close()
-    first.answer.close()
+    first.response.close()
 
 
-def test_the_end_reaches_every_viewer_and_ends_the_threads():
+def test_the_end_of_the_server_ends_every_stream_and_thread():
     before = threading.active_count()
     stream = EventStream()
     with serving(application("play.html", stream), stream, "127.0.0.1", 0) as url:
-        viewer = Page(url, stream, []).watch()
+        viewer = PageClient(url, stream, []).connect()
         wait_for(lambda: stream.viewers == 1)
     assert viewer.next() is None
     viewer.connection.close()
-    viewer.answer.close()
+    viewer.response.close()
     assert threading.active_count() == before
 
 
-def test_every_answer_forbids_foreign_scripts(page):
+def test_every_response_forbids_foreign_scripts(page):
     for path, status in (
         ("/assets/base.css", 200),
         ("/nowhere", 404),
         ("/assets/serve.py", 404),
         ("/assets/..%2fserve.py", 404),
     ):
-        found, headers, _ = page.ask("GET", path)
+        found, headers, _ = page.request("GET", path)
         assert found == status
         policy = headers["content-security-policy"]
         assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'") and "unsafe" not in policy
         assert headers["x-content-type-options"] == "nosniff"
 
 
-def test_a_command_is_one_small_json_object(page):
-    assert page.order('{"p": 0.5}') == (204, "")
-    assert page.heard == [{"p": 0.5}]
-    assert page.order('{"bad": 3}') == (400, '{"error":"bad=3: not that"}')
+def test_a_command_must_be_one_small_json_object(page):
+    assert page.command('{"p": 0.5}') == (204, "")
+    assert page.commands == [{"p": 0.5}]
+    assert page.command('{"bad": 3}') == (400, '{"error":"bad=3: refused"}')
     for body in ("", "[]", "nonsense", '{"p": NaN}', '{"p": Infinity}', b'{"p": "\xff"}', "[" * 4000):
-        status, text = page.order(body)
+        status, text = page.command(body)
         assert status == 400 and len(json.loads(text)["error"].splitlines()) == 1, body
-    assert page.order("x" * (serve.BODY + 1))[0] == 413
-    assert page.order('{"p": 1}', content_type="text/plain")[0] == 415
-    assert page.ask("GET", "/command")[0] == 405
-    assert page.heard == [{"p": 0.5}]
+    assert page.command("x" * (serve.MAX_BODY + 1))[0] == 413
+    assert page.command('{"p": 1}', content_type="text/plain")[0] == 415
+    assert page.request("GET", "/command")[0] == 405
+    assert page.commands == [{"p": 0.5}]
 
 
 @pytest.mark.parametrize(
@@ -166,21 +199,21 @@ def test_a_command_is_one_small_json_object(page):
         {"host": "", "origin": "http://"},
     ],
 )
-def test_a_foreign_page_commands_nothing(page, headers):
-    status, text = page.order('{"p": 1}', **headers)
+def test_commands_of_a_foreign_page_are_refused(page, headers):
+    status, text = page.command('{"p": 1}', **headers)
     assert status == 403 and len(text.splitlines()) == 1
-    assert not page.heard
+    assert not page.commands
 
 
-def test_a_foreign_name_sees_nothing_either(page):
+def test_a_foreign_host_name_is_refused(page):
     for host in ("evil.example", f"evil.example:{page.port}", "[evil]"):
-        assert page.ask("GET", "/events", host=host)[0] == 403
+        assert page.request("GET", "/events", host=host)[0] == 403
     for host in ("localhost", f"LOCALHOST:{page.port}", f"[::1]:{page.port}", "192.0.2.7:80"):
-        assert page.ask("GET", "/assets/base.css", host=host)[0] == 200
-        assert page.order("{}", host=host, origin=f"http://{host}")[0] == 204
+        assert page.request("GET", "/assets/base.css", host=host)[0] == 200
+        assert page.command("{}", host=host, origin=f"http://{host}")[0] == 204
 
 
-def test_a_port_that_is_taken_is_said_in_a_line_with_the_remedy():
+def test_an_address_that_cannot_be_used_gives_one_line_with_the_remedy():
     app, stream = application("play.html", EventStream()), EventStream()
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

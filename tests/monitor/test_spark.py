@@ -1,4 +1,4 @@
-"""Numbers as characters, against slow obvious loops."""
+"""Text drawings, compared with slow and obvious loops."""
 
 import numpy as np
 import pytest
@@ -15,25 +15,25 @@ def _cases():
 
 
 @pytest.mark.parametrize(("values", "width"), list(_cases()))
-def test_buckets_are_means_of_what_falls_into_them(values, width):
-    seen = resample(values, width)
-    assert len(seen) == min(width, len(values))
-    for bucket, mean in enumerate(seen):
+def test_a_bucket_is_the_mean_of_its_values(values, width):
+    means = resample(values, width)
+    assert len(means) == min(width, len(values))
+    for bucket, mean in enumerate(means):
         inside = []
         for i, value in enumerate(values):
-            mine = (
+            in_bucket = (
                 i == bucket
                 if len(values) <= width
                 else bucket * len(values) // width <= i < (bucket + 1) * len(values) // width
             )
-            if mine and value is not None:
+            if in_bucket and value is not None:
                 inside.append(value)
         assert mean == pytest.approx(sum(inside) / len(inside)) if inside else mean is None
 
 
 @pytest.mark.parametrize("height", [1, 2, 5])
 @pytest.mark.parametrize(("values", "width"), list(_cases()))
-def test_a_plot_fills_as_many_eighths_as_the_value_has_passed(values, width, height):
+def test_a_plot_fills_one_eighth_for_every_step_below_the_value(values, width, height):
     low, high = bounds(values, 9.0)
     drawn = plot(values, width, height, low, high)
     assert len(drawn) == height
@@ -43,7 +43,7 @@ def test_a_plot_fills_as_many_eighths_as_the_value_has_passed(values, width, hei
             assert filled == 0
             continue
         passed = 0
-        for eighth in range(1, 8 * height):  # the first is always seen
+        for eighth in range(1, 8 * height):  # the first eighth is always filled
             passed += value >= low + (high - low) * eighth / (8 * height) - 1e-9
         assert filled == passed + 1
     if height == 1:
@@ -55,18 +55,18 @@ def test_a_plot_has_no_holes():
     assert drawn == ["   ▃█", "  ▅██", "▁▇███"]
     for column in range(5):
         heights = [BLOCKS.index(line[column]) for line in drawn]
-        assert heights == sorted(heights), "what is below a block is full"
+        assert heights == sorted(heights), "the cells below a block are full"
 
 
 @pytest.mark.parametrize(
     ("values", "ceiling", "expected"),
     [([], None, (0.0, 1.0)), ([2.0, None], None, (0.0, 2.0)), ([-3.0], 5.0, (-3.0, 5.0)), ([7.0], 5.0, (0.0, 7.0))],
 )
-def test_returns_are_drawn_from_zero_to_what_can_be_reached(values, ceiling, expected):
+def test_the_bounds_include_zero_and_the_ceiling(values, ceiling, expected):
     assert bounds(values, ceiling) == expected
 
 
-def test_values_beyond_the_bounds_are_cut():
+def test_values_beyond_the_bounds_are_clipped():
     assert spark([-5.0, 0.0, 1.0, 9.0], 4, 0.0, 1.0) == "▁▁██"
     assert spark([3.0, 3.0], 4, 3.0, 3.0) == "▁▁"
 
@@ -76,7 +76,7 @@ def test_a_bar_is_as_long_as_its_share(share, done):
     assert [len(part) for part in bar(share, 10)] == [done, 10 - done]
 
 
-def test_a_room_is_seen_from_above():
+def test_a_room_is_drawn_from_above():
     path = [[0, 0], [0, 1], [1, 1], [1, 1], [1, 0]]
     rows = room(3, [1, 1], path, [False, True, False, True])
     assert rows == [

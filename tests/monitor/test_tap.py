@@ -1,4 +1,4 @@
-"""The tap: which trajectories are printed, and how."""
+"""The tap: filters, formats and the end of output."""
 
 import io
 import json
@@ -12,7 +12,7 @@ import pytest
 
 from icrl_dist.cli.main import main
 from icrl_dist.config.run import ConfigError
-from icrl_dist.monitor.tap import Tapped
+from icrl_dist.monitor.tap import TapWriter
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import NULL
@@ -25,20 +25,20 @@ class Out(io.TextIOWrapper):
 
 
 def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0):
-    """What is written of 24 trajectories and some messages that are none."""
+    """The output for 24 trajectories and some invalid messages, and how often `stop` was called."""
     out, ended, made = Out(), [], []
     monkeypatch.setattr(sys, "stdout", out)
-    tap = Tapped(tasks, adversaries, every, form, count, lambda: ended.append(True))
+    tap = TapWriter(tasks, adversaries, every, form, count, lambda: ended.append(True))
     for task in range(3):
         for variation in range(2):
             for trial in range(4):
-                law = {"adversary": NULL} if variation == 0 else {}
-                made.append(trajectory(f"adapt/0/{task}/{variation}/{trial}", **law))
+                adversary = {"adversary": NULL} if variation == 0 else {}
+                made.append(trajectory(f"adapt/0/{task}/{variation}/{trial}", **adversary))
     for first in range(0, len(made), 7):
         tap("key", monitor_messages.trajectories(made[first : first + 7], 0.0))
     broken = [{"identity": "x"}, {"identity": "adapt/0/0/0", "trials": [1], "returns": [], "steps": []}, 7]
-    for odd in (progress(), b"garbage", *(wire.encode_message("trajectories", variations=[one]) for one in broken)):
-        tap("key", odd)
+    for invalid in (progress(), b"garbage", *(wire.encode_message("trajectories", variations=[one]) for one in broken)):
+        tap("key", invalid)
     return out.buffer.getvalue(), len(ended)
 
 
@@ -46,43 +46,43 @@ def identities(written):
     return [json.loads(line)["identity"] for line in written.decode().splitlines()]
 
 
-def test_everything_unless_told_otherwise(monkeypatch):
+def test_without_filters_every_trajectory_is_written(monkeypatch):
     written, ended = tapped(monkeypatch)
     assert len(identities(written)) == 24 and not ended
 
 
-def test_by_task_and_by_adversary(monkeypatch):
+def test_filters_by_task_and_by_adversary(monkeypatch):
     assert identities(tapped(monkeypatch, tasks=(2,), adversaries=("null",))[0]) == [f"adapt/0/2/0/{n}" for n in range(4)]
     assert identities(tapped(monkeypatch, tasks=(0, 1), adversaries=("1",))[0])[-1] == "adapt/0/1/1/3"
     assert identities(tapped(monkeypatch, adversaries=("dirichlet", "0"))[0]) == identities(tapped(monkeypatch)[0])
 
 
-def test_every_so_manyth_of_those_and_no_more_than_asked(monkeypatch):
+def test_every_nth_trajectory_up_to_the_count(monkeypatch):
     written, ended = tapped(monkeypatch, tasks=(1,), every=3, count=2)
     assert identities(written) == ["adapt/0/1/0/0", "adapt/0/1/0/3"] and ended == 1
 
 
-def test_as_messages_of_their_own(monkeypatch):
+def test_msgpack_output_has_one_map_a_trajectory(monkeypatch):
     written, _ = tapped(monkeypatch, tasks=(1,), form="msgpack")
     found = list(msgpack.Unpacker(io.BytesIO(written)))
     assert len(found) == 8 and found[0]["identity"] == "adapt/0/1/0/0" and found[0]["v"] == 1
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])
-def test_a_field_that_json_cannot_hold_costs_no_trajectory(monkeypatch, form):
+def test_a_field_that_json_cannot_represent_loses_no_trajectory(monkeypatch, form):
     out = Out()
     monkeypatch.setattr(sys, "stdout", out)
-    of = {"trials": [0], "returns": [1.0], "steps": [9]}
-    told = [
+    columns = {"trials": [0], "returns": [1.0], "steps": [9]}
+    entries = [
         {
             "identity": "adapt/0/0/0",
             "adversary": {"kind": "x", "more": b"\xff\x01"},
-            "kind": "a name of the message's own",
-            **of,
+            "kind": "a field named like one of the message",
+            **columns,
         },
-        {"identity": "adapt/0/0/1", "adversary": {}, **of},
+        {"identity": "adapt/0/0/1", "adversary": {}, **columns},
     ]
-    Tapped((), (), 1, form, 0, lambda: None)("key", wire.encode_message("trajectories", worker="w0", variations=told))
+    TapWriter((), (), 1, form, 0, lambda: None)("key", wire.encode_message("trajectories", worker="w0", variations=entries))
     written = out.buffer.getvalue()
     found = [*msgpack.Unpacker(io.BytesIO(written))] if form == "msgpack" else [*map(json.loads, written.decode().splitlines())]
     assert [one["identity"] for one in found] == ["adapt/0/0/0/0", "adapt/0/0/1/0"]
@@ -92,9 +92,9 @@ def test_a_field_that_json_cannot_hold_costs_no_trajectory(monkeypatch, form):
 FULL = "icrl-dist: tap: standard output cannot be written: No space left on device\n"
 
 
-@pytest.mark.parametrize(("full", "code", "told"), [(False, 128 + signal.SIGPIPE, ""), (True, 1, FULL)])
-def test_it_ends_when_nobody_reads_it_or_nothing_can_be_written(hub, monkeypatch, capfd, full, code, told):
-    """As ``icrl-dist tap | head -1`` does, without a word and with the exit code of other commands."""
+@pytest.mark.parametrize(("full", "code", "message"), [(False, 128 + signal.SIGPIPE, ""), (True, 1, FULL)])
+def test_the_tap_ends_when_its_reader_is_gone_or_writing_fails(hub, monkeypatch, capfd, full, code, message):
+    """A closed pipe, as in ``icrl-dist tap | head -1``, gives no message and the exit code of other commands."""
     link, over = hub(), threading.Event()
     reader, writer = os.pipe()
     os.close(reader)
@@ -117,11 +117,11 @@ def test_it_ends_when_nobody_reads_it_or_nothing_can_be_written(hub, monkeypatch
     finally:
         over.set()
         running.join()
-    out.close()  # as the interpreter does at its end
-    assert capfd.readouterr().err == told
+    out.close()  # as the interpreter does on exit
+    assert capfd.readouterr().err == message
 
 
-@pytest.mark.parametrize("odd", [{"every": 0}, {"count": -1}, {"tasks": (-3,)}])
-def test_numbers_that_cannot_be(monkeypatch, odd):
+@pytest.mark.parametrize("invalid", [{"every": 0}, {"count": -1}, {"tasks": (-3,)}])
+def test_numbers_out_of_range_are_refused(monkeypatch, invalid):
     with pytest.raises(ConfigError, match="must be at least"):
-        tapped(monkeypatch, **odd)
+        tapped(monkeypatch, **invalid)

@@ -1,43 +1,43 @@
-// What the pages of the live view share: theme, colours for a canvas, events, commands.
+// Shared by both pages: theme, colors for a canvas, server events, commands.
 
 const root = document.documentElement;
 const repaints = [];
 
-/** Call `paint` now and whenever the colours change. */
+/** Call `paint` now and after every change of the theme. */
 export function onTheme(paint) {
   repaints.push(paint);
   paint();
 }
 
-const known = new Map(); // colours, until the theme changes
+const colors = new Map(); // by name of the custom property, until the theme changes
 
 function repaint() {
-  known.clear();
+  colors.clear();
   repaints.forEach((paint) => paint());
 }
 
-/** The theme button: light, dark, or what the system has. */
+/** The theme button: light, dark, or the theme of the system. */
 export function themeButton(button) {
-  const words = { "": "Theme: system", light: "Theme: light", dark: "Theme: dark" };
+  const labels = { "": "Theme: system", light: "Theme: light", dark: "Theme: dark" };
   const show = (theme) => {
     if (theme) root.dataset.theme = theme;
     else delete root.dataset.theme;
-    button.textContent = words[theme];
+    button.textContent = labels[theme];
     repaint();
   };
-  let theme = remembered("theme");
-  if (!(theme in words)) theme = "";
+  let theme = storedValue("theme");
+  if (!(theme in labels)) theme = "";
   button.addEventListener("click", () => {
-    const order = Object.keys(words);
+    const order = Object.keys(labels);
     theme = order[(order.indexOf(theme) + 1) % order.length];
-    remember("theme", theme);
+    storeValue("theme", theme);
     show(theme);
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
   show(theme);
 }
 
-function remembered(name) {
+function storedValue(name) {
   try {
     return localStorage.getItem(name) ?? "";
   } catch {
@@ -45,15 +45,15 @@ function remembered(name) {
   }
 }
 
-function remember(name, value) {
+function storeValue(name, value) {
   try {
     localStorage.setItem(name, value);
   } catch {
-    // A browser that keeps nothing: the choice lasts as long as the page.
+    // The browser refuses storage: the choice lasts until the page is closed.
   }
 }
 
-/** A canvas's context, cleared and as sharp as the screen, in CSS pixels; its width and height in them. */
+/** A canvas's context, cleared and scaled to the resolution of the screen, with width and height in CSS pixels. */
 export function canvas(element) {
   const [width, height] = [element.clientWidth, element.clientHeight];
   const ratio = window.devicePixelRatio || 1;
@@ -70,32 +70,32 @@ export function canvas(element) {
 const probe = document.createElement("span");
 probe.hidden = true;
 
-/** What a custom property such as "--accent" is at present, as rgb(...), for a canvas. */
-export function colour(name) {
-  if (known.has(name)) return known.get(name);
+/** The present value of a custom property such as "--accent", as rgb(...), for a canvas. */
+export function color(name) {
+  if (colors.has(name)) return colors.get(name);
   if (!probe.isConnected) document.body.append(probe);
   probe.style.color = `var(${name})`;
-  known.set(name, getComputedStyle(probe).color);
-  return known.get(name);
+  colors.set(name, getComputedStyle(probe).color);
+  return colors.get(name);
 }
 
-/** Listen to the server; `handlers` by name of event.  `status` is an element that says how it goes. */
+/** Connect to the server's events; `handlers` by name of event.  The element `status` shows the state of the connection. */
 export function listen(handlers, status) {
   const source = new EventSource("/events");
-  const say = (kind, text) => {
+  const show = (kind, text) => {
     if (status.textContent === text) return;
     status.className = `badge ${kind}`;
     status.textContent = text;
   };
-  source.onopen = () => say("ok", "live");
-  source.onerror = () => say("bad", source.readyState === EventSource.CLOSED ? "ended: reload to try again" : "connecting again");
+  source.onopen = () => show("ok", "live");
+  source.onerror = () => show("bad", source.readyState === EventSource.CLOSED ? "disconnected: reload the page" : "reconnecting");
   for (const [name, handle] of Object.entries(handlers)) {
     source.addEventListener(name, (event) => handle(JSON.parse(event.data)));
   }
   return source;
 }
 
-/** Send a command; resolves to "" or to the line that says why not. */
+/** Send a command; resolves to "" or to the error, one line. */
 export async function command(fields) {
   try {
     const answer = await fetch("/command", {
@@ -111,10 +111,10 @@ export async function command(fields) {
       return text;
     }
   } catch {
-    return "the server does not answer";
+    return "no answer from the server";
   }
 }
 
-/** A number with so many digits after the point, or a dash for none. */
+/** A number with `digits` digits after the point; a dash for null. */
 export const number = (value, digits = 0) =>
   value === null || value === undefined ? "–" : value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });

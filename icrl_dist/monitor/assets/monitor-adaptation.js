@@ -1,38 +1,38 @@
-// Return over episodes: the mean over variations, phase by phase, and the variations themselves.
+// The chart of returns by episode: the mean over variations for each phase, and single variations.
 
 import { Chart, axis, faint, ink, line } from "./monitor-charts.js";
-import { brief, byId, mean, plural, say } from "./monitor-dom.js";
+import { brief, byId, mean, plural, setText } from "./monitor-dom.js";
 import { later } from "./monitor-store.js";
 
-const DRAWN = 200; // single variations drawn at most, and used for the quantiles
-const PHASES = 3;
-const LONGEST = 1000; // episodes on the axis
+const MAX_DRAWN = 200; // limit on the variations that are drawn and that the quantiles are computed from
+const MAX_PHASES = 3;
+const MAX_EPISODES = 1000; // limit on the episodes on the axis
 const INKS = ["--series-1", "--series-6", "--series-6"];
 const DASHES = [[], [7, 4], [2, 3]];
 
 let chart = null;
 let shown = { rows: [], newest: "", scaled: true, x: [] };
 
-/** What a phase's returns are divided by: its own optimum where one is known for any of the rows, else 1; null if unknown. */
+/** The divisor of a phase's returns: its optimum (null if unknown) if any row has one, else 1. */
 export function scaling(rows) {
   const scaled = rows.some((row) => row.phases.some((phase) => phase.optimum > 0));
   return { scaled, scale: (phase) => (scaled ? (phase.optimum > 0 ? phase.optimum : null) : 1) };
 }
 
-/** A row's phase of that name, if it has returns that can be drawn. */
+/** A row's phase with this name, if it has returns and a divisor. */
 const drawable = (row, name, scale) => row.phases.find((phase) => phase.name === name && phase.trials.length && scale(phase) !== null);
 
 export function drawAdaptation(rows) {
   const { scaled, scale } = scaling(rows);
   const phases = [...new Set(rows.flatMap((row) => row.phases.filter((phase) => drawable(row, phase.name, scale)).map((phase) => phase.name)))];
-  phases.sort((one, other) => (one === other ? 0 : later(one, other) === one ? -1 : 1)).splice(PHASES);
+  phases.sort((one, other) => (one === other ? 0 : later(one, other) === one ? -1 : 1)).splice(MAX_PHASES);
   const newest = phases[0];
-  say(byId("adaptation-unit"), `${scaled ? "return over the optimal return" : "return"}, by episode`);
+  setText(byId("adaptation-unit"), `${scaled ? "return over the optimal return" : "return"}, by episode`);
   if (!newest) return;
-  const begun = rows.filter((row) => row.phases.some((phase) => phase.name === newest && phase.trials.length));
-  const known = begun.filter((row) => drawable(row, newest, scale));
+  const started = rows.filter((row) => row.phases.some((phase) => phase.name === newest && phase.trials.length));
+  const known = started.filter((row) => drawable(row, newest, scale));
   const columns = phases.map((name) => means(rows, name, scale));
-  const trials = ordered(columns[0]).slice(-LONGEST);
+  const trials = ordered(columns[0]).slice(-MAX_EPISODES);
   const x = trials.map((trial) => trial + 1);
   const [low, high] = spread(known, newest, scale, trials);
   shown = { rows: sample(known), newest, scale, x };
@@ -40,10 +40,10 @@ export function drawAdaptation(rows) {
   shown.phases = phases;
   const lines = columns.map((column) => trials.map((trial) => column.get(trial) ?? null));
   chart.draw([x, high, low, ...lines.toReversed()], [scaled, x.length < 2, ...phases].join());
-  describe(columns, phases, known.length, begun.length, scaled);
+  describe(columns, phases, known.length, started.length, scaled);
 }
 
-/** Mean over variations by trial; any numbers may be trials. */
+/** Mean over variations by trial; trials need not be consecutive. */
 function means(rows, name, scale) {
   const sums = new Map();
   for (const row of rows) {
@@ -59,7 +59,7 @@ function means(rows, name, scale) {
 const ordered = (column) => [...column.keys()].sort((one, other) => one - other);
 
 function sample(rows) {
-  const every = Math.ceil(rows.length / DRAWN);
+  const every = Math.ceil(rows.length / MAX_DRAWN);
   return rows.filter((_, index) => index % every === 0);
 }
 
@@ -70,7 +70,7 @@ function spread(rows, name, scale, trials) {
     const phase = drawable(row, name, scale);
     phase?.trials.forEach((trial, index) => values.get(trial)?.push(phase.returns[index] / scale(phase)));
   }
-  const quantile = (q) => [...values.values()].map((of) => (of.sort((a, b) => a - b), of.length ? of[Math.round(q * (of.length - 1))] : null));
+  const quantile = (q) => [...values.values()].map((each) => (each.sort((a, b) => a - b), each.length ? each[Math.round(q * (each.length - 1))] : null));
   return [quantile(0.1), quantile(0.9)];
 }
 
@@ -89,7 +89,7 @@ function options() {
   };
 }
 
-/** Every variation's own curve, faint, behind the mean. */
+/** Draw the curve of every variation, faint, behind the mean. */
 function singles(plot) {
   const { ctx } = plot;
   ctx.save();
@@ -115,8 +115,8 @@ function singles(plot) {
 function describe(columns, phases, known, all, scaled) {
   const [newest, ...earlier] = columns.map((column) => ordered(column).map((trial) => column.get(trial)));
   const ends = earlier.map((values, index) => `${phases[index + 1]} ended at ${brief(mean(values.slice(-5)))}`);
-  const left = known < all && scaled ? ` (${plural(all - known, "optimum")} not known yet)`.replace("optimums", "optima") : "";
-  say(
+  const left = known < all && scaled ? ` (${plural(all - known, "optimum")} not computed yet)`.replace("optimums", "optima") : "";
+  setText(
     byId("adaptation-summary"),
     `${phases[0]}: ${brief(newest[0])} in the first episode, ${brief(mean(newest.slice(-5)))} in the last five, ` +
       `mean of ${plural(known, "variation")}${left}${ends.length ? "; " + ends.join(", ") : ""}. Shaded: 10% to 90% of variations.`,

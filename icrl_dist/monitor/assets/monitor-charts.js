@@ -1,32 +1,32 @@
-// uPlot charts in the page's colours, drawn anew when those change.
+// uPlot charts in the colors of the theme; a change of the theme draws them again.
 
-import { colour, onTheme } from "./common.js";
-import { brief, el, say } from "./monitor-dom.js";
+import { color, onTheme } from "./common.js";
+import { brief, el, setText } from "./monitor-dom.js";
 
 const charts = new Set();
 const cache = new Map();
 
-/** A colour of the theme, looked up once. */
+/** A color of the theme, cached. */
 export function ink(name) {
-  if (!cache.has(name)) cache.set(name, colour(name));
+  if (!cache.has(name)) cache.set(name, color(name));
   return cache.get(name);
 }
 
-let began = false;
+let started = false;
 export function watchTheme() {
   onTheme(() => {
     cache.clear();
-    if (began) for (const chart of charts) chart.remake();
-    began = true;
+    if (started) for (const chart of charts) chart.remake();
+    started = true;
   });
 }
 
-/** The same colour, thinner. */
+/** A color of the theme with opacity `share`. */
 export const faint = (name, share) => ink(name).replace("rgb(", "rgba(").replace(")", `, ${share})`);
 
 const FONT = "11px system-ui, 'Liberation Sans', sans-serif";
 
-/** A chart that fills an element, with its key above; `make` gives uPlot's options. */
+/** A chart that fills an element, with a legend above; `make` returns uPlot's options. */
 export class Chart {
   constructor(place, make) {
     this.keys = el("div", { class: "keys small", "aria-hidden": "true" });
@@ -40,7 +40,7 @@ export class Chart {
     new ResizeObserver(() => this.#fit()).observe(this.place);
   }
 
-  /** Draw columns; `shape` names what the series are: another shape is another chart. */
+  /** Draw columns; `shape` identifies the series, and another shape makes a new chart. */
   draw(data, shape = "") {
     this.data = data;
     if (this.plot && shape === this.shape) this.plot.setData(data);
@@ -48,7 +48,7 @@ export class Chart {
       this.shape = shape;
       this.remake();
     }
-    this.#tell();
+    this.#updateLegend();
   }
 
   remake() {
@@ -56,7 +56,7 @@ export class Chart {
     this.plot = null;
     if (!this.data || !this.place.clientWidth) return;
     const made = this.make();
-    const hooks = { ...made.hooks, setCursor: [() => this.#tell()] };
+    const hooks = { ...made.hooks, setCursor: [() => this.#updateLegend()] };
     this.plot = new uPlot({ ...common(), ...made, hooks, ...this.#size() }, this.data, this.place);
     this.values = [];
     this.keys.replaceChildren(
@@ -70,18 +70,18 @@ export class Chart {
         return el("span", { class: "key" }, ...(index ? [swatch] : []), `${series.label} `, value);
       }),
     );
-    this.#tell();
+    this.#updateLegend();
   }
 
-  /** The key says the values under the cursor, else the newest. */
-  #tell() {
+  /** Show in the legend the values under the cursor, else the newest values. */
+  #updateLegend() {
     if (!this.plot?.data) return;
     const { idx } = this.plot.cursor;
     for (const [index, element] of this.values ?? []) {
       const column = this.plot.data[index];
       const value = idx === null || idx === undefined ? (index ? column.findLast((each) => each !== null) : column.at(-1)) : column[idx];
-      const { words } = this.plot.series[index];
-      say(element, (words ?? brief)(value));
+      const { format } = this.plot.series[index];
+      setText(element, (format ?? brief)(value));
     }
   }
 
@@ -96,7 +96,7 @@ export class Chart {
     if (this.plot.width !== width || this.plot.height !== height) this.plot.setSize({ width, height });
   }
 
-  forget() {
+  clear() {
     this.plot?.destroy();
     this.plot = null;
     this.data = null;
@@ -110,7 +110,7 @@ const common = () => ({
   padding: [8, 14, 0, 0],
 });
 
-/** An axis in the page's colours. */
+/** An axis in the colors of the theme. */
 export function axis(more = {}) {
   return {
     stroke: ink("--muted"),
@@ -124,7 +124,7 @@ export function axis(more = {}) {
   };
 }
 
-/** A line in a colour of the theme. */
+/** A line in a color of the theme. */
 export function line(label, name, more = {}) {
   return {
     label,
@@ -144,7 +144,7 @@ export class Timeline {
       scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(least, (high ?? 1) * 1.08)] } },
       axes: [axis({ size: 22, values: (_, ticks) => ticks.map(ago), space: 60 }), axis()],
       series: [
-        { label: "", words: (value) => (value === undefined ? "" : ago(value)) },
+        { label: "", format: (value) => (value === undefined ? "" : ago(value)) },
         ...names.map(({ label, ink: name, dash, points }) => line(label, name, { dash: dash ?? [], points: { show: points ?? false, size: 4 } })),
       ],
     }));

@@ -1,16 +1,16 @@
-// One variation: its adversary, its curves, its newest episode, and where each came from.
+// The dialog of one variation: its adversary, returns, newest episode and lineage.
 
 import { Chart, axis, line } from "./monitor-charts.js";
 import { Tile } from "./monitor-episodes.js";
-import { brief, byId, clock, el, plural, say } from "./monitor-dom.js";
+import { brief, byId, clock, el, plural, setText } from "./monitor-dom.js";
 import { factsOf } from "./monitor-panels.js";
 
 const INKS = ["--series-1", "--series-4", "--series-6"];
 
-/** The phases whose own optimum is known: each round has another adversary. */
+/** The phases with a known optimum; it differs by phase, because each round has another adversary. */
 const solved = (row) => row.phases.filter((phase) => phase.optimum !== null);
 
-function phaseWords(phase) {
+function phaseText(phase) {
   const optimal = phase.optimum === null ? "" : `, optimal ${brief(phase.optimum)}`;
   return `${phase.name}: ${plural(phase.returns.length, "episode")}, last ${brief(phase.returns.at(-1))}${optimal}`;
 }
@@ -27,7 +27,7 @@ export class Detail {
     byId("detail-close").addEventListener("click", () => this.dialog.close());
     this.dialog.addEventListener("close", () => {
       this.name = this.row = null;
-      this.chart.forget();
+      this.chart.clear();
       this.episodes.extra.delete(this.tile);
       this.opener?.focus();
     });
@@ -39,9 +39,9 @@ export class Detail {
   async open(name) {
     this.opener = document.activeElement;
     this.name = name;
-    this.seen = null;
-    say(byId("detail-title"), `Variation ${name}`);
-    say(byId("detail-said"), "");
+    this.shown = null;
+    setText(byId("detail-title"), `Variation ${name}`);
+    setText(byId("detail-said"), "");
     byId("detail-lineage").replaceChildren();
     byId("detail-episode").replaceChildren();
     this.tile.episode = null;
@@ -49,23 +49,23 @@ export class Detail {
     await this.refresh();
   }
 
-  /** Ask for it again, if it has changed. */
+  /** Fetch the variation again if it has changed. */
   async refresh() {
-    const told = this.store.variations.get(this.name);
-    if (!this.name || this.asking || told === this.seen) return;
-    this.asking = true;
+    const newest = this.store.variations.get(this.name);
+    if (!this.name || this.fetching || newest === this.shown) return;
+    this.fetching = true;
     try {
       const answer = await fetch(`/variation/${this.name}`);
-      if (!answer.ok) return say(byId("detail-said"), "The server no longer knows this variation.");
+      if (!answer.ok) return setText(byId("detail-said"), "The server has no data of this variation any more.");
       const row = await answer.json();
       if (row.name === this.name) {
-        this.seen = told;
+        this.shown = newest;
         this.#show(row);
       }
     } catch {
-      say(byId("detail-said"), "The server does not answer.");
+      setText(byId("detail-said"), "No answer from the server.");
     } finally {
-      this.asking = false;
+      this.fetching = false;
     }
   }
 
@@ -81,7 +81,7 @@ export class Detail {
     const bounds = solved(row).map((phase) => trials.map((trial) => (during(phase, trial) ? phase.optimum : null)));
     const x = trials.map((trial) => trial + 1);
     this.chart.draw([x, ...bounds, ...columns], JSON.stringify([row.name, row.phases.map((phase) => [phase.name, phase.optimum])]));
-    say(byId("detail-summary"), row.phases.map(phaseWords).join("; "));
+    setText(byId("detail-summary"), row.phases.map(phaseText).join("; "));
     if (row.episode && row.episode.identity !== this.tile.episode?.identity) {
       byId("detail-episode").replaceChildren(this.tile.element);
       this.tile.show(row.episode);
@@ -106,11 +106,11 @@ export class Detail {
   }
 
   #lineage(rows) {
-    const head = ["Identity", "Return", "Weights", "Digest", "Worker", "Sent at", "Explain"];
+    const head = ["Identity", "Return", "Version", "Weights digest", "Worker", "Sent at", "Explain"];
     const body = rows.toReversed().map((row) => {
-      const words = `icrl-dist explain runs/${this.store.run.name} ${row.identity}`;
-      const copy = el("button", { type: "button", class: "small-button", title: words, "aria-label": `Copy: ${words}` }, "Copy command");
-      copy.addEventListener("click", () => this.#copy(words));
+      const command = `icrl-dist explain runs/${this.store.run.name} ${row.identity}`;
+      const copy = el("button", { type: "button", class: "small-button", title: command, "aria-label": `Copy: ${command}` }, "Copy command");
+      copy.addEventListener("click", () => this.#copy(command));
       return el(
         "tr",
         {},
@@ -130,12 +130,12 @@ export class Detail {
     if (focused) [...byId("detail-lineage").querySelectorAll("button")].find((button) => button.getAttribute("aria-label") === focused)?.focus();
   }
 
-  async #copy(words) {
+  async #copy(command) {
     try {
-      await navigator.clipboard.writeText(words);
-      say(byId("detail-said"), `Copied: ${words}`);
+      await navigator.clipboard.writeText(command);
+      setText(byId("detail-said"), `Copied: ${command}`);
     } catch {
-      say(byId("detail-said"), words);
+      setText(byId("detail-said"), command);
     }
   }
 }

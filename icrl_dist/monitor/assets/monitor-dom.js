@@ -1,10 +1,10 @@
-// Elements, words and numbers.  Whatever a message says becomes text, never markup.
+// Elements, texts and numbers.  Data from messages becomes text, never markup.
 
 import { number } from "./common.js";
 
 export const byId = (id) => document.getElementById(id);
 
-/** An element with attributes and children; a child that is no node becomes text. */
+/** An element with attributes and children; a child that is not a node becomes text. */
 export function el(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -15,13 +15,13 @@ export function el(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Set text only where it differs, so that nothing is announced or selected anew. */
-export function say(element, text) {
-  const words = String(text);
-  if (element.textContent !== words) element.textContent = words;
+/** Set an element's text only if it differs, so that screen readers and selections are not disturbed. */
+export function setText(element, text) {
+  const newText = String(text);
+  if (element.textContent !== newText) element.textContent = newText;
 }
 
-/** What a run's or worker's state looks like; the word always stands beside it. */
+/** Style of the badge of a run's or worker's state; the badge also contains the state as text. */
 const KINDS = {
   collecting: "ok", fitting: "ok", finished: "ok", working: "ok", done: "ok",
   waiting: "muted", silent: "warn", interrupted: "warn", failed: "bad", gone: "bad",
@@ -30,10 +30,10 @@ const KINDS = {
 export function badge(element, state) {
   const kind = `badge ${KINDS[state] ?? "muted"}`;
   if (element.className !== kind) element.className = kind;
-  say(element, state);
+  setText(element, state);
 }
 
-/** A time span in seconds, as 1:02:03 or 2:03; a dash for none. */
+/** A duration in seconds as 1:02:03 or 2:03; a dash for null. */
 export function span(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   const whole = Math.round(seconds);
@@ -43,10 +43,10 @@ export function span(seconds) {
   return hours ? `${hours}:${two(minutes)}:${two(rest)}` : `${minutes}:${two(rest)}`;
 }
 
-/** A moment, Unix seconds, as the time of day. */
+/** A time in Unix seconds as the time of day. */
 export const clock = (time) => (Math.abs(time) < 8e12 ? new Date(time * 1000).toLocaleTimeString("en-GB") : "–");
 
-/** A number to three digits or so. */
+/** A number with about three digits; a dash for null. */
 export function brief(value) {
   if (value === null || value === undefined) return "–";
   const size = Math.abs(value);
@@ -57,14 +57,14 @@ export function brief(value) {
 const parameter = (value) =>
   Array.isArray(value) ? `[${value.map(brief).join(", ")}]` : typeof value === "number" ? brief(value) : String(value);
 
-/** Parameters as words: "p 0.31, alpha [1.2, 0.4]". */
+/** Parameters as text: "p 0.31, alpha [1.2, 0.4]". */
 export const parameters = (named, without = []) =>
   Object.entries(named)
     .filter(([name]) => !without.includes(name))
     .map(([name, value]) => `${name} ${parameter(value)}`)
     .join(", ");
 
-/** A count by reason, as words. */
+/** Counts by reason as text. */
 export const reasons = (counts) =>
   Object.entries(counts ?? {}).map(([name, count]) => `${name} ${number(count)}`).join(", ") || "none";
 

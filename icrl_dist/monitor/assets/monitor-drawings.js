@@ -1,9 +1,9 @@
-// Episodes on canvases.  A drawing is drawn at a moment `at`, in frames, up to `frames(drawing)`.
+// Draws episodes on canvases.  `at` is the position in an episode in frames, below `frames(drawing)`.
 
 import { canvas, number } from "./common.js";
 import { faint, ink } from "./monitor-charts.js";
 
-const CELLS_PER_S = 10; // Dark Room has no clock of its own
+const CELLS_PER_S = 10; // Dark Room has no simulated time
 const POINTS_PER_S = 30;
 
 export function frames(drawing) {
@@ -12,14 +12,14 @@ export function frames(drawing) {
   return Math.max(...drawing.paths.map((path) => path.points.length));
 }
 
-/** Frames a second: a simulation's own rate. */
+/** Frames a second; real time for a simulation. */
 export function rate(drawing) {
   if (drawing.kind === "room") return CELLS_PER_S;
   return drawing.kind === "sticks" ? 1 / drawing.frame_s : POINTS_PER_S;
 }
 
-/** What a drawing shows, in words. */
-export function words(drawing) {
+/** A description of a drawing in text. */
+export function description(drawing) {
   if (drawing.kind === "room") {
     const reached = drawing.path.findIndex(([x, y]) => x === drawing.goal[0] && y === drawing.goal[1]);
     const overridden = drawing.overridden.filter(Boolean).length;
@@ -33,7 +33,7 @@ export function words(drawing) {
   return `From above: ${drawing.paths.map((path) => path.name).join(" and ")}, ${frames(drawing)} frames`;
 }
 
-/** Draw on a canvas, as sharp as the screen, at frame `at`; whole if `still`. */
+/** Draw the episode up to frame `at`, or all of it if `still`. */
 export function draw(element, drawing, at, still = false) {
   const { pen: ctx, width, height } = canvas(element);
   if (!width) return;
@@ -106,7 +106,7 @@ function dot(ctx, x, y, radius) {
 
 const boundsOf = new WeakMap();
 
-/** What holds all points, with a margin; found once a drawing. */
+/** The bounding box of all points of a drawing, cached. */
 function bounds(drawing, points) {
   if (!boundsOf.has(drawing)) {
     const box = [Infinity, Infinity, -Infinity, -Infinity];
@@ -121,7 +121,7 @@ function bounds(drawing, points) {
   return boundsOf.get(drawing);
 }
 
-/** From metres to the canvas, one scale for both axes, y upwards. */
+/** A map from meters to the canvas, with one scale for both axes and y upwards. */
 function fit(width, height, [x0, y0, x1, y1]) {
   const scale = Math.min((width - 12) / Math.max(1e-6, x1 - x0), (height - 20) / Math.max(1e-6, y1 - y0));
   const [cx, cy] = [(x0 + x1) / 2, (y0 + y1) / 2];

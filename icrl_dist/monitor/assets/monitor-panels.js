@@ -1,43 +1,43 @@
-// Header, alerts, recording, workers, events: what is small and always whole.
+// Header, alerts, controls of a recording, workers and events.
 
 import { command, number } from "./common.js";
-import { badge, brief, byId, clock, el, parameters, plural, reasons, say, span } from "./monitor-dom.js";
+import { badge, brief, byId, clock, el, parameters, plural, reasons, setText, span } from "./monitor-dom.js";
 import { Table } from "./monitor-table.js";
 
 const STAGES = { collect: "Collecting", fit: "Fitting" };
 
 export function drawHeader({ run, replay }) {
-  say(byId("name"), run.name || "Waiting for a run");
+  setText(byId("name"), run.name || "Waiting for a run");
   document.title = run.name ? `${run.name}: ${run.state}` : "icrl-dist: live view";
   badge(byId("state"), run.state ?? "waiting");
-  say(byId("what"), [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(" · "));
+  setText(byId("what"), [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(" · "));
   const over = ["finished", "interrupted", "failed"].includes(run.state);
   const fit = run.stage === "fit";
-  say(byId("stage"), run.stage ? `${STAGES[run.stage] ?? run.stage} ${run.phase}/${run.round}` : "no stage yet");
+  setText(byId("stage"), run.stage ? `${STAGES[run.stage] ?? run.stage} ${run.phase}/${run.round}` : "no stage yet");
   const steps = run.steps ?? 0;
-  say(byId("steps"), steps ? `${number(run.step)} of ${number(steps)} ${fit ? "steps" : "trajectories"} · ${Math.floor((100 * run.step) / steps)}%` : "");
+  setText(byId("steps"), steps ? `${number(run.step)} of ${number(steps)} ${fit ? "steps" : "trajectories"} · ${Math.floor((100 * run.step) / steps)}%` : "");
   byId("bar").value = steps ? Math.min(1, run.step / steps) : 0;
   const last = run.rounds ? ` of ${number(run.rounds - 1)}` : "";
-  say(byId("round"), run.stage ? (run.phase === "adapt" ? `${run.round}${last}` : "before 0") : "–");
-  say(byId("elapsed"), span(run.elapsed_s));
-  say(byId("stage-eta"), over ? "–" : span(run.stage_eta_s));
-  say(byId("eta"), over ? "–" : span(run.eta_s));
-  say(byId("version"), run.version >= 0 ? `T^${run.version}` : "none yet");
-  say(byId("trajectories"), number(run.trajectories ?? 0));
-  say(byId("loss"), brief(run.loss));
+  setText(byId("round"), run.stage ? (run.phase === "adapt" ? `${run.round}${last}` : "before 0") : "–");
+  setText(byId("elapsed"), span(run.elapsed_s));
+  setText(byId("stage-eta"), over ? "–" : span(run.stage_eta_s));
+  setText(byId("eta"), over ? "–" : span(run.eta_s));
+  setText(byId("version"), run.version >= 0 ? `T^${run.version}` : "none yet");
+  setText(byId("trajectories"), number(run.trajectories ?? 0));
+  setText(byId("loss"), brief(run.loss));
   byId("replay").hidden = !replay;
 }
 
 export function drawAlerts({ alerts }) {
   const place = byId("alerts");
-  const words = alerts.map((alert) => `${alert.text} (since ${clock(alert.since)})`);
-  if (place.dataset.words !== words.join("\n")) {
-    place.dataset.words = words.join("\n");
+  const texts = alerts.map((alert) => `${alert.text} (since ${clock(alert.since)})`);
+  if (place.dataset.texts !== texts.join("\n")) {
+    place.dataset.texts = texts.join("\n");
     const at = place.scrollTop;
-    place.replaceChildren(...words.map((text) => el("p", {}, el("strong", {}, "Alert: "), text)));
+    place.replaceChildren(...texts.map((text) => el("p", {}, el("strong", {}, "Alert: "), text)));
     place.scrollTop = at;
   }
-  if (words.length > 1) place.tabIndex = place.scrollHeight > place.clientHeight ? 0 : -1; // keys scroll it where it scrolls
+  if (texts.length > 1) place.tabIndex = place.scrollHeight > place.clientHeight ? 0 : -1; // focusable if it can be scrolled
   else place.removeAttribute("tabindex");
 }
 
@@ -48,43 +48,43 @@ export class Replay {
   constructor() {
     this.dragging = false;
     this.speeds = "";
-    this.told = null;
-    byId("pause").addEventListener("click", () => this.#send(this.#ended() ? { at: this.told.begin, paused: false } : { paused: !this.told.paused }));
+    this.replay = null;
+    byId("pause").addEventListener("click", () => this.#send(this.#ended() ? { at: this.replay.begin, paused: false } : { paused: !this.replay.paused }));
     byId("speed").addEventListener("change", (event) => this.#send({ speed: Number(event.target.value) }));
     const seek = byId("seek");
     seek.addEventListener("input", () => {
       this.dragging = true;
-      say(byId("at"), this.#words(this.#moment()));
-      seek.setAttribute("aria-valuetext", this.#words(this.#moment()));
+      setText(byId("at"), this.#positionText(this.#selectedTime()));
+      seek.setAttribute("aria-valuetext", this.#positionText(this.#selectedTime()));
     });
     seek.addEventListener("change", async () => {
-      await this.#send({ at: this.#moment() });
+      await this.#send({ at: this.#selectedTime() });
       this.dragging = false;
     });
   }
 
   async #send(fields) {
-    say(byId("replay-error"), await command(fields));
+    setText(byId("replay-error"), await command(fields));
   }
 
   #ended() {
-    return this.told.at >= this.told.end;
+    return this.replay.at >= this.replay.end;
   }
 
-  #moment() {
-    const { begin, end } = this.told;
+  #selectedTime() {
+    const { begin, end } = this.replay;
     return begin + ((end - begin) * Number(byId("seek").value)) / 1000;
   }
 
-  #words(at) {
-    const { begin, end } = this.told;
+  #positionText(at) {
+    const { begin, end } = this.replay;
     return `${span(at - begin)} of ${span(end - begin)}`;
   }
 
   draw({ replay }) {
     if (!replay) return;
-    this.told = replay;
-    say(byId("pause"), this.#ended() ? "Play again" : replay.paused ? "Play" : "Pause");
+    this.replay = replay;
+    setText(byId("pause"), this.#ended() ? "Play again" : replay.paused ? "Play" : "Pause");
     const speeds = [...new Set([...SPEEDS, replay.speed])].sort((a, b) => a - b);
     if (speeds.join() !== this.speeds) {
       this.speeds = speeds.join();
@@ -93,8 +93,8 @@ export class Replay {
     if (document.activeElement !== byId("speed")) byId("speed").value = String(replay.speed);
     if (this.dragging) return;
     byId("seek").value = String(Math.round((1000 * (replay.at - replay.begin)) / Math.max(1e-9, replay.end - replay.begin)));
-    say(byId("at"), this.#words(replay.at));
-    byId("seek").setAttribute("aria-valuetext", this.#words(replay.at));
+    setText(byId("at"), this.#positionText(replay.at));
+    byId("seek").setAttribute("aria-valuetext", this.#positionText(replay.at));
   }
 }
 
@@ -109,14 +109,14 @@ const COLUMNS = [
     fill: (cell, row) => {
       if (!cell.firstChild) cell.append(el("span"));
       badge(cell.firstChild, row.state);
-      cell.title = row.state === "gone" || row.state === "silent" ? `nothing heard for ${span(row.silent_s)}` : row.doing;
+      cell.title = row.state === "gone" || row.state === "silent" ? `no heartbeat for ${span(row.silent_s)}` : row.doing;
     },
   },
-  { name: "job", title: "Job", value: (row) => row.job, fill: (cell, row) => (say(cell, row.job || "–"), (cell.title = row.doing)) },
+  { name: "job", title: "Job", value: (row) => row.job, fill: (cell, row) => (setText(cell, row.job || "–"), (cell.title = row.doing)) },
   count("steps_per_s", "Steps/s", "Environment steps a second"),
-  count("unstored", "Unstored", "Episodes finished and not yet acknowledged by the learner"),
-  count("lag", "Lag", "Versions by which the weights that act in its job are older than the newest"),
-  count("restarts", "Restarts", "Times it came back as another process"),
+  count("unstored", "Unstored", "Finished episodes that the learner has not stored yet"),
+  count("lag", "Lag", "Number of versions between the weights of its job and the newest weights"),
+  count("restarts", "Restarts", "Number of restarts as a new process"),
   { ...count("memory_mb", "MB", "Resident memory, megabytes"), text: (row) => (row.memory_mb ? number(row.memory_mb) : "–") },
 ];
 
@@ -137,13 +137,13 @@ export class Workers {
   draw({ workers }) {
     const shown = this.table.draw(workers);
     const trouble = workers.filter((row) => row.state === "gone" || row.state === "silent").length;
-    say(byId("worker-count"), `${number(workers.length)}${trouble ? `, ${number(trouble)} in trouble` : ""}`);
+    setText(byId("worker-count"), `${number(workers.length)}${trouble ? `, ${number(trouble)} in trouble` : ""}`);
     byId("worker-more").hidden = shown >= workers.length;
-    say(byId("worker-more"), `${plural(workers.length - shown, "more worker")} not shown`);
+    setText(byId("worker-more"), `${plural(workers.length - shown, "more worker")} not shown`);
   }
 }
 
-/** Events, newest first: only what is new is added. */
+/** Events, newest first; only new events are added to the page. */
 export class Events {
   constructor() {
     this.newest = -1;
@@ -166,17 +166,17 @@ export class Events {
     }
     while (list.children.length > 200) list.lastChild.remove();
     if (at > 4) list.scrollTop = at + list.scrollHeight - before;
-    say(byId("drops"), reasons(run.drops));
-    say(byId("ignored"), reasons(ignored));
+    setText(byId("drops"), reasons(run.drops));
+    setText(byId("ignored"), reasons(ignored));
   }
 }
 
-const against = (adversary) => [String(adversary.kind ?? "?"), parameters(adversary, ["kind"])].filter(Boolean).join(": ");
+const adversaryText = (adversary) => [String(adversary.kind ?? "?"), parameters(adversary, ["kind"])].filter(Boolean).join(": ");
 
 export const factsOf = (row) => [
   ["Task", parameters(row.parameters) || "–"],
-  ["Adversary", against(row.adversary)],
-  ...row.phases.slice(0, -1).map((phase) => [`Adversary of ${phase.name}`, against(phase.adversary)]).filter(([, words]) => words !== against(row.adversary)),
+  ["Adversary", adversaryText(row.adversary)],
+  ...row.phases.slice(0, -1).map((phase) => [`Adversary of ${phase.name}`, adversaryText(phase.adversary)]).filter(([, text]) => text !== adversaryText(row.adversary)),
   ["Optimal return, expected", brief(row.optimum)],
   ...(row.quarantine ? [["Quarantined", row.quarantine]] : []),
 ];

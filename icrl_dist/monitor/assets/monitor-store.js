@@ -1,4 +1,4 @@
-// What the page knows of a run: bounded, whatever the server says.  docs/monitor.md has the fields.
+// The state of a run on the page, with limits on its size.  docs/monitor.md lists the fields.
 
 const VARIATIONS = 4096;
 const EPISODES = 48;
@@ -27,19 +27,19 @@ export function emptyStore() {
   };
 }
 
-/** Take in one picture or what has changed since; false if something between was missed. */
-export function apply(store, told) {
-  if (told.since === -1) Object.assign(store, emptyStore(), { changes: store.changes + 1 });
-  else if (told.epoch !== store.epoch || told.since > store.seq) return false;
-  else if (told.seq < store.seq) return true;
-  for (const name of ["epoch", "seq", "time", "run", "workers", "alerts", "ignored", "replay"]) store[name] = told[name];
-  store.variationCount = told.variation_count;
-  store.leftOut = told.variations_left_out;
-  for (const row of told.variations) {
+/** Apply a full snapshot or a change; false if a change before this one was missed. */
+export function apply(store, snapshot) {
+  if (snapshot.since === -1) Object.assign(store, emptyStore(), { changes: store.changes + 1 });
+  else if (snapshot.epoch !== store.epoch || snapshot.since > store.seq) return false;
+  else if (snapshot.seq < store.seq) return true;
+  for (const name of ["epoch", "seq", "time", "run", "workers", "alerts", "ignored", "replay"]) store[name] = snapshot[name];
+  store.variationCount = snapshot.variation_count;
+  store.leftOut = snapshot.variations_left_out;
+  for (const row of snapshot.variations) {
     if (store.variations.size < VARIATIONS || store.variations.has(row.name)) store.variations.set(row.name, row);
   }
-  if (told.variations.length) store.changes += 1;
-  for (const episode of told.episodes) {
+  if (snapshot.variations.length) store.changes += 1;
+  for (const episode of snapshot.episodes) {
     if (store.episodes.get(episode.name)?.identity === episode.identity) continue;
     store.episodes.delete(episode.name);
     store.episodes.set(episode.name, episode);
@@ -48,22 +48,22 @@ export function apply(store, told) {
     if (store.episodes.size <= EPISODES) break;
     store.episodes.delete(name);
   }
-  append(store, told);
-  const believe = { ...store.beliefs, ...told.beliefs };
-  store.beliefs = Object.fromEntries(told.believers.filter((worker) => Object.hasOwn(believe, worker)).map((worker) => [worker, believe[worker]]));
+  append(store, snapshot);
+  const beliefs = { ...store.beliefs, ...snapshot.beliefs };
+  store.beliefs = Object.fromEntries(snapshot.believers.filter((worker) => Object.hasOwn(beliefs, worker)).map((worker) => [worker, beliefs[worker]]));
   return true;
 }
 
-function append(store, told) {
+function append(store, snapshot) {
   const known = store.series.number.at(-1) ?? -1;
-  const first = told.series.number.findIndex((each) => each > known);
+  const first = snapshot.series.number.findIndex((each) => each > known);
   for (const name of NAMES) {
     const column = store.series[name];
-    if (first >= 0) column.push(...told.series[name].slice(first));
+    if (first >= 0) column.push(...snapshot.series[name].slice(first));
     if (column.length > POINTS) column.splice(0, column.length - POINTS);
   }
-  const heard = store.events.at(-1)?.number ?? -1;
-  store.events.push(...told.events.filter((event) => event.number > heard));
+  const newest = store.events.at(-1)?.number ?? -1;
+  store.events.push(...snapshot.events.filter((event) => event.number > newest));
   if (store.events.length > EVENTS) store.events.splice(0, store.events.length - EVENTS);
 }
 

@@ -1,6 +1,6 @@
-// A table that can be sorted by its columns and keeps its rows, their focus and their place.
+// A table that is sorted by its columns and keeps row elements, focus and scroll position.
 
-import { el, say } from "./monitor-dom.js";
+import { el, setText } from "./monitor-dom.js";
 
 /**
  * `columns`: name, title, value (to sort by), fill (cell, item) or text, number (right-aligned), first ("desc" or "asc").
@@ -38,7 +38,7 @@ export class Table {
     });
   }
 
-  /** Show the items, sorted, at most `limit` of them; returns how many are shown. */
+  /** Show at most `limit` of the items, sorted; returns the number shown. */
   draw(items) {
     this.items = items;
     const column = this.columns.find((each) => each.name === this.order[0]);
@@ -73,7 +73,7 @@ export class Table {
         row.item = item;
         this.columns.forEach((column, index) => {
           if (column.fill) column.fill(row.cells[index], item);
-          else say(row.cells[index], column.text(item));
+          else setText(row.cells[index], column.text(item));
         });
         this.options.decorate?.(row.element, item);
       }

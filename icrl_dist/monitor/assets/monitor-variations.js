@@ -1,15 +1,15 @@
-// The table of variations, its filters, and the curves that they choose.
+// The table of variations and its filters, which also select the variations in the chart of returns.
 
 import { number } from "./common.js";
 import { drawAdaptation } from "./monitor-adaptation.js";
-import { brief, byId, el, parameters, plural, say, sparkline, sparklineElement } from "./monitor-dom.js";
+import { brief, byId, el, parameters, plural, setText, sparkline, sparklineElement } from "./monitor-dom.js";
 import { recent } from "./monitor-store.js";
 import { Table } from "./monitor-table.js";
 
-const ROWS = 100; // shown at first, and so many more a click
+const ROWS = 100; // rows shown at first and added by each click
 
-/** An adversary in a few words: its kind and how strong it is. */
-export function adversaryWords(adversary) {
+/** A short text of an adversary: its kind and its strength. */
+export function adversaryText(adversary) {
   const strength = ["p", "strength"].find((name) => typeof adversary.p === "number" ? name === "p" : name in adversary);
   return strength ? `${adversary.kind} ${strength} ${brief(adversary[strength])}` : String(adversary.kind ?? "?");
 }
@@ -30,14 +30,14 @@ const COLUMNS = [
     },
   },
   {
-    name: "adversary", title: "Adversary", value: (row) => adversaryWords(row.adversary),
+    name: "adversary", title: "Adversary", value: (row) => adversaryText(row.adversary),
     fill: (cell, row) => {
-      say(cell, adversaryWords(row.adversary));
+      setText(cell, adversaryText(row.adversary));
       cell.title = parameters(row.adversary, ["kind"]);
     },
   },
   {
-    name: "curve", title: "Returns", about: "Its newest phase; sorted by how much the return rose", value: rise, first: "desc",
+    name: "curve", title: "Returns", about: "Returns in the newest phase; sorted by the increase of the return", value: rise, first: "desc",
     fill: (cell, row) => {
       if (!cell.firstChild) cell.append(sparklineElement());
       const returns = row.phases.at(-1)?.returns ?? [];
@@ -46,8 +46,8 @@ const COLUMNS = [
   },
   { name: "last", title: "Last", about: "Return of the last episode", number: true, first: "desc", value: (row) => row.phases.at(-1)?.returns.at(-1) ?? null, text: (row) => brief(row.phases.at(-1)?.returns.at(-1)) },
   { name: "optimum", title: "Optimum", about: "Exact optimal return", number: true, first: "desc", value: (row) => row.optimum, text: (row) => brief(row.optimum) },
-  { name: "share", title: "Last 5", about: "Mean of the last five returns over the optimum", number: true, value: share, text: (row) => (share(row) === null ? "–" : `${number(100 * share(row))}%`) },
-  { name: "episodes", title: "Episodes", about: "Of its newest phase", number: true, first: "desc", value: (row) => row.phases.at(-1)?.returns.length ?? 0, text: (row) => number(row.phases.at(-1)?.returns.length ?? 0) },
+  { name: "share", title: "Last 5", about: "Mean of the last five returns divided by the optimum", number: true, value: share, text: (row) => (share(row) === null ? "–" : `${number(100 * share(row))}%`) },
+  { name: "episodes", title: "Episodes", about: "Episodes in the newest phase", number: true, first: "desc", value: (row) => row.phases.at(-1)?.returns.length ?? 0, text: (row) => number(row.phases.at(-1)?.returns.length ?? 0) },
 ];
 
 export class Variations {
@@ -63,20 +63,20 @@ export class Variations {
       open: (row) => open(row.name),
       decorate: (element, row) => element.classList.toggle("troubled", Boolean(row.quarantine)),
     });
-    const again = () => this.draw(true);
-    byId("task-filter").addEventListener("input", again);
-    byId("adversary-filter").addEventListener("change", again);
+    const redraw = () => this.draw(true);
+    byId("task-filter").addEventListener("input", redraw);
+    byId("adversary-filter").addEventListener("change", redraw);
     byId("quarantine-filter").addEventListener("click", (event) => {
       event.target.setAttribute("aria-pressed", String(event.target.getAttribute("aria-pressed") !== "true"));
-      again();
+      redraw();
     });
     byId("variation-show").addEventListener("click", () => {
       this.table.limit += ROWS;
-      again();
+      redraw();
     });
   }
 
-  /** The variations that the filters let through. */
+  /** The variations that match the filters. */
   chosen() {
     const task = byId("task-filter").value.trim();
     const kind = byId("adversary-filter").value;
@@ -92,24 +92,24 @@ export class Variations {
   draw(force = false) {
     if (!force && this.drawn === this.store.changes) return;
     this.drawn = this.store.changes;
-    this.#offerKinds();
+    this.#updateKinds();
     const rows = this.chosen();
     const shown = this.table.draw(rows);
     const [all, planned] = [this.store.variationCount, this.store.run.variations];
-    const heard = planned && planned > all ? `${number(all)} of ${number(planned)}` : number(all);
-    say(byId("variation-count"), rows.length === this.store.variations.size ? heard : `${number(rows.length)} chosen of ${number(all)}`);
+    const count = planned && planned > all ? `${number(all)} of ${number(planned)}` : number(all);
+    setText(byId("variation-count"), rows.length === this.store.variations.size ? count : `${number(rows.length)} selected of ${number(all)}`);
     const more = rows.length - shown;
-    const words = [
+    const notes = [
       more ? `${plural(more, "more row")} not shown` : "",
-      this.store.leftOut ? `${number(this.store.leftOut)} beyond what is kept` : "",
-      this.store.variations.size && !rows.length ? "no variation passes the filters" : "",
+      this.store.leftOut ? `${number(this.store.leftOut)} beyond the limit` : "",
+      this.store.variations.size && !rows.length ? "no variation matches the filters" : "",
     ];
-    say(byId("variation-more"), words.filter(Boolean).join("; "));
+    setText(byId("variation-more"), notes.filter(Boolean).join("; "));
     byId("variation-show").hidden = !more;
     drawAdaptation(rows);
   }
 
-  #offerKinds() {
+  #updateKinds() {
     const kinds = [...new Set([...this.store.variations.values()].filter((row) => row.adversary.kind).map((row) => String(row.adversary.kind)))].sort().slice(0, 50);
     if (kinds.join("\n") === this.kinds) return;
     this.kinds = kinds.join("\n");

@@ -1,16 +1,16 @@
-// The live view: listen, remember, draw.  docs/monitor.md says what the server tells.
+// The live view: receives snapshots, keeps the newest state, draws it.  docs/monitor.md describes the events.
 
 import { listen, themeButton } from "./common.js";
 import { Timeline, watchTheme } from "./monitor-charts.js";
 import { Detail } from "./monitor-detail.js";
-import { byId, brief, say } from "./monitor-dom.js";
+import { byId, brief, setText } from "./monitor-dom.js";
 import { Beliefs, Episodes } from "./monitor-episodes.js";
 import { Events, Replay, Workers, drawAlerts, drawHeader } from "./monitor-panels.js";
 import { apply, emptyStore } from "./monitor-store.js";
 import { Variations } from "./monitor-variations.js";
 
 const STALE_MS = 3000;
-const AGAIN_MS = 2000;
+const CHECK_MS = 2000;
 
 const store = emptyStore();
 let detail = null;
@@ -39,17 +39,17 @@ const timelines = [
 watchTheme();
 themeButton(byId("theme"));
 
-// What the server says.
+// Events of the server.
 
-let heard = performance.now();
+let lastEvent = performance.now();
 let epoch = "";
 let source = null;
 
-function told(picture) {
-  heard = performance.now();
-  say(byId("connection"), store.replay ? "playing" : "live");
+function receive(snapshot) {
+  lastEvent = performance.now();
+  setText(byId("connection"), store.replay ? "playing" : "live");
   byId("connection").className = "badge ok";
-  if (!apply(store, picture)) return connect(); // something was missed: begin with the whole
+  if (!apply(store, snapshot)) return connect(); // a change was missed: reconnect for a full snapshot
   if (store.epoch !== epoch) {
     epoch = store.epoch;
     episodes.clear();
@@ -59,20 +59,20 @@ function told(picture) {
 
 function connect() {
   source?.close();
-  source = listen({ picture: told }, byId("connection"));
+  source = listen({ picture: receive }, byId("connection"));
 }
 
 setInterval(() => {
-  const silent = performance.now() - heard;
+  const silent = performance.now() - lastEvent;
   if (source.readyState === EventSource.CLOSED) connect();
   else if (source.readyState === EventSource.OPEN && silent > STALE_MS) {
     byId("connection").className = "badge warn";
-    say(byId("connection"), `stale: no news for ${Math.round(silent / 1000)} s`);
+    setText(byId("connection"), `stale: no update for ${Math.round(silent / 1000)} s`);
   }
   document.body.classList.toggle("stale", silent > STALE_MS);
-}, AGAIN_MS);
+}, CHECK_MS);
 
-// What is drawn how often: numbers four times a second, tables and charts once or twice.
+// Drawing: numbers four times a second, tables twice, charts once.
 
 const jobs = [
   [240, () => {

@@ -1,7 +1,7 @@
-"""Be the adversary: a Dark Room in which a person disturbs an agent that acts live.
+"""The game of ``icrl-dist play``: a Dark Room in which a person acts as the adversary of a live agent.
 
-The person moves the goal and overrides actions, by hand or by a law; the agent is told of
-none of it, and its weights never change.
+The person moves the goal and overrides actions, one by one or at random.  The agent observes
+neither, and its weights never change.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 EPISODES = 400
 """Returns that are kept and shown."""
 SPEEDS = (0.5, 100.0)
-"""Slowest and fastest, steps a second."""
+"""Minimum and maximum speed, steps a second."""
 HELD_S = 1.5
-"""A hand that is held lets go by itself after so long, unless it is held anew: its viewer may be gone."""
+"""A held override ends after this time unless ``hold`` is called again, because its viewer may have disconnected."""
 _SUPPOSED = (NULL, Adversary.of("uniform", p=0.4))
-"""What the adversary may be in beliefs about the goal; the exact one depends on it in nothing."""
+"""Adversaries assumed in the posteriors over the goal; the exact posterior does not depend on them."""
 
 Cause = Literal["agent", "law", "hand"]
 
@@ -41,13 +41,13 @@ class Played(NamedTuple):
 
     total: float
     optimum: float | None
-    """What the oracle earns on average that knows goal and law; None if either changed meanwhile."""
+    """Expected return of the optimal policy given goal and overrides; None if either changed during the episode."""
     overridden: int
     by_hand: int
 
 
 class PlayGame:
-    """One agent in one room, stepped by whoever asks; every episode starts in the corner, as at test time.
+    """One agent in one room; the caller steps it.  Every episode starts in the corner, as in evaluation.
 
     Not thread-safe.  The same agent, seed and commands between the same steps give the same game.
     """
@@ -70,7 +70,7 @@ class PlayGame:
         self.renew()
 
     def renew(self) -> None:
-        """A new agent: the same weights, an empty context, a first episode."""
+        """Restart: the same weights, an empty context, the first episode."""
         self._forget()
         self.episodes: deque[Played] = deque(maxlen=EPISODES)
         self.number = 1
@@ -86,16 +86,17 @@ class PlayGame:
 
     @property
     def optimum(self) -> float:
-        """Expected return of the policy that knows goal and law: exact, by value iteration."""
+        """Expected return of the optimal policy given goal and overrides: exact, by value iteration."""
         return _optimum(self.size, self.horizon, self.goal, self.p, self.law)
 
     @property
     def wait_s(self) -> float | None:
-        """From one step to the next; None if it is paused."""
+        """Time between two steps; None while paused."""
         return 0.0 if self._owed else None if self.paused else 1.0 / self.speed
 
     def step(self) -> None:
-        """The agent acts, something is executed, the agent is told what came of its own action."""
+        """One step: the agent selects an action, an override may replace it, and the agent observes its own action and
+        the outcome."""
         if self.steps == self.horizon:
             self.number += 1
             self._begin()
@@ -126,14 +127,14 @@ class PlayGame:
         return (drawn, "law") if chance < self.p else (action, "agent")
 
     def belief(self) -> Belief:
-        """What the agent's laws imply of the goal, beside the exact posterior, which is told when the goal moves.
+        """The posterior over goals that the agent's action distributions imply, and the exact posterior.
 
-        The exact one is given what the agent's context holds of the time since then.
+        The exact posterior uses only the transitions in the agent's context since the goal last moved.
         """
         return self._beliefs.read(self.agent, last=max(0, self._since - self._unread))
 
     def command(self, fields: dict[str, Any]) -> None:
-        """Do what a viewer asks for.  Raises ValueError naming what is wrong."""
+        """Execute a viewer's command.  Raises ValueError with the wrong value and what is expected."""
         known = {name: kind for name, (kind, _) in COMMANDS.items()}
         do = fields.get("do")
         if not isinstance(do, str) or do not in known:
@@ -145,10 +146,10 @@ class PlayGame:
         carry_out(self, *([] if check is None else [check(self, fields["value"])]))
 
     def move_goal(self, cell: int) -> None:
-        """The goal is elsewhere from the next step on.
+        """Move the goal, from the next step on.
 
-        That is another task, so the agent begins with an empty context.  With ``keep`` it keeps one that
-        tells of the old goal, and nothing in its training ever moved a goal.
+        The new goal is another task, so the agent's context is cleared.  With ``keep`` the agent keeps its
+        context, which describes the old goal; no goal moved within a context in training.
         """
         if cell == self.goal:
             return
@@ -161,22 +162,22 @@ class PlayGame:
         self.keep = keep
 
     def override(self, p: float) -> None:
-        """From now on p of the actions are overridden."""
+        """Override each action with probability p from now on."""
         self._changed |= p != self.p and self.steps > 0
         self.p = p
 
     def choose_law(self, action: int | None) -> None:
-        """Overrides come from this action alone, or uniformly from all."""
+        """Draw overrides from this action alone, or uniformly from all actions if None."""
         law = _UNIFORM if action is None else tuple(float(a == action) for a in range(ACTIONS))
         self._changed |= law != self.law and self.p > 0 and self.steps > 0
         self.law = law
 
     def push(self, action: int) -> None:
-        """The next step executes this action, whatever the agent does."""
+        """Execute this action in the next step instead of the agent's."""
         self._hand = action
 
     def hold(self, action: int | None) -> None:
-        """As ``push``, and so does every step until None, or for ``HELD_S``."""
+        """Execute this action in every step until ``hold(None)``, but for at most ``HELD_S``."""
         if action is None:
             self._held_until = 0.0
             return
@@ -188,18 +189,18 @@ class PlayGame:
         self.paused, self._owed = paused, 0
 
     def one_step(self) -> None:
-        """Pause, if it runs, and make one step."""
+        """Pause and make one step."""
         self.paused, self._owed = True, min(self._owed + 1, self.horizon)
 
     def one_episode(self) -> None:
-        """Pause, if it runs, and go to the end of this episode, or of the next if it has ended, as fast as can be."""
+        """Pause and run to the end of this episode, or of the next if it has ended, at full speed."""
         self.paused, self._owed = True, self.horizon - self.steps % self.horizon
 
     def change_speed(self, speed: float) -> None:
         self.speed = speed
 
     def snapshot(self) -> dict[str, Any]:
-        """The room now, for JSON; cells are numbers, x * size + y."""
+        """The state of the room as JSON values; a cell is the number x * size + y."""
         surprise = float(self.agent.surprise[0]) if self.agent.outcomes else None
         return {
             "size": self.size,
@@ -223,7 +224,7 @@ class PlayGame:
         }
 
     def history(self) -> dict[str, Any]:
-        """Every finished episode that is kept, for JSON, in columns; the first one's number."""
+        """The kept finished episodes as JSON columns, and the number of the first one."""
         columns = zip(*self.episodes, strict=True) if self.episodes else ([] for _ in Played._fields)
         finished = self.number - (self.steps < self.horizon)
         first = finished - len(self.episodes) + 1
@@ -283,4 +284,4 @@ COMMANDS: dict[str, tuple[Callable[[PlayGame, object], Any] | None, Callable[...
     "episode": (None, PlayGame.one_episode),
     "new": (None, PlayGame.renew),
 }
-"""What a viewer can ask for: how its value is checked, if it has one, and what is done."""
+"""Commands of a viewer by name: the check of the value (None if there is no value), and the method to call."""

@@ -1,4 +1,4 @@
-"""A run to be watched that nobody runs: real messages, and a feed whose clock the test moves."""
+"""A feed with a clock that the test sets, and the folder of a finished run, for tests of the views."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib import resources
 
 import numpy as np
 
-from icrl_dist.monitor.picture import Picture
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.problems.darkroom import room
 from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import monitor_messages, wire
@@ -19,12 +19,12 @@ SIZE, HORIZON = 3, 9
 DIRICHLET = Adversary.of("dirichlet", p=0.3, alpha=(0.5, 0.1, 2.0, 1.0, 0.7))
 
 
-def episode(task=0, variation=0, trial=0, earned=3, worker="w0", stage="adapt", adversary=None):
-    """An episode in the 3x3 room: up twice, then right, and ``earned`` rewards at its end."""
+def episode(task=0, variation=0, trial=0, total=3, worker="w0", stage="adapt", adversary=None):
+    """An episode in the 3x3 room: two steps up, then right, with ``total`` rewards at its end."""
     path = np.array([[0, 0], [0, 1], [0, 2], [1, 2]] + [[2, 2]] * (HORIZON - 3), np.float32)
     none = np.zeros(0, np.int16)
-    moved = np.full(HORIZON, -1, np.int16)
-    moved[1] = 2
+    overridden = np.full(HORIZON, -1, np.int16)
+    overridden[1] = 2
     adversary = adversary or (NULL if variation == 0 else DIRICHLET)
     return Trajectory(
         identity=Identity(stage, 0, task, variation, trial),
@@ -34,8 +34,8 @@ def episode(task=0, variation=0, trial=0, earned=3, worker="w0", stage="adapt", 
         worker=worker,
         actions=np.zeros(HORIZON, np.int16),
         observations=path,
-        rewards=np.concatenate([np.zeros(HORIZON - earned), np.ones(earned)]).astype(np.float32),
-        adversary=moved,
+        rewards=np.concatenate([np.zeros(HORIZON - total), np.ones(total)]).astype(np.float32),
+        adversary=overridden,
         queries=np.zeros((0, 2), np.float32),
         labels=np.zeros((0, 5), np.float32),
         taken=none,
@@ -44,11 +44,11 @@ def episode(task=0, variation=0, trial=0, earned=3, worker="w0", stage="adapt", 
     )
 
 
-class Watched:
-    """A feed of what the test says."""
+class FakeFeed:
+    """A feed whose messages, time and recording the test sets."""
 
     def __init__(self, replay=None):
-        self.picture, self.time, self.recording, self.controls = Picture("demo"), BEGAN, replay, []
+        self.state, self.time, self.recording, self.controls = RunState("demo"), BEGAN, replay, []
 
     def now(self):
         return self.time
@@ -56,27 +56,27 @@ class Watched:
     def replay(self):
         return self.recording
 
-    def control(self, **wanted):
-        self.controls.append(wanted)
+    def control(self, **fields):
+        self.controls.append(fields)
         if self.recording is not None:
-            self.recording |= wanted
+            self.recording |= fields
 
     def close(self):
         pass
 
     def pass_time(self, seconds):
         self.time += seconds
-        self.picture.tick(self.time)
+        self.state.tick(self.time)
 
-    def say(self, kind, topic=None, **fields):
+    def send(self, kind, topic=None, **fields):
         payload = wire.encode_message(kind, time=self.time, **fields)
-        self.picture.hear(f"icrl/demo/mon/{topic or kind}", payload, self.time)
+        self.state.receive(f"icrl/demo/mon/{topic or kind}", payload, self.time)
 
-    def about(self):
+    def send_run(self):
         phases = [["pretrain", 0, 100], ["adapt", 0, 50]]
-        self.say("run", method="icaa", problem="darkroom", phases=phases, rounds=1, tasks=4, variations=8, began=BEGAN)
+        self.send("run", method="icaa", problem="darkroom", phases=phases, rounds=1, tasks=4, variations=8, began=BEGAN)
 
-    def progress(self, stage="collect", step=30, steps=120, **fields):
+    def send_progress(self, stage="collect", step=30, steps=120, **fields):
         common = {
             "phase": "adapt",
             "round": 0,
@@ -87,35 +87,35 @@ class Watched:
             "drops": {},
             "doing": [],
         }
-        self.say("learner", stage=stage, step=step, steps=steps, **(common | fields))
+        self.send("learner", stage=stage, step=step, steps=steps, **(common | fields))
 
-    def beat(self, worker="w0", job="adapt/0/3", **fields):
+    def send_heartbeat(self, worker="w0", job="adapt/0/3", **fields):
         common = {"doing": "", "episodes": 40, "trajectories": 38, "steps": 360, "resent": 0, "pid": 7}
         memory = {"memory_mb": 210.0, "peak_mb": 230.0}
-        self.say("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
+        self.send("worker", f"worker/{worker}", worker=worker, job=job, **(common | memory | fields))
 
-    def store(self, trajectory):
-        self.picture.hear("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
+    def send_trajectory(self, trajectory):
+        self.state.receive("icrl/demo/mon/trajectories/w0", monitor_messages.trajectories([trajectory], self.time), self.time)
 
-    def draw(self, trajectory):
-        self.picture.hear("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
+    def send_episode(self, trajectory):
+        self.state.receive("icrl/demo/mon/episode/w0", monitor_messages.episode(trajectory, self.time), self.time)
 
-    def busy(self):
-        """Four tasks of two variations, two workers."""
-        self.about()
-        self.progress()
+    def send_run_in_progress(self):
+        """A run in its first round: four tasks of two variations, six episodes each, two workers."""
+        self.send_run()
+        self.send_progress()
         for task in range(4):
             for variation in range(2):
                 for trial in range(6):
-                    self.store(episode(task, variation, trial, earned=(task + trial) % 6, worker=f"w{task % 2}"))
-        self.beat("w0")
-        self.beat("w1", job="adapt/0/1")
+                    self.send_trajectory(episode(task, variation, trial, (task + trial) % 6, worker=f"w{task % 2}"))
+        self.send_heartbeat("w0")
+        self.send_heartbeat("w1", job="adapt/0/1")
         for _ in range(4):
             self.pass_time(0.25)
 
 
 def run_folder(folder):
-    """The folder of a finished run of smoke, as far as a recording needs it."""
+    """Writes the files of a finished smoke run that a recording needs; returns ``folder``."""
     folder.mkdir(parents=True)
     shutil.copy(str(resources.files("icrl_dist.config.runs") / "smoke.toml"), folder / "run.toml")
     store = Store(folder / "dataset")
