@@ -1,6 +1,6 @@
-"""Durable trajectories per second: one worker process, the learner's inbox and store, with and without fsync.
+"""Durable trajectories per second: one worker process, the learner's ingest and store, with and without fsync.
 
-The whole path of a run except training: the worker encodes and sends with credits; the inbox decodes,
+The whole path of a run except training: the worker encodes and sends with credits; the ingest decodes,
 checks and appends to the store, and replies after the store has written to disk.
 """
 
@@ -132,7 +132,7 @@ def fsync_p50_ms(folder: Path, count: int = 60) -> float:
 
 
 class _LearnerSide:
-    """The learner's side of the stream: an inbox, and a separate store for every turn."""
+    """The learner's side of the stream: an ingest, and a separate store for every turn."""
 
     def __init__(self, link: ZenohLink, folder: Path, worker: subprocess.Popen[bytes]) -> None:
         self._folder, self._worker = folder, worker
@@ -155,10 +155,10 @@ class _LearnerSide:
             began = time.monotonic()
             self._waiting.reply(b"%f" % seconds)
             self._waiting = self._next_request()
-            inbox.close()
+            ingest.close()
         shutil.rmtree(folder)  # so that unsynced data is not written to disk during the next turn
-        if inbox.drops:
-            raise RuntimeError(f"the inbox dropped {dict(inbox.drops)}: the rate would be wrong")
+        if ingest.drops:
+            raise RuntimeError(f"the ingest dropped {dict(ingest.drops)}: the rate would be wrong")
         if durable:
             self.stored += len(stored)
             self.commits += ingest.commits

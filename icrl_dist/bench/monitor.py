@@ -1,7 +1,7 @@
-"""What being watched costs: CPU a trajectory in workers and learner with and without a viewer, and what a viewer takes.
+"""The cost of monitoring: CPU per trajectory of workers and learner with and without a viewer, and the viewer's CPU.
 
-The runs are real, through Ray workers and Zenoh.  Pairs of windows, one without and one with a
-viewer, follow each other in one run, so that what else the machine does meets both.
+The runs are real, with Ray workers and Zenoh.  Intervals with and without a viewer alternate in one run,
+so that other load on the machine affects both.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
 BOUND = 0.98
-"""Being watched may cost a trajectory's CPU time this share."""
+"""Smallest accepted ratio of CPU per trajectory without a viewer to that with one."""
 STREAMS, PER_S = 1000, 20.0
 PAGE_CORES, TERMINAL_CORES = 0.5, 1.0
 _FULL = ("--context.max", "200", "--stream.job-tasks", "2")
-"""Contexts are full after six episodes: from then on each costs the same.  A job ends 16 episodes at a time, not
-80: so a window of some seconds holds hundreds of such times, and counts trajectories to a hundredth."""
+"""Contexts are full after six episodes, so later episodes have equal costs.  16 episodes of a job end together instead
+of 80, so that an interval of a few seconds counts its trajectories to 1%."""
 _ROUND = (*_FULL, "--pretrain.contexts", "390", "--pretrain.steps", "20", "--icaa.trials", "1500", "--icaa.context-trials", "5")
 _CONTEXTS = ("--method", "dpt", "--pretrain.contexts", "780000")
 _VIEWER = (sys.executable, "-m", "icrl_dist.bench.viewer")
@@ -46,20 +46,20 @@ How = Literal["live", "stopped"]
 
 
 def run(folder: Path = Path("runs"), pairs: int = 8, seconds: float = 5.0) -> dict[str, Any]:
-    """Watch an ICAA round and the making of random contexts, then the crowd.
+    """Measure an ICAA round, the collection of random contexts, and both views with ``STREAMS`` variations.
 
-    ``ratio_live`` and ``ratio_stopped``: CPU seconds a trajectory without a viewer over those with
-    one that looks on, or that was stopped by SIGSTOP; over ``pairs`` pairs of windows of ``seconds``, in
-    an ICAA round; ``contexts_...``: the same where a trajectory costs least.
-    ``page_cores``, ``terminal_cores``: CPU seconds a second of the two views, ``STREAMS`` variations
-    ending ``PER_S`` episodes a second each.  ``ok``: within the bounds.
+    ``ratio_live`` and ``ratio_stopped``: CPU seconds per trajectory without a viewer, divided by those with
+    a running viewer or with one stopped by SIGSTOP, over ``pairs`` pairs of intervals of ``seconds`` in an
+    ICAA round.  ``contexts_...``: the same for random contexts, where a trajectory costs least.
+    ``page_cores``, ``terminal_cores``: CPU seconds per second of the two views, with ``STREAMS`` variations
+    that each end ``PER_S`` episodes per second.  ``ok``: all within the bounds.
     """
     folder.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"pairs": pairs, "window_s": seconds, "load": round(os.getloadavg()[0], 1)}
     with tempfile.TemporaryDirectory(dir=folder, prefix="monitor-") as scratch:
         for name, settings in (("", _ROUND), ("contexts_", _CONTEXTS)):
-            result |= _watched(Path(scratch) / (name.strip("_") or "round"), settings, pairs, seconds, name)
-    result |= _crowd(10.0)
+            result |= _measure_run(Path(scratch) / (name.strip("_") or "round"), settings, pairs, seconds, name)
+    result |= _measure_views(10.0)
     result["ratio"] = min(result["ratio_live"], result["ratio_stopped"])
     cheap = result["page_cores"] < PAGE_CORES and result["terminal_cores"] < TERMINAL_CORES
     return {**result, "ok": result["ratio"] >= BOUND and cheap}
@@ -69,119 +69,119 @@ def describe(result: dict[str, Any]) -> str:
     """The result as a few lines."""
     r = result
     return (
-        f"CPU a trajectory without a viewer over with one: {r['ratio_live']:.3f} live, {r['ratio_stopped']:.3f} stopped "
+        f"CPU per trajectory, without a viewer / with one: {r['ratio_live']:.3f} live, {r['ratio_stopped']:.3f} stopped "
         f"(ICAA, {r['ms']:.2f} ms; at least {BOUND});\n"
-        f"  {r['contexts_ratio_live']:.3f} and {r['contexts_ratio_stopped']:.3f} where it is cheapest "
+        f"  {r['contexts_ratio_live']:.3f} and {r['contexts_ratio_stopped']:.3f} where a trajectory costs least "
         f"(random contexts, {r['contexts_ms']:.2f} ms)\n"
         f"{STREAMS} streams at {PER_S:g}/s: page {r['page_cores']:.2f} cores (below {PAGE_CORES}), of "
-        f"{r['sent_per_s']:,.0f} episodes/s it heard {r['page_heard_per_s']:,.0f}; terminal {r['terminal_cores']:.2f} cores "
+        f"{r['sent_per_s']:,.0f} episodes/s it received {r['page_heard_per_s']:,.0f}; terminal {r['terminal_cores']:.2f} cores "
         f"(below {TERMINAL_CORES:g})\n"
         f"{'within the bounds' if r['ok'] else 'OUT OF BOUNDS'}; load average before: {r['load']}"
     )
 
 
-def _watched(out: Path, settings: Sequence[str], pairs: int, seconds: float, name: str) -> dict[str, Any]:
+def _measure_run(out: Path, settings: Sequence[str], pairs: int, seconds: float, name: str) -> dict[str, Any]:
     with training("demo", out, *settings) as process:
         while not (out / "endpoint").is_file():
             need_alive(process)
             time.sleep(0.1)
         threading.Thread(target=lambda: [None for _ in process.stdout or ()], daemon=True).start()
         endpoint = (out / "endpoint").read_text().strip()
-        with ZenohLink.connect(endpoint, 60.0) as link, _Viewer(endpoint) as viewer:
-            meter = _Meter(process, link, out.name, "pretrain" if name else "adapt")
+        with ZenohLink.connect(endpoint, 60.0) as link, _ViewerProcess(endpoint) as viewer:
+            meter = _CpuMeter(process, link, out.name, "pretrain" if name else "adapt")
             meter.wait()
             spent: dict[tuple[How, bool], list[tuple[float, int]]] = defaultdict(list)
             for pair in range(pairs):
                 how: How
                 for how in ("live", "stopped"):
-                    alone_first = pair % 2 == 0
-                    for watched in (not alone_first, alone_first):
-                        with viewer.watching(how == "stopped") if watched else contextlib.nullcontext():
+                    without_first = pair % 2 == 0
+                    for watched in (not without_first, without_first):
+                        with viewer.connected(how == "stopped") if watched else contextlib.nullcontext():
                             spent[how, watched].append(meter.spent(seconds))
-            if viewer.heard == 0:
-                raise RuntimeError("the viewer heard nothing: nothing was compared")
-    told: dict[str, Any] = {}
+            if viewer.received == 0:
+                raise RuntimeError("the viewer received no message, so nothing was compared; run the benchmark again")
+    found: dict[str, Any] = {}
     for how in ("live", "stopped"):
-        told[f"{name}ratio_{how}"] = round(_cost(spent[how, False]) / _cost(spent[how, True]), 4)
+        found[f"{name}ratio_{how}"] = round(_cost(spent[how, False]) / _cost(spent[how, True]), 4)
         both = zip(spent[how, False], spent[how, True], strict=True)
-        pairwise = [_cost([alone]) / max(1e-9, _cost([beside])) for alone, beside in both]
-        told[f"{name}spread_{how}"] = [round(min(pairwise), 3), round(max(pairwise), 3)]
-    return told | {f"{name}ms": round(1000 * _cost([*spent["live", False], *spent["stopped", False]]), 3)}
+        pairwise = [_cost([without]) / max(1e-9, _cost([with_viewer])) for without, with_viewer in both]
+        found[f"{name}spread_{how}"] = [round(min(pairwise), 3), round(max(pairwise), 3)]
+    return found | {f"{name}ms": round(1000 * _cost([*spent["live", False], *spent["stopped", False]]), 3)}
 
 
-def _cost(windows: Iterable[tuple[float, int]]) -> float:
-    """CPU seconds a trajectory over all of these windows: jobs end many episodes at once, so one window is coarse."""
-    cpu, made = map(sum, zip(*windows, strict=True))
-    return cpu / max(1, made)
+def _cost(intervals: Iterable[tuple[float, int]]) -> float:
+    """CPU seconds per trajectory over all intervals; one interval is imprecise, because many episodes end together."""
+    cpu, trajectories = map(sum, zip(*intervals, strict=True))
+    return cpu / max(1, trajectories)
 
 
-class _Meter:
-    """CPU seconds a trajectory, in a run's workers and learner, from one of the learner's reports to another."""
+class _CpuMeter:
+    """CPU seconds of a run's workers and learner, and its trajectories, at the learner's reports."""
 
     def __init__(self, process: subprocess.Popen[str], link: ZenohLink, name: str, phase: str) -> None:
         self._process, self._phase = process, phase
         self._changed = threading.Condition()
         self._reports = 0
-        self._now = (0.0, 0)
-        self._family: list[psutil.Process] = []
-        link.subscribe(Keys(name).monitor("learner"), self._hear)
+        self._latest = (0.0, 0)
+        self._processes: list[psutil.Process] = []
+        link.subscribe(Keys(name).monitor("learner"), self._on_report)
 
-    def _hear(self, key: str, payload: bytes) -> None:
+    def _on_report(self, key: str, payload: bytes) -> None:
         _, fields = wire.decode_message(payload)
         if fields["stage"] == "collect" and fields["phase"] == self._phase and fields["step"] > 0:
             with self._changed:
                 self._reports += 1
-                self._now = self._cpu(), fields["trajectories"]
+                self._latest = self._cpu(), fields["trajectories"]
                 self._changed.notify_all()
 
     def _cpu(self) -> float:
-        if not self._family:
-            everyone = psutil.Process(self._process.pid).children(recursive=True)
-            self._family = [one for one in everyone if is_learner(one) or is_worker(one)]
-        return sum(sum(one.cpu_times()[:2]) for one in self._family)
+        if not self._processes:
+            children = psutil.Process(self._process.pid).children(recursive=True)
+            self._processes = [process for process in children if is_learner(process) or is_worker(process)]
+        return sum(sum(process.cpu_times()[:2]) for process in self._processes)
 
     def wait(self) -> tuple[float, int]:
-        """CPU seconds so far and trajectories stored, at the next report."""
+        """CPU seconds and stored trajectories so far, at the next report."""
         with self._changed:
             reports = self._reports
             while not self._changed.wait_for(lambda: self._reports > reports, 1.0):
                 need_alive(self._process)
-            return self._now
+            return self._latest
 
     def spent(self, seconds: float) -> tuple[float, int]:
-        """CPU seconds and trajectories over the next so many seconds."""
-        self.wait()  # what has just changed settles
+        """CPU seconds and trajectories over an interval of about this many seconds."""
+        self.wait()  # skip one report: a viewer has just connected or disconnected
         cpu, stored = self.wait()
         time.sleep(seconds)
         later, more = self.wait()
         return later - cpu, more - stored
 
 
-class _Viewer:
-    """A viewer in a process of its own, which looks on by turns."""
+class _ViewerProcess:
+    """A viewer in a separate process, which can be connected and disconnected."""
 
     def __init__(self, endpoint: str) -> None:
         self._process = subprocess.Popen(
             [*_VIEWER, "view", endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
         )
-        self.heard = 0
+        self.received = 0
 
-    def __enter__(self) -> _Viewer:
+    def __enter__(self) -> _ViewerProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.wait()
 
-    def watching(self, stopped: bool) -> _Watching:
-        return _Watching(self, stopped)
+    def connected(self, stopped: bool) -> _Connected:
+        return _Connected(self, stopped)
 
-    def say(self, line: str) -> None:
+    def write(self, line: str) -> None:
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
 
-    def answer(self) -> str:
+    def read(self) -> str:
         assert self._process.stdout is not None
         return self._process.stdout.readline().strip()
 
@@ -189,25 +189,27 @@ class _Viewer:
         self._process.send_signal(number)
 
 
-class _Watching:
-    def __init__(self, viewer: _Viewer, stopped: bool) -> None:
+class _Connected:
+    """Connects the viewer on entry, stops it by SIGSTOP if ``stopped``, and disconnects it on exit."""
+
+    def __init__(self, viewer: _ViewerProcess, stopped: bool) -> None:
         self._viewer, self._stopped = viewer, stopped
 
     def __enter__(self) -> None:
-        self._viewer.say("on")
-        if self._viewer.answer() != "on":
-            raise RuntimeError("the viewer could not connect")
+        self._viewer.write("on")
+        if self._viewer.read() != "on":
+            raise RuntimeError("the viewer did not connect")
         if self._stopped:
             self._viewer.signal(signal.SIGSTOP)
 
     def __exit__(self, *_: object) -> None:
         self._viewer.signal(signal.SIGCONT)
-        self._viewer.say("off")
-        self._viewer.heard += int(self._viewer.answer() or 0)
+        self._viewer.write("off")
+        self._viewer.received += int(self._viewer.read() or 0)
 
 
-def _crowd(seconds: float) -> dict[str, Any]:
-    """Both views of a crowd of streams, one after the other."""
+def _measure_views(seconds: float) -> dict[str, Any]:
+    """CPU of the page and then of the terminal view, with ``STREAMS`` simulated variations."""
     crowd = subprocess.Popen(
         [*_VIEWER, "crowd", str(STREAMS), str(PER_S)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
     )
@@ -242,11 +244,11 @@ def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
             threading.Thread(target=_drain, args=(events,), daemon=True).start()
             time.sleep(3.0)
             first, cores = sent[0], _cores(process.pid, seconds)
-            heard, said = _heard_per_s(url, int(seconds)), sent[0] - first
+            received, published = _received_per_s(url, int(seconds)), sent[0] - first
         return {
             "page_cores": round(cores, 3),
-            "page_heard_per_s": round(heard, 1),
-            "sent_per_s": round(said / seconds, 1),
+            "page_heard_per_s": round(received, 1),
+            "sent_per_s": round(published / seconds, 1),
         }
     finally:
         process.send_signal(signal.SIGINT)
@@ -254,18 +256,18 @@ def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
 
 
 def _drain(events: Iterable[bytes]) -> None:
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # http.client's own, when it is closed meanwhile
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # http.client raises these when it is closed during a read
         for _ in events:
             pass
 
 
-def _heard_per_s(url: str, points: int) -> float:
-    """Episodes a second that the page knows of, over its last points, one a second."""
+def _received_per_s(url: str, points: int) -> float:
+    """Episodes per second received by the page, averaged over its last ``points`` (one per second)."""
     with urllib.request.urlopen(url.rstrip("/") + "/events", timeout=30) as events:
         for line in events:
             if line.startswith(b"data:"):
                 return statistics.mean(json.loads(line[5:])["series"]["episodes_per_s"][-points:])
-    raise RuntimeError("the page told nothing")
+    raise RuntimeError("the page sent no data; run the benchmark again")
 
 
 def _terminal(endpoint: str, seconds: float) -> float:
@@ -299,7 +301,8 @@ def _terminal(endpoint: str, seconds: float) -> float:
 
 
 def _cores(pid: int, seconds: float) -> float:
-    one = psutil.Process(pid)
-    before, then = sum(one.cpu_times()[:2]), time.monotonic()
+    """CPU seconds per second of a process."""
+    process = psutil.Process(pid)
+    before, began = sum(process.cpu_times()[:2]), time.monotonic()
     time.sleep(seconds)
-    return (sum(one.cpu_times()[:2]) - before) / (time.monotonic() - then)
+    return (sum(process.cpu_times()[:2]) - before) / (time.monotonic() - began)

@@ -1,7 +1,7 @@
-"""The rates that ``icrl-dist plan`` reckons with: a little of each part of a run, timed on this machine.
+"""Measures the rates for ``icrl-dist plan``: times a sample of each part of a run on this machine.
 
-Everything measured is the run's own code at the run's own sizes: a job, the ingest, steps of the
-fit, episodes of the evaluation.  What is too long is timed in part and continued.
+The code and the sizes are those of the run: a job, the ingest, steps of the fit, episodes of the
+evaluation.  Parts that take too long are timed partly and extrapolated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from icrl_dist.agent import ood_score
-from icrl_dist.bench.samples import Sample, in_full, made_up
+from icrl_dist.bench.samples import Sample, all_trials, random_trajectories
 from icrl_dist.collect import jobs
 from icrl_dist.config.run import Run
 from icrl_dist.diagnostics.estimate import PhaseRates, Rates
@@ -44,53 +44,53 @@ from icrl_dist.types import Job, Trajectory
 from learner.ingest import Ingest
 
 BUDGET_S = 8.0
-"""A part that takes longer is timed for so long and continued in thought."""
-_ENOUGH = 64
-"""Trajectories that the ingest is timed with, at least so often as to fill a second."""
+"""A part that takes longer is timed for this long and extrapolated."""
+_SAMPLE = 64
+"""Trajectories that the ingest and the store are timed with; the ingest gets them repeatedly, for one second."""
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 
 
-def measure(run: Run, name: str, tell: Tell = lambda said: None, budget_s: float = BUDGET_S) -> Rates:
-    """The rates of the run on this machine; ``tell`` hears what is being timed.  Some tens of seconds."""
+def measure(run: Run, name: str, report: Report = lambda text: None, budget_s: float = BUDGET_S) -> Rates:
+    """Measure the rates of the run on this machine, in some tens of seconds; ``report`` is called with each part."""
     threads = torch.get_num_threads()
     try:
-        return _measure(run, name, tell, budget_s)
+        return _measure(run, name, report, budget_s)
     finally:
         torch.set_num_threads(threads)
 
 
-def _measure(run: Run, name: str, tell: Tell, budget_s: float) -> Rates:
+def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
     method, spec = METHODS[run.method], splits.spec(run)
     model = PretrainedTransformer(spec, run.model)
     arrays = weights_of(model)
     weights = len(wire.encode_message("weights", **{key: value.tobytes() for key, value in arrays.items()}))
     device = torch.device("cuda" if run.learner.device != "cpu" and torch.cuda.is_available() else "cpu")
-    seen: dict[str, tuple[float, list[Trajectory]]] = {}
+    samples: dict[str, tuple[float, list[Trajectory]]] = {}
     rates: list[PhaseRates] = []
     ingest = np.inf
     for phase in method.phases(run):
-        asked = method.ask(run, phase)
-        if phase.stage not in seen:
-            tell(f"{phase.stage}: a job")
+        jobs_of_phase = method.ask(run, phase)
+        if phase.stage not in samples:
+            report(f"{phase.stage}: a job")
             torch.set_num_threads(1)
-            seen[phase.stage] = _job(run, asked[0], model, budget_s)
-            tell(f"{phase.stage}: the ingest")
+            samples[phase.stage] = _job(run, jobs_of_phase[0], model, budget_s)
+            report(f"{phase.stage}: the ingest")
             torch.set_num_threads(1)
-            ingest = min(ingest, _ingest(run, asked[0], seen[phase.stage][1]))
-            tell(f"{phase.stage}: steps of the fit")
+            ingest = min(ingest, _ingest(run, jobs_of_phase[0], samples[phase.stage][1]))
+            report(f"{phase.stage}: steps of the fit")
             torch.set_num_threads(run.learner.threads or len(os.sched_getaffinity(0)))
-            fit_step = _fit(run, phase, model.to(device), Sample({s: t for s, (_, t) in seen.items()}), budget_s)
+            fit_step = _fit(run, phase, model.to(device), Sample({s: t for s, (_, t) in samples.items()}), budget_s)
             model.to("cpu")
-        job_s, sample = seen[phase.stage]
-        count = sum(job.trials * len(job.variations) for job in asked)
-        # Jobs of fewer rows are not faster: a decision costs a call, whatever the number of rows.
+        job_s, sample = samples[phase.stage]
+        count = sum(job.trials * len(job.variations) for job in jobs_of_phase)
+        # The time of the first job is used for all: fewer rows are not faster, because a decision is one call.
         rates.append(
             PhaseRates(
                 name=f"{phase.stage}/{phase.round}",
-                jobs=len(asked),
+                jobs=len(jobs_of_phase),
                 trajectories=count,
-                env_steps=count * spec.horizon if asked[0].kind != "train_expert" else _expert_steps(asked),
+                env_steps=count * spec.horizon if jobs_of_phase[0].kind != "train_expert" else _expert_steps(jobs_of_phase),
                 labels=count * len(sample[0].labels),
                 job_s=job_s,
                 message_bytes=float(np.mean([len(wire.encode_trajectory(t)) for t in sample])),
@@ -99,9 +99,9 @@ def _measure(run: Run, name: str, tell: Tell, budget_s: float) -> Rates:
                 fit_step_s=fit_step,
             )
         )
-    tell("the evaluation")
+    report("the evaluation")
     evaluation = 0.0 if run.method == "experts" else _evaluation(run, model, budget_s)
-    tell("a start")
+    report("a start")
     return Rates(
         run=name,
         machine=f"{platform.machine()}, {torch.backends.cpu.get_cpu_capability()}, learner on {device}",
@@ -109,18 +109,18 @@ def _measure(run: Run, name: str, tell: Tell, budget_s: float) -> Rates:
         phases=tuple(rates),
         ingest_per_s=float(ingest),
         weights_bytes=weights,
-        checkpoint_bytes=3 * weights,  # with AdamW's two moments
+        checkpoint_bytes=3 * weights,  # weights and AdamW's two moments
         start_s=_start(),
         evaluate_s=evaluation,
     )
 
 
-def _expert_steps(asked: Sequence[Job]) -> int:
-    return sum(sac_of(job).steps * len(job.variations) for job in asked)
+def _expert_steps(expert_jobs: Sequence[Job]) -> int:
+    return sum(sac_of(job).steps * len(job.variations) for job in expert_jobs)
 
 
-class _Weights:
-    """Random ones: what a decision costs does not depend on them."""
+class _RandomWeights:
+    """A policy source with an untrained model: the cost of a decision does not depend on the weights."""
 
     def __init__(self, model: PretrainedTransformer) -> None:
         self._model = model
@@ -130,24 +130,24 @@ class _Weights:
 
 
 def _job(run: Run, job: Job, model: PretrainedTransformer, budget_s: float) -> tuple[float, list[Trajectory]]:
-    """Seconds that the job takes, and trajectories such as it delivers, all trials of some of its variations."""
+    """Seconds of the job, and trajectories like its own: all trials of some of its variations."""
     if job.kind == "train_expert":
-        return _training(job, budget_s), made_up(job)
-    rows, made, times = len(job.variations), [], [time.perf_counter()]
-    work = jobs.do(job, _Weights(model), "plan")
+        return _training(job, budget_s), random_trajectories(job)
+    rows, trajectories, times = len(job.variations), [], [time.perf_counter()]
+    work = jobs.do(job, _RandomWeights(model), "plan")
     while group := list(itertools.islice(work, rows)):
-        made += group
+        trajectories += group
         times.append(time.perf_counter())
         if job.kind == "adapt" and times[-1] - times[0] > budget_s and len(times) > 4:
             break
-    if job.kind != "adapt":  # all its episodes are stepped at once
-        return times[-1] - times[0], made
+    if job.kind != "adapt":  # its episodes run together, so the time is that of the whole job
+        return times[-1] - times[0], trajectories
     spent = np.diff(times)
-    return _continued(spent, job.trials, run.context.max // model.spec.horizon), in_full(job, made)
+    return _extrapolated(spent, job.trials, run.context.max // model.spec.horizon), all_trials(job, trajectories)
 
 
-def _continued(spent: np.ndarray, count: int, longest: int) -> float:
-    """Seconds of ``count`` trials given those of the first, each a little longer than the last until contexts are full."""
+def _extrapolated(spent: np.ndarray, count: int, longest: int) -> float:
+    """Seconds of ``count`` trials from those of the first ones; times grow linearly until contexts are full."""
     if len(spent) >= count:
         return float(spent.sum())
     slope, first = np.polyfit(np.arange(len(spent)), spent, 1) if len(spent) > 1 else (0.0, spent[0])
@@ -156,7 +156,7 @@ def _continued(spent: np.ndarray, count: int, longest: int) -> float:
 
 
 def _training(job: Job, budget_s: float) -> float:
-    """Seconds of a job's SAC trainings, by episodes in which the experts learn."""
+    """Seconds of a job's SAC training, extrapolated from episodes with updates."""
     from icrl_dist.experts.sac.batched import train
     from icrl_dist.experts.train import trained_by
 
@@ -168,19 +168,19 @@ def _training(job: Job, budget_s: float) -> float:
     def progress(experts: Any, returns: np.ndarray) -> None:
         times.append(time.perf_counter())
         if len(times) > 2 and times[-1] - times[0] > budget_s:
-            raise _EnoughSeen
+            raise _BudgetSpent
 
-    with contextlib.suppress(_EnoughSeen):
+    with contextlib.suppress(_BudgetSpent):
         train(env, short, 20 * horizon, range(env.batch), progress, backend=trained_by(env.batch))
-    return float(np.median(np.diff(times))) * config.steps / horizon  # the first episode is over before they learn
+    return float(np.median(np.diff(times))) * config.steps / horizon  # without the first episode, which has no updates
 
 
-class _EnoughSeen(Exception):  # noqa: N818
-    """Enough was timed."""
+class _BudgetSpent(Exception):  # noqa: N818
+    """The time budget of this measurement is spent."""
 
 
 def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, budget_s: float) -> float:
-    """Seconds of an optimizer step, the drawing of its batch included; 0 if the phase has no fit."""
+    """Seconds of an optimizer step with the drawing of its batch; 0 if the phase has no fit."""
     if not phase.steps:
         return 0.0
     pools = METHODS[run.method].learn(run, dataclasses.replace(phase, round=0), data)
@@ -193,84 +193,84 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
     def progress(step: int, loss: float) -> None:
         times.append(time.perf_counter())
         if step >= 6 and times[-1] - times[1] > budget_s:
-            raise _EnoughSeen
+            raise _BudgetSpent
 
-    with contextlib.suppress(_EnoughSeen):
+    with contextlib.suppress(_BudgetSpent):
         fit.fit(model, fit.Optimizer(model, optim), optim, 1e-6, 200, batch, progress)
-    return float(np.mean(np.diff(times[2:])))  # contexts differ in length from step to step: the mean, not the median
+    return float(np.mean(np.diff(times[2:])))  # the mean, not the median: contexts differ in length between steps
 
 
 def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
-    """Trajectories a second: sent on credit over a link, checked, stored with fsync, acknowledged; all in this process."""
+    """Trajectories per second sent with credits over a link, checked, stored with fsync and acknowledged, in this process."""
     spec, keys, numbers = splits.spec(run), Keys("plan"), itertools.count()
-    acknowledged: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
-    few = sample[: min(len(sample), _ENOUGH)]
-    with tempfile.TemporaryDirectory(dir=_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
-        learner_ingest = Ingest(
+    failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
+    few = sample[:_SAMPLE]
+    with tempfile.TemporaryDirectory(dir=_run_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
+        ingest = Ingest(
             store,
             spec,
             run.stream.max_message_bytes,
             lambda _: dataclasses.replace(job, trials=1 << 30),
             lambda _: few[0].weights_digest,
             lambda _: None,
-            acknowledged.put,
+            failures.put,
         )
         with ZenohLink.listen("tcp/127.0.0.1:0") as link, ZenohLink.connect(link.endpoints[0], 10.0) as theirs:
-            link.serve(keys.data, learner_ingest.put)
+            link.serve(keys.data, ingest.put)
             sender = CreditSender(theirs, keys.data, run.stream.credits, run.stream.reply_timeout_s)
             began, sent = time.perf_counter(), 0
             while time.perf_counter() - began < 1.0:
-                for one in few:
-                    again = dataclasses.replace(one, identity=one.identity._replace(trial=next(numbers)))
-                    sender.send(wire.encode_trajectory(again))
+                for trajectory in few:
+                    identity = trajectory.identity._replace(trial=next(numbers))
+                    sender.send(wire.encode_trajectory(dataclasses.replace(trajectory, identity=identity)))
                     sent += 1
             sender.drain(60.0)
             rate = sent / (time.perf_counter() - began)
             sender.close()
-        learner_ingest.close()
-        if not acknowledged.empty():
-            raise acknowledged.get()
+        ingest.close()
+        if not failures.empty():
+            raise failures.get()
     return rate
 
 
-def _disk() -> Path:
-    """Where run folders would be made, if it is there."""
+def _run_disk() -> Path:
+    """The folder of runs if it exists, else the current folder."""
     runs = Path("runs")
     return runs if runs.is_dir() else Path()
 
 
 def _stored(sample: Sequence[Trajectory]) -> float:
-    few = sample[:_ENOUGH]
+    few = sample[:_SAMPLE]
     with tempfile.TemporaryDirectory() as folder, contextlib.closing(Store(Path(folder), durable=False)) as store:
         store.append(list(few))
         return sum(file.stat().st_size for file in Path(folder).iterdir()) / len(few)
 
 
 def _evaluation(run: Run, model: PretrainedTransformer, budget_s: float) -> float:
-    """Seconds of what ``train`` does when learning is over: surprise on the training tasks, returns on held-out ones."""
+    """Seconds of the end of ``train``: calibration of the OOD score on training tasks, returns on held-out tasks."""
     times = [time.perf_counter()]
 
     def count(*_: object) -> None:
         times.append(time.perf_counter())
         if times[-1] - times[0] > budget_s:
-            raise _EnoughSeen
+            raise _BudgetSpent
 
-    with contextlib.suppress(_EnoughSeen):
+    with contextlib.suppress(_BudgetSpent):
         ood_score.calibrate(run, model, count)
-    total = _continued(np.diff(times), 2 * ood_score.EPISODES, 1 << 30)
-    others = list(_others(run))
+    total = _extrapolated(np.diff(times), 2 * ood_score.EPISODES, 1 << 30)
+    others = list(_baselines(run))
     for make, copies in [(evaluate.in_context(run, model), 1 + (len(METHODS[run.method].phases(run)) > 1)), *others]:
         times[:] = [time.perf_counter()]
         small = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, p=run.evaluate.p[-1:]))
-        with contextlib.suppress(_EnoughSeen):
+        with contextlib.suppress(_BudgetSpent):
             evaluate.online(small, {"one": make}, count)
-        spent = _continued(np.diff(times), run.evaluate.episodes, run.context.max // model.spec.horizon)
+        spent = _extrapolated(np.diff(times), run.evaluate.episodes, run.context.max // model.spec.horizon)
         total += copies * len(run.evaluate.p) * spent
     return total
 
 
-def _others(run: Run) -> Iterator[tuple[evaluate.MakePolicy, int]]:
-    """Who a model is held against, and how many that cost about the same."""
+def _baselines(run: Run) -> Iterator[tuple[evaluate.MakePolicy, int]]:
+    """The baselines in the evaluation's table, and how many of them have about this cost."""
     if run.problem == "darkroom":
         from icrl_dist.problems.darkroom.exact_agents import RULES
 
@@ -283,7 +283,7 @@ def _others(run: Run) -> Iterator[tuple[evaluate.MakePolicy, int]]:
 
 
 def _start() -> float:
-    """Seconds that a fresh process needs to import what a worker does: the learner, then the workers beside each other."""
+    """Seconds for the learner and then the workers (in parallel) to start: twice the imports in a new process."""
     began = time.perf_counter()
     subprocess.run([sys.executable, "-c", "import actors.worker, learner.service, ray"], check=True)
     return 2 * (time.perf_counter() - began)

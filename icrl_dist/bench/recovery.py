@@ -1,7 +1,7 @@
-"""How soon a run is at work again: a worker killed, then the learner, with many trajectories stored.
+"""Seconds until a run works again after SIGKILL of a worker, and of the learner with many stored trajectories.
 
-The run is real, through Ray workers and Zenoh; times are from the SIGKILL on.  What the dataset
-takes on disk beside the bytes of its arrays is measured on the way.
+The run is real, with Ray workers and Zenoh.  The size of the dataset on disk relative to its arrays is
+measured too.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 from icrl_dist.types import Identity
 
-_TASKS = 39  # to train on in a 7x7 room
-_TOGETHER = 4  # of them in a job
+_TASKS = 39  # training tasks of a 7x7 room
+_JOB_TASKS = 4
 
 
 def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3) -> dict[str, Any]:
-    """Kill a worker ``kills`` times, then the learner once ``trajectories`` are stored.
+    """Kill a worker ``kills`` times, then the learner after ``trajectories`` are stored.
 
-    ``worker_s``: until another sends the first trajectory of the killed worker's job, the median;
-    ``learner_s``: until the learner answers a worker again.  Raises ConfigError for numbers that
-    are not above 0, RuntimeError if the run ended before.
+    ``worker_s``: median seconds until another worker sends the first trajectory of the killed worker's job.
+    ``learner_s``: seconds until the learner answers requests again.  Raises ConfigError for numbers that
+    are not above 0, RuntimeError if the run ended early.
     """
     if trajectories < 1 or kills < 1:
         raise ConfigError(f"bench recovery: trajectories = {trajectories}, kills = {kills}: must be above 0")
@@ -49,9 +49,9 @@ def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3)
         with training("demo", out, *_settings(trajectories)) as process:
             endpoint = _wait(lambda: _endpoint(out), process)
             with ZenohLink.connect(endpoint, 60.0) as link:
-                heard = _Heard(link, out.name, process)
-                waits = [heard.kill_a_worker((n + 1) * trajectories // (2 * kills + 2)) for n in range(kills)]
-                heard.until(trajectories)
+                events = _RunEvents(link, out.name, process)
+                waits = [events.kill_a_worker((n + 1) * trajectories // (2 * kills + 2)) for n in range(kills)]
+                events.wait_for(trajectories)
                 learner_s, stored = _kill_the_learner(process, link, out)
         used = sum(file.stat().st_size for file in (out / "dataset").iterdir())
         store = Store(out / "dataset", readonly=True)
@@ -69,16 +69,17 @@ def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3)
 
 
 def describe(result: dict[str, Any]) -> str:
-    """The result as three lines."""
+    """The result in three lines."""
     return (
-        f"a killed worker's job ran again after {result['worker_s']:.2f} s (worst {result['worker_worst_s']:.2f} s)\n"
-        f"a killed learner with {result['trajectories']} trajectories answered again after {result['learner_s']:.1f} s\n"
-        f"the dataset takes {result['disk_ratio']:.3f} times its arrays' bytes, {result['bytes_a_trajectory']:.0f} a trajectory"
+        f"the job of a killed worker ran again after {result['worker_s']:.2f} s (worst {result['worker_worst_s']:.2f} s)\n"
+        f"a killed learner with {result['trajectories']} stored trajectories answered again after {result['learner_s']:.1f} s\n"
+        f"the dataset takes {result['disk_ratio']:.3f} times the bytes of its arrays, "
+        f"{result['bytes_a_trajectory']:.0f} bytes per trajectory"
     )
 
 
-class _Heard:
-    """What the run says: the trajectories that are sent, how many are stored, whose job goes to another."""
+class _RunEvents:
+    """Events of the run: trajectories that are sent, the number stored, and jobs of workers that ended."""
 
     def __init__(self, link: ZenohLink, name: str, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -86,20 +87,21 @@ class _Heard:
         self._stored = 0
         self._sent: list[tuple[float, str, Identity]] = []
         self._freed: list[tuple[str, str]] = []
-        link.subscribe(Keys(name).monitor_all, self._hear)
-        threading.Thread(target=self._read, daemon=True).start()
+        link.subscribe(Keys(name).monitor_all, self._on_message)
+        threading.Thread(target=self._read_output, daemon=True).start()
 
-    def _hear(self, key: str, payload: bytes) -> None:
+    def _on_message(self, key: str, payload: bytes) -> None:
         kind, fields = wire.decode_message(payload)
         with self._changed:
             if kind == "learner":
                 self._stored = fields["trajectories"]
             elif kind == "trajectories":
                 now = time.monotonic()
-                self._sent += [(now, one["worker"], Identity.parse(one["identity"])) for one in monitor_messages.rows(fields)]
+                rows = monitor_messages.rows(fields)
+                self._sent += [(now, row["worker"], Identity.parse(row["identity"])) for row in rows]
             self._changed.notify_all()
 
-    def _read(self) -> None:
+    def _read_output(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             if found := re.match(r"worker (\S+) is gone; its job will be leased again: (\S+)", line):
@@ -107,50 +109,48 @@ class _Heard:
                     self._freed.append((found[1], found[2]))
                     self._changed.notify_all()
 
-    def until(self, stored: int) -> None:
-        """Wait until so many trajectories are stored."""
+    def wait_for(self, stored: int) -> None:
+        """Wait until this many trajectories are stored."""
         while self._stored < stored:
             need_alive(self._process)
             with self._changed:
                 self._changed.wait(0.1)
 
     def kill_a_worker(self, stored: int) -> float:
-        """SIGKILL a worker that is at work; seconds until another sends a trajectory of its job."""
-        self.until(stored)
+        """SIGKILL a worker that holds a job; returns seconds until another worker sends a trajectory of this job."""
+        self.wait_for(stored)
         for _ in range(10):
             with self._changed:
                 self._freed.clear()
                 self._sent.clear()
-            family = psutil.Process(self._process.pid).children(recursive=True)
-            os.kill(min(host.pid for host in family if is_worker(host)), signal.SIGKILL)
+            children = psutil.Process(self._process.pid).children(recursive=True)
+            os.kill(min(child.pid for child in children if is_worker(child)), signal.SIGKILL)
             began = time.monotonic()
-            if (when := self._done_again()) is not None:
-                return when - began
-        raise RuntimeError("ten workers were killed, and none held a job")
+            if (moment := self._sent_again()) is not None:
+                return moment - began
+        raise RuntimeError("ten workers were killed, and none of them held a job; run the benchmark again")
 
-    def _done_again(self) -> float | None:
-        """When a trajectory of the job that was freed was sent; None if none was freed."""
+    def _sent_again(self) -> float | None:
+        """The time at which a trajectory of the freed job was sent; None if no job was freed."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._freed, 10):
                 return None
             dead, label = self._freed[0]
             stage, round_, task = label.split("/")[:3]
 
-            def again() -> float | None:
-                wanted = (stage, int(round_), range(int(task), int(task) + _TOGETHER))
-                hits = (
-                    when for when, worker, i in self._sent if worker != dead and i[:2] == wanted[:2] and i.task in wanted[2]
-                )
-                return next(hits, None)
+            def first_sent() -> float | None:
+                job, tasks = (stage, int(round_)), range(int(task), int(task) + _JOB_TASKS)
+                sent = (moment for moment, worker, i in self._sent if worker != dead and i[:2] == job and i.task in tasks)
+                return next(sent, None)
 
-            if not self._changed.wait_for(lambda: again() is not None, 60):
+            if not self._changed.wait_for(lambda: first_sent() is not None, 60):
                 raise RuntimeError(f"job {label} of the killed worker {dead} did not run again within 60 s")
-            return again()
+            return first_sent()
 
 
 def _settings(trajectories: int) -> tuple[str, ...]:
     contexts = 2 * trajectories // _TASKS * _TASKS
-    return "--method", "dpt", "--stream.job-tasks", str(_TOGETHER), "--pretrain.contexts", str(contexts)
+    return "--method", "dpt", "--stream.job-tasks", str(_JOB_TASKS), "--pretrain.contexts", str(contexts)
 
 
 def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path) -> tuple[float, int]:
@@ -163,7 +163,7 @@ def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path
         need_alive(process)
         try:
             link.request(Keys(out.name).work, hello, timeout_s=0.5)
-        except Refused:  # it answers: it knows no such message
+        except Refused:  # an answer: the message is unknown to the learner
             break
         except Unanswered:
             time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Trajectories to time a run's parts with: of its own jobs where those are quick, of their form where they are not."""
+"""Trajectories for timing the parts of a run: from its own jobs if these are fast, else random ones of the same shapes."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from icrl_dist.rollout.episode import episode
 from icrl_dist.types import Job, Trajectory
 
 
-def in_full(job: Job, made: Sequence[Trajectory]) -> list[Trajectory]:
-    """Every trial of the job: those that were not made are repeats of those that were."""
-    have: dict[tuple[int, int], list[Trajectory]] = {}
-    for one in made:
-        have.setdefault((one.identity.task, one.identity.variation), []).append(one)
+def all_trials(job: Job, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """Every trial of the job; missing trials are copies of existing ones."""
+    by_variation: dict[tuple[int, int], list[Trajectory]] = {}
+    for trajectory in trajectories:
+        key = trajectory.identity.task, trajectory.identity.variation
+        by_variation.setdefault(key, []).append(trajectory)
     return [
         dataclasses.replace(trials[n % len(trials)], identity=trials[0].identity._replace(trial=n))
-        for trials in have.values()
+        for trials in by_variation.values()
         for n in range(job.trials)
     ]
 
 
-def made_up(job: Job) -> list[Trajectory]:
-    """Trajectories of the job's form, of random actions and labels: what they hold costs nothing more or less."""
-    rng, made = np.random.default_rng(0), []
+def random_trajectories(job: Job) -> list[Trajectory]:
+    """Trajectories with the job's shapes, and random actions and labels: costs do not depend on the content."""
+    rng, trajectories = np.random.default_rng(0), []
     rows = job.rows()[: max(2, job.tasks)]
     chosen = list(job.variations[: len(rows)])
     ran = episode(registry.batch(chosen), evaluate.random_vectors(chosen), [np.random.default_rng(r) for r in range(len(rows))])
@@ -36,7 +37,7 @@ def made_up(job: Job) -> list[Trajectory]:
     count, actions = queries + windows * length, ran.actions.shape[-1]
     for row, (task, variation) in enumerate(rows):
         for trial in range(job.trials):
-            made.append(
+            trajectories.append(
                 Trajectory(
                     identity=next(iter(job.identities()))._replace(task=task, variation=variation, trial=trial),
                     variation=chosen[row],
@@ -54,17 +55,18 @@ def made_up(job: Job) -> list[Trajectory]:
                     origin="expert",
                 )
             )
-    return made
+    return trajectories
 
 
 class Sample:
-    """Timed trajectories as a method's dataset."""
+    """Trajectories of timed jobs in the form of a method's dataset."""
 
     def __init__(self, stages: dict[str, list[Trajectory]]) -> None:
         self._trials: dict[Key, list[Trajectory]] = {}
         for stage, trajectories in stages.items():
-            for one in trajectories:
-                self._trials.setdefault((stage, 0, one.identity.task, one.identity.variation), []).append(one)
+            for trajectory in trajectories:
+                key = (stage, 0, trajectory.identity.task, trajectory.identity.variation)
+                self._trials.setdefault(key, []).append(trajectory)
 
     def variations(self, stage: str, round: int) -> Sequence[Key]:
         return [key for key in self._trials if key[0] == stage and round == 0]

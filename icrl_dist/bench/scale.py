@@ -1,8 +1,8 @@
-"""How many workers one learner bears: 1, 8, 64, 256 simulated ones against the learner's own ingest and store.
+"""How many workers one learner supports: 1, 8, 64 and 256 simulated workers send to the learner's ingest and store.
 
-A simulated worker is a session of its own over a real link, with a run's credits, which replays
-recorded trajectories as fast as they are acknowledged.  Several share a process, so that two
-cores bear them; they make nothing, so what is measured is the learner and the links.
+A simulated worker has its own session over a real link and the credits of a run, and sends a recorded
+trajectory as fast as it is acknowledged.  Several share a process, so that two cores are enough.  They
+simulate nothing, so the benchmark measures the learner and the links.
 """
 
 from __future__ import annotations
@@ -42,22 +42,23 @@ from learner.ingest import Ingest
 
 WORKERS = (1, 8, 64, 256)
 PROCESSES = 4
-"""Processes that simulated workers share."""
+"""Number of processes of the simulated workers."""
 CREDITS = StreamConfig().credits
 TIMEOUT_S = StreamConfig().reply_timeout_s
 KNEE = 0.9
-"""The knee is the fewest workers that reach this share of the highest rate."""
+"""The knee is the smallest number of workers with this share of the highest rate."""
 
 
 class Recorded:
-    """A worker's trajectories, encoded beforehand: the same one again and again under another trial number."""
+    """The trajectories of a worker, encoded in advance: one trajectory with changing trial numbers."""
 
     _MARK = 0x51525354
-    """Numbers of this size have four bytes on the wire, and these four stand nowhere else in it."""
+    """A trial number of four bytes on the wire that occur nowhere else in the message."""
 
     def __init__(self, task: int) -> None:
-        one = example()
-        marked = dataclasses.replace(one, identity=one.identity._replace(task=task, trial=self._MARK))
+        trajectory = example()
+        identity = trajectory.identity._replace(task=task, trial=self._MARK)
+        marked = dataclasses.replace(trajectory, identity=identity)
         self._bytes = bytearray(wire.encode_trajectory(marked))
         pattern = struct.pack(">I", self._MARK)
         assert self._bytes.count(pattern) == 1
@@ -69,8 +70,8 @@ class Recorded:
 
 
 def work(endpoint: str, first: int, count: int, seconds: float) -> None:
-    """A process of ``count`` workers: connect, say so, wait for a line, send for ``seconds``; then latencies as JSON."""
-    taken: list[float] = []
+    """A process of ``count`` workers: connect, print ``ready``, read a line, send for ``seconds``; print latencies as JSON."""
+    latencies: list[float] = []
     with contextlib.ExitStack() as stack:
         links = [stack.enter_context(ZenohLink.connect(endpoint, 60.0)) for _ in range(count)]
         print("ready", flush=True)
@@ -86,8 +87,8 @@ def work(endpoint: str, first: int, count: int, seconds: float) -> None:
             while True:
                 waiting.append(time.monotonic())
                 sender.send(recorded.next())
-                while acknowledged < sender.acknowledged:  # answers come in the order of sending, but for resends
-                    taken.append(time.monotonic() - waiting.popleft())
+                while acknowledged < sender.acknowledged:  # replies come in the order of sending, except for resends
+                    latencies.append(time.monotonic() - waiting.popleft())
                     acknowledged += 1
                 if time.monotonic() > end:
                     break
@@ -100,25 +101,26 @@ def work(endpoint: str, first: int, count: int, seconds: float) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-    print(json.dumps({"taken": taken, "resent": sum(resent)}), flush=True)
+    print(json.dumps({"taken": latencies, "resent": sum(resent)}), flush=True)
 
 
 def run(folder: Path = Path("runs"), seconds: float = 40.0, workers: Sequence[int] = WORKERS) -> dict[str, Any]:
-    """Measure ``seconds`` in all, shared out evenly; one store a size, in a temporary folder that is removed.
+    """Measure for ``seconds`` in total, divided evenly over the numbers of workers.
 
-    Raises ConfigError for a folder in memory, or for numbers that are not above 0.
+    Each number has its own store, in a temporary folder under ``folder`` that is removed.  Raises
+    ConfigError for a folder on a file system in memory, and for numbers that are not above 0.
     """
     if not seconds > 0 or not workers or min(workers) < 1:
         raise ConfigError(f"bench scale: seconds = {seconds}, workers = {list(workers)}: all must be above 0")
     kind = ingest.file_system(folder)
     if kind in ingest.IN_MEMORY:
         raise ConfigError(
-            f"bench scale: {folder} lies on {kind}, where an fsync does nothing: name a folder on a disk by --folder"
+            f"bench scale: {folder} is on {kind}, where an fsync has no effect: choose a folder on a disk with --folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(dir=folder, prefix="scale-") as name:
-        rows = [_size(Path(name) / str(count), count, seconds / len(workers)) for count in workers]
+        rows = [_measure(Path(name) / str(count), count, seconds / len(workers)) for count in workers]
         fsync = ingest.fsync_p50_ms(Path(name))
     best = max(row["ingest_per_s"] for row in rows)
     return {
@@ -140,46 +142,46 @@ def describe(result: dict[str, Any]) -> str:
     lines = ["".join(f"{name:>14}" for name in names)]
     lines += ["".join(f"{row[name]:>14}" for name in names) for row in result["rows"]]
     lines.append(
-        f"knee: {result['knee_workers']} workers; {result['message_bytes']} bytes each, {result['credits']} credits, "
+        f"knee: {result['knee_workers']} workers; {result['message_bytes']} bytes per message, {result['credits']} credits, "
         f"{result['file_system']}, fsync p50 {result['fsync_p50_ms']} ms, load {result['load_before']}, {result['cores']} cores"
     )
     return "\n".join(lines)
 
 
-def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
-    """One number of workers: from the first message sent to the last acknowledged."""
+def _measure(folder: Path, count: int, seconds: float) -> dict[str, Any]:
+    """The row of one number of workers, from the first message sent to the last acknowledged."""
     process = psutil.Process()
     stored: list[float] = []
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     with contextlib.closing(Store(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
-        learner_ingest = _open_ingest(store, count, stored, failures)
-        link.serve(KEYS.data, learner_ingest.put)
+        ingest = _ingest(store, count, stored, failures)
+        link.serve(KEYS.data, ingest.put)
         before = process.memory_info().rss
         with _workers(link.endpoints[0], count, seconds) as others:
             connected, cpu, began = process.memory_info().rss, _cpu(process), time.monotonic()
-            for one in others:
-                _ask(one, "go")
-            most = connected
+            for other in others:
+                _write(other, "go")
+            peak = connected
             while time.monotonic() < began + seconds:
                 time.sleep(0.1)
-                most = max(most, process.memory_info().rss)
-            said = [json.loads(_answer(one)) for one in others]
+                peak = max(peak, process.memory_info().rss)
+            reports = [json.loads(_read(other)) for other in others]
             used, took = _cpu(process) - cpu, time.monotonic() - began
-        learner_ingest.close()
+        ingest.close()
         if not failures.empty():
             raise failures.get()
-    taken = sorted(itertools.chain.from_iterable(one["taken"] for one in said))
+    latencies = sorted(itertools.chain.from_iterable(report["taken"] for report in reports))
     return {
         "workers": count,
         "ingest_per_s": round(len(stored) / (stored[-1] - began), 1),
-        "ack_p50_ms": round(1e3 * statistics.median(taken), 1),
-        "ack_p99_ms": round(1e3 * taken[math.ceil(0.99 * (len(taken) - 1))], 1),
-        "busy": learner_ingest.drops["busy"],
-        "resent": sum(one["resent"] for one in said),
-        "duplicates": learner_ingest.drops["duplicate"],
+        "ack_p50_ms": round(1e3 * statistics.median(latencies), 1),
+        "ack_p99_ms": round(1e3 * latencies[math.ceil(0.99 * (len(latencies) - 1))], 1),
+        "busy": ingest.drops["busy"],
+        "resent": sum(report["resent"] for report in reports),
+        "duplicates": ingest.drops["duplicate"],
         "trajectories": len(stored),
-        "trajectories_an_fsync": round(len(stored) / learner_ingest.commits, 1),
-        "mb": round(most / 1e6, 1),
+        "trajectories_an_fsync": round(len(stored) / ingest.commits, 1),
+        "mb": round(peak / 1e6, 1),
         "kb_a_worker": round((connected - before) / 1e3 / count, 1),
         "learner_cores": round(used / took, 2),
     }
@@ -190,46 +192,47 @@ def _cpu(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def _open_ingest(store: Store, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
-    one = example()
-    size, actions = one.observations.shape[1], one.labels.shape[1]
-    spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))
-    job = Job("adapt", *one.identity[:2], 0, (one.variation,) * count, 1, one.policy_version, seed=0, tasks=count)
+def _ingest(store: Store, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
+    trajectory = example()
+    size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
+    spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))
+    variations = (trajectory.variation,) * count
+    job = Job("adapt", *trajectory.identity[:2], 0, variations, 1, trajectory.policy_version, seed=0, tasks=count)
 
     def note(_: Trajectory) -> None:
         stored.append(time.monotonic())
 
-    return Ingest(store, spec, LIMIT, lambda _: job, lambda _: one.weights_digest, note, failures.put)
+    return Ingest(store, spec, LIMIT, lambda _: job, lambda _: trajectory.weights_digest, note, failures.put)
 
 
 @contextlib.contextmanager
 def _workers(endpoint: str, count: int, seconds: float) -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes whose workers are all connected."""
+    """Processes of simulated workers, all of them connected."""
     assert parse(endpoint).loopback
     shares = [len(range(number, count, PROCESSES)) for number in range(min(PROCESSES, count))]
     code = "import sys; from icrl_dist.bench.scale import work; work(sys.argv[1], *map(int, sys.argv[2:4]), float(sys.argv[4]))"
     with contextlib.ExitStack() as stack:
         others = []
         for number, share in enumerate(shares):
-            given = [endpoint, str(sum(shares[:number])), str(share), str(seconds)]
-            words = [sys.executable, "-c", code, *given]
-            one = stack.enter_context(subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
-            stack.callback(one.kill)
-            others.append(one)
-        for one in others:
-            assert _answer(one) == "ready"
+            arguments = [endpoint, str(sum(shares[:number])), str(share), str(seconds)]
+            command = [sys.executable, "-c", code, *arguments]
+            other = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+            stack.callback(other.kill)
+            others.append(other)
+        for other in others:
+            assert _read(other) == "ready"
         yield others
 
 
-def _ask(process: subprocess.Popen[str], line: str) -> None:
+def _write(process: subprocess.Popen[str], line: str) -> None:
     assert process.stdin is not None
     process.stdin.write(line + "\n")
     process.stdin.flush()
 
 
-def _answer(process: subprocess.Popen[str]) -> str:
+def _read(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:
-        raise RuntimeError(f"the bench's workers died: exit code {process.wait()}")
+        raise RuntimeError(f"a worker process of the benchmark ended: exit code {process.wait()}")
     return line.strip()

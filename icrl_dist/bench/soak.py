@@ -1,7 +1,7 @@
-"""Does anything grow?  The memory of every process of a long run, and the slope of each.
+"""The memory growth of every process in a long run.
 
-The run is real: short ICAA rounds without end, through Ray workers, Zenoh and the store, with a
-fit, a checkpoint and a broadcast every few seconds, under a small memory of the dataset.
+The run is real: many short ICAA rounds with Ray workers, Zenoh and the store, a fit, a checkpoint and a
+broadcast every few seconds, and a small cache of the dataset.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config.run import ConfigError
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
-_NUMBERS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
+_SETTINGS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
 _PERIOD_S = 1.0
 WARM_UP = 0.4
-"""Share of the time that is not measured: imports, first batches and caches fill up in it."""
+"""The share of the time that is not measured: imports, first batches and filling caches."""
 
 Report = Callable[[float, str], None]
 
 
 def run(seconds: float = 600.0, folder: Path = Path("runs"), report: Report = lambda elapsed, text: None) -> dict[str, Any]:
-    """Run for ``seconds`` and measure; ``folder`` takes a temporary run folder and ``soak.png``.
+    """Run for ``seconds`` and measure; writes a temporary run folder and ``soak.png`` to ``folder``.
 
-    ``worst_mb_per_min`` is the largest slope of private memory (RssAnon) after the warm-up, by
-    the median of all slopes between two samples.  Raises ConfigError for a time too short to
-    measure a slope in, RuntimeError if the run ended before.
+    ``worst_mb_per_min`` is the largest slope of private memory (RssAnon) after the warm-up, where a slope
+    is the median over all pairs of samples.  Raises ConfigError for a time too short for a slope,
+    RuntimeError if the run ended early.
     """
     if seconds < 30:
-        raise ConfigError(f"bench soak: seconds = {seconds:g}: a slope needs at least 30")
+        raise ConfigError(f"bench soak: seconds = {seconds:g}: must be at least 30 to measure a slope")
     folder.mkdir(parents=True, exist_ok=True)
     samples: dict[str, list[tuple[float, float]]] = {}
     with (
         tempfile.TemporaryDirectory(dir=folder, prefix="soak-") as scratch,
-        training("smoke", Path(scratch) / "soak", *_NUMBERS) as process,
+        training("smoke", Path(scratch) / "soak", *_SETTINGS) as process,
     ):
         threading.Thread(target=_drain, args=(process,), daemon=True).start()
-        began = _until_it_works(process, Path(scratch) / "soak")
+        began = _wait_for_weights(process, Path(scratch) / "soak")
         while (elapsed := time.monotonic() - began) < seconds:
             need_alive(process)
             for name, mb in _memory(process.pid):
@@ -73,7 +73,7 @@ def run(seconds: float = 600.0, folder: Path = Path("runs"), report: Report = la
 
 
 def describe(result: dict[str, Any]) -> str:
-    """A line a process, the steepest first."""
+    """One line per process, the largest slope first."""
     rows = sorted(result["processes"], key=lambda row: -row["mb_per_min"])
     lines = [f"{'process':<28}{'MB/min':>8}{'MB':>8}"]
     lines += [f"{row['process']:<28}{row['mb_per_min']:>8.2f}{row['mb']:>8.1f}" for row in rows]
@@ -87,18 +87,18 @@ def _drain(process: subprocess.Popen[str]) -> None:
         pass
 
 
-def _until_it_works(process: subprocess.Popen[str], folder: Path, timeout_s: float = 120.0) -> float:
+def _wait_for_weights(process: subprocess.Popen[str], folder: Path, timeout_s: float = 120.0) -> float:
     deadline = time.monotonic() + timeout_s
     while json.loads(_progress(folder))["version"] < 1:
         need_alive(process)
         if time.monotonic() > deadline:
-            raise RuntimeError(f"the run did not begin within {timeout_s:.0f} s; `icrl-dist doctor` may say why")
+            raise RuntimeError(f"no weights after {timeout_s:.0f} s; check the machine with `icrl-dist doctor`")
         time.sleep(0.2)
     return time.monotonic()
 
 
 def _progress(folder: Path) -> str:
-    """How far the run is, from its metrics: trajectories and newest version, as JSON."""
+    """The run's progress from its metrics: trajectories and the latest policy version, as JSON."""
     trajectories, version = 0, -1
     with contextlib.suppress(FileNotFoundError):
         for line in (folder / "metrics.jsonl").read_text().splitlines():
@@ -111,7 +111,7 @@ def _progress(folder: Path) -> str:
 
 
 def _memory(pid: int) -> Iterator[tuple[str, float]]:
-    """Name and private memory, MB, of a process and all that it started."""
+    """Name and private memory in MB of a process and of its descendants."""
     with contextlib.suppress(psutil.Error):
         root = psutil.Process(pid)
         for process in (root, *root.children(recursive=True)):
@@ -131,7 +131,7 @@ def _name(process: psutil.Process, root: psutil.Process) -> str:
 
 
 def _slope(points: list[tuple[float, float]], seconds: float) -> float:
-    """MB a minute by Theil and Sen: the median slope between any two samples after the warm-up."""
+    """The Theil-Sen slope in MB per minute: the median slope over all pairs of samples after the warm-up."""
     from scipy.stats import theilslopes
 
     after = np.array([point for point in points if point[0] > WARM_UP * seconds])

@@ -1,7 +1,7 @@
-"""Trajectories a second from one worker process to one learner process: our stream beside a Ray actor.
+"""Trajectories per second from one worker process to one learner process: our stream against a Ray actor.
 
-Both move the same bytes, encoded beforehand and not decoded, with as many under way; they take
-turns in one run, for machines speed up and slow down.
+Both move the same bytes, encoded in advance and not decoded, with the same number in flight.  They
+alternate in one run, because the speed of a machine varies.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ KEYS = Keys("bench")
 
 
 def example(trial: int = 0) -> Trajectory:
-    """A walker episode's worth of numbers: H = 200, S = 24, A = 6, and 30 labels; about 24 KB."""
+    """A trajectory of the size of a walker episode: H = 200, S = 24, A = 6, and 30 labels; about 24 KB."""
     steps, observation, actions, queries = 200, 24, 6, 30
     rng = np.random.default_rng(0)
     return Trajectory(
@@ -56,46 +56,46 @@ def example(trial: int = 0) -> Trajectory:
 
 
 class Source:
-    """A worker's trajectories, encoded beforehand: the stream is measured, not the encoding."""
+    """A worker's trajectories, encoded in advance, so that only the stream is measured."""
 
     def __init__(self) -> None:
         self._ready = [wire.encode_trajectory(example(trial)) for trial in range(64)]
         self._made = 0
 
-    def make(self) -> bytes:
+    def next(self) -> bytes:
         self._made += 1
         return self._ready[self._made % len(self._ready)]
 
 
 class Sink:
-    """A learner that only counts what comes in, message by message."""
+    """A learner that only counts messages."""
 
     def __init__(self) -> None:
-        self.taken = 0
+        self.count = 0
 
     def take(self, data: bytes) -> None:
-        self.taken += len(data) > 0
+        self.count += len(data) > 0
 
 
 def work(endpoint: str) -> None:
-    """The worker process: ask for seconds of work, send for so long, until refused."""
+    """The worker process: request a number of seconds and send for that long, until the number is 0."""
     source = Source()
     with ZenohLink.connect(endpoint, 10.0) as link:
         sender = CreditSender(link, KEYS.data, CREDITS, 10.0)
         while seconds := float(link.request(KEYS.work, b"", 600.0)):
             end = time.monotonic() + seconds
             while time.monotonic() < end:
-                sender.send(source.make())
+                sender.send(source.next())
             sender.drain(10.0)
         sender.close()
 
 
 def run(seconds: float = 15.0, pairs: int = 5) -> dict[str, Any]:
-    """Measure for ``seconds`` in all, taking turns; rates and ratios are medians over the turns.
+    """Measure for ``seconds`` in total, alternating; rates and ratios are medians over turns.
 
-    Ray twice: results awaited in the order of the calls, which one actor allows and is its
-    fastest (``ray_per_s``), and as they arrive by ``ray.wait``, which many actors need
-    (``ray_wait_per_s``) and our stream always does.
+    Ray is measured twice: with results taken in the order of the calls, its fastest way with one actor
+    (``ray_per_s``), and as they arrive by ``ray.wait`` (``ray_wait_per_s``), which a learner with many
+    actors needs and our stream always does.
     """
     turn = seconds / (3 * pairs)
     turns: list[tuple[float, float, float]] = []
@@ -131,12 +131,12 @@ class _Stream:
         self._sink, self._worker = Sink(), worker
         self._data: queue.SimpleQueue[Query] = queue.SimpleQueue()
         self._idle: queue.SimpleQueue[Query] = queue.SimpleQueue()
-        link.serve(KEYS.data, self._take_apart)
+        link.serve(KEYS.data, self._split)
         link.serve(KEYS.work, self._idle.put)
         self._waiting = self._idle.get(timeout=60)
 
     def __call__(self, seconds: float) -> float:
-        before, start = self._sink.taken, time.monotonic()
+        before, start = self._sink.count, time.monotonic()
         self._waiting.reply(b"%f" % seconds)
         while True:
             try:
@@ -145,15 +145,15 @@ class _Stream:
                 if not self._idle.empty():
                     break
                 if self._worker.poll() is not None:
-                    raise RuntimeError(f"the bench's worker process died: exit code {self._worker.returncode}") from None
+                    raise RuntimeError(f"the worker process ended: exit code {self._worker.returncode}") from None
                 continue
             self._sink.take(query.payload)
             query.reply(b"stored")
             last = time.monotonic()
         self._waiting = self._idle.get()
-        return (self._sink.taken - before) / (last - start)
+        return (self._sink.count - before) / (last - start)
 
-    def _take_apart(self, query: Query) -> None:
+    def _split(self, query: Query) -> None:
         for part in batching.split(query, LIMIT):
             self._data.put(part)
 
@@ -179,29 +179,29 @@ class _RayActor:
     def __init__(self, ray: Any) -> None:
         self._ray, self._sink = ray, Sink()
         self._source = ray.remote(num_cpus=1)(Source).remote()
-        ray.get(self._source.make.remote())
+        ray.get(self._source.next.remote())
 
     def in_order(self, seconds: float) -> float:
         """Take the results in the order of the calls."""
-        before, start = self._sink.taken, time.monotonic()
-        under_way = deque(self._source.make.remote() for _ in range(CREDITS))
-        while under_way:
-            self._sink.take(self._ray.get(under_way.popleft()))
+        before, start = self._sink.count, time.monotonic()
+        in_flight = deque(self._source.next.remote() for _ in range(CREDITS))
+        while in_flight:
+            self._sink.take(self._ray.get(in_flight.popleft()))
             if time.monotonic() < start + seconds:
-                under_way.append(self._source.make.remote())
-        return (self._sink.taken - before) / (time.monotonic() - start)
+                in_flight.append(self._source.next.remote())
+        return (self._sink.count - before) / (time.monotonic() - start)
 
     def as_ready(self, seconds: float) -> float:
-        """Take whichever result is ready, as a learner of many actors must."""
-        before, start = self._sink.taken, time.monotonic()
-        under_way = [self._source.make.remote() for _ in range(CREDITS)]
-        while under_way:
-            ready, under_way = self._ray.wait(under_way, num_returns=1)
+        """Take results as they become ready, as a learner with many actors must."""
+        before, start = self._sink.count, time.monotonic()
+        in_flight = [self._source.next.remote() for _ in range(CREDITS)]
+        while in_flight:
+            ready, in_flight = self._ray.wait(in_flight, num_returns=1)
             for data in self._ray.get(ready):
                 self._sink.take(data)
                 if time.monotonic() < start + seconds:
-                    under_way.append(self._source.make.remote())
-        return (self._sink.taken - before) / (time.monotonic() - start)
+                    in_flight.append(self._source.next.remote())
+        return (self._sink.count - before) / (time.monotonic() - start)
 
 
 @contextlib.contextmanager
@@ -212,11 +212,11 @@ def _ray() -> Iterator[_RayActor]:
 
 @contextlib.contextmanager
 def local_ray() -> Iterator[Any]:
-    """Ray, started on this machine for a benchmark's time.  Raises RuntimeError if one runs in this process."""
+    """A local Ray for the duration of a benchmark.  Raises RuntimeError if Ray is already initialized in this process."""
     import ray
 
     if ray.is_initialized():
-        raise RuntimeError("a Ray session is open in this process: run this benchmark in one of its own")
+        raise RuntimeError("Ray is already initialized in this process: run this benchmark in a new process")
     local.start_ray(ray, _log.warning, address="local", num_cpus=2, configure_logging=False)
     try:
         yield ray

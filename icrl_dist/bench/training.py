@@ -1,4 +1,4 @@
-"""A real training beside a benchmark: started, looked at from outside, and ended."""
+"""A real training in a child process, for benchmarks that observe it from outside."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def training(run: str, out: Path, *settings: str) -> Iterator[subprocess.Popen[str]]:
-    """``icrl-dist train RUN --out OUT``, which is interrupted at the end; its standard output is to be read, and what
-    it has to complain of is seen."""
+    """Run ``icrl-dist train RUN --out OUT`` and interrupt it at the end.
+
+    The caller must read its standard output; its standard error goes to the terminal.
+    """
     command = [sys.executable, "-u", "-m", "icrl_dist.cli", "train", run, "--out", str(out), *settings]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
@@ -29,6 +31,6 @@ def training(run: str, out: Path, *settings: str) -> Iterator[subprocess.Popen[s
 
 
 def need_alive(process: subprocess.Popen[str]) -> None:
-    """Raises RuntimeError if the training is over."""
+    """Raises RuntimeError if the training has ended."""
     if process.poll() is not None:
-        raise RuntimeError(f"the run ended, exit code {process.returncode}; `icrl-dist doctor` may say why")
+        raise RuntimeError(f"the run ended, exit code {process.returncode}; check the machine with `icrl-dist doctor`")

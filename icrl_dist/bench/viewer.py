@@ -1,9 +1,9 @@
-"""A viewer, and a crowd of streams to be viewed, as processes of their own for ``bench monitor``.
+"""Processes for ``bench monitor``: a viewer, and a publisher with many simulated variations.
 
-``python -m icrl_dist.bench.viewer view ENDPOINT``: ``on`` on standard input subscribes and keeps a
-picture, as a view does; ``off`` lets go of it and answers how many messages it took in.
-``python -m icrl_dist.bench.viewer crowd STREAMS PER_S``: a learner's endpoint, with so many
-variations that each end ``PER_S`` episodes a second, of 16 workers; prints where it listens.
+``python -m icrl_dist.bench.viewer view ENDPOINT``: on the line ``on`` of standard input it subscribes and
+updates its state as a view does; on ``off`` it disconnects and prints the number of messages received.
+``python -m icrl_dist.bench.viewer crowd STREAMS PER_S``: publishes like a learner and 16 workers with
+``STREAMS`` variations that each end ``PER_S`` episodes per second; prints its endpoint.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from actors.publisher import PERIOD_S
-from icrl_dist.monitor.feed import PERIOD_S as LOOK_S
+from icrl_dist.monitor.feed import PERIOD_S as SNAPSHOT_S
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import Keys
@@ -28,31 +28,31 @@ _TRIALS = 40
 
 
 def view(endpoint: str) -> None:
-    """Watch by turns, as standard input says."""
+    """Connect and disconnect as standard input commands."""
     for line in sys.stdin:
         if line.strip() != "on":
             continue
         with ZenohLink.connect(endpoint, 30.0) as link, LiveFeed(link) as feed:
             ended = threading.Event()
 
-            def look(feed: LiveFeed = feed, ended: threading.Event = ended) -> None:
+            def take_snapshots(feed: LiveFeed = feed, ended: threading.Event = ended) -> None:
                 since = -1
-                while not ended.wait(LOOK_S):
-                    shown = feed.state.snapshot(feed.now(), since)
-                    since = shown["seq"]
-                    json.dumps(shown)
+                while not ended.wait(SNAPSHOT_S):
+                    snapshot = feed.state.snapshot(feed.now(), since)
+                    since = snapshot["seq"]
+                    json.dumps(snapshot)
 
-            looking = threading.Thread(target=look)
-            looking.start()
+            thread = threading.Thread(target=take_snapshots)
+            thread.start()
             print("on", flush=True)
             sys.stdin.readline()
             ended.set()
-            looking.join()
+            thread.join()
             print(feed.state.received, flush=True)
 
 
 def crowd(streams: int, per_s: float) -> None:
-    """Publish until standard input ends."""
+    """Publish until standard input is closed."""
     keys = Keys("crowd")
     with ZenohLink.listen("tcp/127.0.0.1:0") as link:
         print(link.endpoints[0], flush=True)
@@ -70,8 +70,8 @@ def crowd(streams: int, per_s: float) -> None:
             due = int((time.monotonic() - began) * per_s)  # episodes of each stream
             trials = range(sent, due)[-_TRIALS:]
             if trials:
-                for topic, told in zip(topics, rows, strict=True):
-                    link.publish(topic, _message(told, trials), droppable=True)
+                for topic, streams_of_worker in zip(topics, rows, strict=True):
+                    link.publish(topic, _message(streams_of_worker, trials), droppable=True)
             progress = {"stage": "collect", "phase": "adapt", "round": 0, "step": 0, "steps": 1, "version": 0, "lag": 0}
             counts = {"trajectories": sent * streams, "workers": _WORKERS, "drops": {}, "doing": [], "time": time.time()}
             link.publish(keys.monitor("learner"), wire.encode_message("learner", **progress, **counts), droppable=True)
@@ -80,7 +80,7 @@ def crowd(streams: int, per_s: float) -> None:
 
 
 def _episodes(worker: int, streams: int) -> list[list[Trajectory]]:
-    """Of each of a worker's streams, all of its trials."""
+    """All trials of each of a worker's variations."""
     task = Task.of("darkroom", goal=(3, 4), size=10, horizon=100, start=(0, 0))
     adversary = Adversary.of("dirichlet", p=0.1, alpha=(0.5, 1.0, 0.5, 1.5, 0.7))
     return [
@@ -107,8 +107,8 @@ def _episodes(worker: int, streams: int) -> list[list[Trajectory]]:
     ]
 
 
-def _message(told: list[list[Trajectory]], trials: range) -> bytes:
-    return monitor_messages.trajectories((one[trial % _TRIALS] for one in told for trial in trials), time.time())
+def _message(streams: list[list[Trajectory]], trials: range) -> bytes:
+    return monitor_messages.trajectories((stream[trial % _TRIALS] for stream in streams for trial in trials), time.time())
 
 
 if __name__ == "__main__":

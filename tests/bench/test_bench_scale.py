@@ -1,4 +1,4 @@
-"""The scale benchmark: every simulated worker is heard, and what is counted was stored."""
+"""The scale benchmark: trajectories of every simulated worker are stored and counted."""
 
 import json
 
@@ -14,7 +14,7 @@ def on_disk(monkeypatch):
     monkeypatch.setattr(ingest, "file_system", lambda folder: "ext4")
 
 
-def test_what_is_replayed_differs_in_its_trial_only():
+def test_replayed_trajectories_differ_only_in_their_trial():
     recorded = scale.Recorded(7)
     first, second = (wire.decode_trajectory(recorded.next(), scale.LIMIT) for _ in range(2))
     assert second.identity == first.identity._replace(trial=first.identity.trial + 1) and first.identity.task == 7
@@ -23,11 +23,11 @@ def test_what_is_replayed_differs_in_its_trial_only():
     }
 
 
-def test_it_measures_every_size_and_leaves_nothing_behind(on_disk, tmp_path, monkeypatch):
+def test_it_measures_every_number_of_workers_and_removes_its_files(on_disk, tmp_path, monkeypatch):
     stored = []
-    real = scale._open_ingest
+    real = scale._ingest
 
-    def open_ingest(store, count, times, failures):
+    def counting_ingest(store, count, times, failures):
         made = real(store, count, times, failures)
         take = made.take
 
@@ -38,9 +38,9 @@ def test_it_measures_every_size_and_leaves_nothing_behind(on_disk, tmp_path, mon
         made.take = counted
         return made
 
-    monkeypatch.setattr(scale, "_open_ingest", open_ingest)
+    monkeypatch.setattr(scale, "_ingest", counting_ingest)
     result = scale.run(tmp_path / "here", seconds=1.0, workers=(1, 6))
-    assert stored[-1] == set(range(6)), "a worker was not heard"
+    assert stored[-1] == set(range(6)), "a worker has no stored trajectory"
     one, six = result["rows"]
     assert (one["workers"], six["workers"]) == (1, 6)
     for row in result["rows"]:
@@ -54,10 +54,10 @@ def test_it_measures_every_size_and_leaves_nothing_behind(on_disk, tmp_path, mon
     assert list((tmp_path / "here").iterdir()) == []
 
 
-def test_what_it_cannot_measure_is_refused(on_disk, tmp_path, monkeypatch):
+def test_invalid_arguments_are_refused(on_disk, tmp_path, monkeypatch):
     for wrong in ({"seconds": 0.0}, {"workers": ()}, {"workers": (0,)}):
         with pytest.raises(ConfigError, match="must be above 0"):
             scale.run(tmp_path, **wrong)
     monkeypatch.setattr(ingest, "file_system", lambda folder: "tmpfs")
-    with pytest.raises(ConfigError, match=r"lies on tmpfs, .* --folder"):
+    with pytest.raises(ConfigError, match=r"is on tmpfs, .* --folder"):
         scale.run(tmp_path)

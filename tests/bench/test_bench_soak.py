@@ -1,4 +1,4 @@
-"""The soak and recovery benchmarks: their arithmetic, and what they refuse; the runs themselves are commands."""
+"""The soak and recovery benchmarks: their arithmetic and the arguments that they refuse.  The runs themselves are commands."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ from icrl_dist.bench import recovery, soak
 from icrl_dist.config.run import ConfigError
 
 
-def test_a_slope_is_megabytes_a_minute_after_the_warm_up_and_ignores_spikes():
+def test_a_slope_is_in_megabytes_per_minute_after_the_warm_up_and_ignores_spikes():
     seconds = 100.0
     points = [(float(t), 50.0 + (t < 40) * 2 * t + 0.6 * t / 60) for t in range(100)]
     assert soak._slope(points, seconds) == pytest.approx(0.6, abs=1e-6)
@@ -29,7 +29,7 @@ input()
 """
 
 
-def test_the_memory_of_a_process_is_found_and_grows_with_what_it_holds():
+def test_the_memory_of_a_process_is_measured_and_grows_with_its_allocations():
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", HOLDER], text=True, bufsize=1, **pipes) as holder:
         before = dict(soak._memory(holder.pid))
@@ -39,11 +39,11 @@ def test_the_memory_of_a_process_is_found_and_grows_with_what_it_holds():
         holder.communicate("\n")
     (name,) = before
     assert name == f"icrl-dist train {holder.pid}"
-    assert 38 < after[name] - before[name] < 60  # it may not have been quite begun before
+    assert 38 < after[name] - before[name] < 60  # its start may not have been complete at the first measurement
 
 
-def test_too_short_and_nothing_at_all_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match="seconds = 5: a slope needs at least 30"):
+def test_too_short_times_and_zero_numbers_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="seconds = 5: must be at least 30"):
         soak.run(5, tmp_path)
     for numbers in ({"trajectories": 0}, {"kills": 0}):
         with pytest.raises(ConfigError, match="must be above 0"):

@@ -72,10 +72,10 @@ def test_rates_of_another_machine_are_read(tmp_path, capsys):
 
 def test_the_time_of_trials_that_were_not_measured_is_extrapolated():
     spent = measuring.np.array([1.0, 2.0, 3.0, 4.0])
-    assert measuring._continued(spent, 4, 100) == 10
-    assert measuring._continued(spent, 6, 100) == pytest.approx(10 + 5 + 6)
-    assert measuring._continued(spent[:1], 3, 100) == pytest.approx(3)  # only one trial was measured
-    assert measuring._continued(spent, 8, 5) == pytest.approx(10 + 5 + 6 + 6 + 6)  # the context is full after 5 trials
+    assert measuring._extrapolated(spent, 4, 100) == 10
+    assert measuring._extrapolated(spent, 6, 100) == pytest.approx(10 + 5 + 6)
+    assert measuring._extrapolated(spent[:1], 3, 100) == pytest.approx(3)  # one was all that there was time for
+    assert measuring._extrapolated(spent, 8, 5) == pytest.approx(10 + 5 + 6 + 6 + 6)  # contexts are full
 
 
 SHORT = [
