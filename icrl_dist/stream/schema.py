@@ -65,7 +65,8 @@ def check(instance: Any, where: str = "") -> None:
 
 def as_data(instance: Any) -> dict[str, Any]:
     """The fields of a dataclass instance as plain data; tuples become lists."""
-    return {name: _as_data(getattr(instance, name)) for name in _fields(type(instance))}
+    cls: Any = type(instance)  # mypy counts no class of instances as hashable
+    return {name: _as_data(getattr(instance, name)) for name in _fields(cls)}
 
 
 @dataclass(frozen=True, slots=True)
