@@ -21,9 +21,10 @@ from icrl_dist.collect import jobs
 from icrl_dist.config.run import parse
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
-from icrl_dist.stream import wire
+from icrl_dist.stream import messages, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Keys, Link, LinkError, Refused, Unanswered
+from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Identity, Job, Trajectory
 
@@ -61,7 +62,7 @@ class Worker:
         """
         self._link.announce(self._keys.alive(self.name))
         _, hello = self._ask("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
-        run = parse(hello["run"], "the learner's run")
+        run = parse(read(messages.Welcome, hello, "hello").run, "the learner's run")
         policy = LivePolicy(self._link, self._keys, splits.spec(run), run.model, run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
         beliefs = Beliefs(self._link, self._keys.monitor(f"belief/{self.name}"), self.name, run)
@@ -72,10 +73,12 @@ class Worker:
                 if kind == "stop":
                     return
                 if kind == "wait":
-                    self._stop.wait(float(fields["seconds"]))
+                    self._stop.wait(read(messages.Wait, fields, kind).seconds)
                 else:
-                    job = wire.decode_job(fields["job"])
-                    self._do(job, float(fields["deadline_s"]), policy, beliefs, sender, watchdog, run.stream.lease_s)
+                    lease = read(messages.Lease, fields, kind)
+                    self._do(
+                        wire.decode_job(lease.job), lease.deadline_s, policy, beliefs, sender, watchdog, run.stream.lease_s
+                    )
 
     def _do(
         self,

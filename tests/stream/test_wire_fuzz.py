@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from icrl_dist.bench import fuzz
-from icrl_dist.stream import validation, wire
+from icrl_dist.stream import excerpts, validation, wire
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
 TARGETS = fuzz.targets()
@@ -103,5 +103,5 @@ def test_a_message_of_many_values_is_refused_before_it_fills_the_memory(measured
 @pytest.mark.parametrize("value", [b"\0" * (4 << 20), "x" * (4 << 20), [[b"\0" * (4 << 20)]], {"a": list(range(100_000))}])
 def test_an_error_message_is_short_and_cheap_however_large_the_value(value: object, measured: None) -> None:
     before = tracemalloc.get_traced_memory()[1]
-    assert len(validation.show(value)) <= 80
+    assert len(excerpts.show(value)) <= 80
     assert tracemalloc.get_traced_memory()[1] - before < 1 << 20
