@@ -9,7 +9,7 @@ import time
 from icrl_dist.config.run import ModelConfig
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link, Refused, Unanswered
+from icrl_dist.stream.link import Link, Refused, StreamKeys, Unanswered
 from icrl_dist.types import Spec, Weights
 
 _KEPT = 4
@@ -19,7 +19,9 @@ _KEPT = 4
 class LivePolicy:
     """Follows the learner's broadcasts; ``at`` waits for one version (Algorithm 3, line 12)."""
 
-    def __init__(self, link: Link, keys: Keys, spec: Spec, config: ModelConfig, limit: int, timeout_s: float = 60.0) -> None:
+    def __init__(
+        self, link: Link, keys: StreamKeys, spec: Spec, config: ModelConfig, limit: int, timeout_s: float = 60.0
+    ) -> None:
         self._link, self._keys, self._limit, self._timeout_s = link, keys, limit, timeout_s
         self._model = PretrainedTransformer(spec, config).eval()
         self._loaded: Weights | None = None

@@ -23,7 +23,7 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys, Link, LinkError, Refused, Unanswered
+from icrl_dist.stream.link import Link, LinkError, Refused, StreamKeys, Unanswered
 from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Identity, Job, Trajectory
@@ -42,7 +42,7 @@ class Worker:
         ``folder``: the run folder, for a worker that has its process to itself: there it leaves
         its crash records, and its stacks when it must end because a job outlasts its deadline.
         """
-        self._link, self._keys, self.name, self._patience_s = link, Keys(run_name), name, patience_s
+        self._link, self._keys, self.name, self._patience_s = link, StreamKeys(run_name), name, patience_s
         self._folder = folder
         self._stop = threading.Event()
         self._episodes = self._steps = 0

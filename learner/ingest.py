@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.link import Query
 from icrl_dist.types import Identity, Job, Spec, Trajectory
@@ -68,7 +68,7 @@ class Inbox:
 
     def __init__(
         self,
-        store: Store,
+        store: Dataset,
         spec: Spec,
         limit: int,
         wants: Callable[[Identity], Job | None],

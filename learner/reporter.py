@@ -13,7 +13,7 @@ from typing import Any
 from icrl_dist.config.run import Run
 from icrl_dist.methods.recipes import Phase, about
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link, LinkError
+from icrl_dist.stream.link import Link, LinkError, StreamKeys
 from icrl_dist.telemetry.alerts import Alerts
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.types import Job, Trajectory
@@ -35,7 +35,7 @@ class Herald:
     """Says everything once, to whoever wants to hear it; events may come from any thread."""
 
     def __init__(
-        self, run: Run, folder: Path, link: Link, keys: Keys, metrics: Metrics, report: Report, version: Callable[[], int]
+        self, run: Run, folder: Path, link: Link, keys: StreamKeys, metrics: Metrics, report: Report, version: Callable[[], int]
     ) -> None:
         """``version``: the newest of the weights."""
         self._run, self._link, self._keys, self._metrics, self._report = run, link, keys, metrics, report

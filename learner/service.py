@@ -18,11 +18,11 @@ from icrl_dist.methods.recipes import Phase
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.problems import splits
 from icrl_dist.results.evaluate import label_quality
-from icrl_dist.storage import files
-from icrl_dist.storage.dataset import Damaged, Store
+from icrl_dist.storage import checkpoint, files
+from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link
+from icrl_dist.stream.link import Link, StreamKeys
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.training import batches, fit
 from icrl_dist.types import Identity, Job, Trajectory, Weights
@@ -64,14 +64,14 @@ class Service:
 
     def _begin(self, closing: contextlib.ExitStack) -> None:
         run, folder, link, report = self._run, self._folder, self._link, self._report
-        self._keys = Keys(folder.name)
+        self._keys = StreamKeys(folder.name)
         self._spec = splits.spec(run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self.model = PretrainedTransformer(self._spec, run.model).to(_device(run.learner.device))
         self._opt = fit.Optimizer(self.model, run.optim)
-        self.version = files.newest_version(folder)
+        self.version = checkpoint.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
@@ -84,7 +84,7 @@ class Service:
         self._error: BaseException | None = None
         self._lag = 0
         self._mended = 0
-        self.store = Store(folder / "dataset")
+        self.store = Dataset(folder / "dataset")
         closing.callback(self.store.close)
         self._tell_repairs()
         self._plan = Plan(run, Lineage.of(folder, run), self.store, {})
@@ -145,7 +145,7 @@ class Service:
             self._changed.set()
 
     def _older(self, version: int) -> Weights:
-        return checkpoints.weights_of_file(files.version_file(self._folder, version), version)
+        return checkpoints.weights_of_file(checkpoint.version_file(self._folder, version), version)
 
     # The run, on the caller's thread.
 
@@ -193,7 +193,7 @@ class Service:
             "repaired": self._mended,
             "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
             "staleness": self._run.stream.staleness,
-            "lag": {str(lag): count for lag, count in self.store.ledger.lags().items()},
+            "lag": {str(lag): count for lag, count in self.store.index.lags().items()},
             "threads": self._threads,
             "instruction_set": torch.backends.cpu.get_cpu_capability(),
         }
@@ -236,7 +236,7 @@ class Service:
             self._board.close(phase.stage, phase.round)
             self._opened.discard(phase)
         self._plan.give_up(blamed)
-        if not self.store.ledger.count(phase.stage, phase.round):
+        if not self.store.index.count(phase.stage, phase.round):
             raise RunFailed(
                 f"{phase.stage}/{phase.round}: not one trajectory was stored, and {len(blamed)} of its variations are "
                 f"quarantined; first: {next(iter(blamed.values()))}"
@@ -281,7 +281,7 @@ class Service:
             "dataset_digest": self.store.digest(self.version),
             "quarantined": self._plan.given_up,
         }
-        self._save(files.version_file(self._folder, self.version), loss=loss, **where)
+        self._save(checkpoint.version_file(self._folder, self.version), loss=loss, **where)
         partial.unlink(missing_ok=True)
         self._publish()
         self._herald.fitted(loss, time.monotonic() - began)
@@ -297,7 +297,7 @@ class Service:
     def _take_up(self) -> None:
         """Go on from the newest version, and from the fit that was under way, if there are any."""
         if self.version >= 0:
-            checkpoints.restore(files.version_file(self._folder, self.version), self._spec, self.model, self._opt)
+            checkpoints.restore(checkpoint.version_file(self._folder, self.version), self._spec, self.model, self._opt)
             self._publish()
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
         if partial.exists() and checkpoints.read_manifest(partial)["next_version"] == self.version + 1:

@@ -13,7 +13,7 @@ from icrl_dist import version
 from icrl_dist.config.run import Run, dumps
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.dispatch import Dispatcher
-from icrl_dist.stream.link import Keys, Link, Query
+from icrl_dist.stream.link import Link, Query, StreamKeys
 from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Job
@@ -39,7 +39,7 @@ class Desk:
         run: Run,
         folder: Path,
         link: Link,
-        keys: Keys,
+        keys: StreamKeys,
         board: Board,
         lock: threading.Lock,
         report: Callable[[dict[str, Any]], None],

@@ -23,7 +23,7 @@ from icrl_dist.bench.stream import local_ray
 from icrl_dist.config.run import ConfigError, ModelConfig
 from icrl_dist.models.dpt import PretrainedTransformer, load_weights, weights_of
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Query
+from icrl_dist.stream.link import Query, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Spec, Weights
 from learner.broadcast import Broadcast
@@ -47,7 +47,7 @@ def receive(endpoint: str) -> None:
     with ZenohLink.connect(endpoint, 30.0) as link:
 
         def listen(size: str) -> None:
-            mine, keys = model(size), Keys(f"bench-{size}")
+            mine, keys = model(size), StreamKeys(f"bench-{size}")
 
             def take(_: str, payload: bytes) -> None:
                 weights = wire.decode_weights(payload, LIMIT)
@@ -57,7 +57,7 @@ def receive(endpoint: str) -> None:
             link.subscribe(keys.weights, take)
             report(keys, f"-1 {time.monotonic()}")
 
-        def report(keys: Keys, text: str) -> None:
+        def report(keys: StreamKeys, text: str) -> None:
             link.send(keys.work, text.encode(), 60.0, lambda outcome: over.put(None) if outcome == b"stop" else None)
 
         for size in WIDTHS:
@@ -108,9 +108,9 @@ class _Ours:
     def __init__(self, link: ZenohLink, workers: list[subprocess.Popen[bytes]]) -> None:
         self._workers = workers
         self._reports: queue.SimpleQueue[Query] = queue.SimpleQueue()
-        self._broadcasts = {size: Broadcast(link, Keys(f"bench-{size}"), _older) for size in WIDTHS}
+        self._broadcasts = {size: Broadcast(link, StreamKeys(f"bench-{size}"), _older) for size in WIDTHS}
         for size in WIDTHS:
-            link.serve(Keys(f"bench-{size}").work, self._reports.put)
+            link.serve(StreamKeys(f"bench-{size}").work, self._reports.put)
         for _ in WIDTHS:
             self._last(-1)
 

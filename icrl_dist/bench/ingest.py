@@ -25,7 +25,7 @@ import psutil
 
 from icrl_dist.bench.stream import KEYS, LIMIT, example
 from icrl_dist.config.run import ConfigError, StreamConfig
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query
@@ -149,7 +149,7 @@ class _Learner:
         """Trajectories a second into a fresh store, until the last one that was sent is stored."""
         folder = self._folder / f"turn-{next(self._numbers)}"
         stored: list[float] = []
-        with contextlib.closing(Store(folder, durable=durable)) as store:
+        with contextlib.closing(Dataset(folder, durable=durable)) as store:
             self._inbox = inbox = self._open(store, stored)
             began = time.monotonic()
             self._waiting.reply(b"%f" % seconds)
@@ -166,7 +166,7 @@ class _Learner:
     def stop(self) -> None:
         self._waiting.reply(b"0")
 
-    def _open(self, store: Store, stored: list[float]) -> Inbox:
+    def _open(self, store: Dataset, stored: list[float]) -> Inbox:
         one = example()
         size, actions = one.observations.shape[1], one.labels.shape[1]
         spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))

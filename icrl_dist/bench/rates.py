@@ -33,10 +33,10 @@ from icrl_dist.methods.recipes import METHODS, Phase
 from icrl_dist.models.dpt import PretrainedTransformer, weights_of
 from icrl_dist.problems import registry, splits
 from icrl_dist.results import evaluate
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.training import batches, fit
 from icrl_dist.types import Job, Trajectory
@@ -201,10 +201,10 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
 
 def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
     """Trajectories a second: sent on credit over a link, checked, stored with fsync, acknowledged; all in this process."""
-    spec, keys, numbers = splits.spec(run), Keys("plan"), itertools.count()
+    spec, keys, numbers = splits.spec(run), StreamKeys("plan"), itertools.count()
     acknowledged: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     few = sample[: min(len(sample), _ENOUGH)]
-    with tempfile.TemporaryDirectory(dir=_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
+    with tempfile.TemporaryDirectory(dir=_disk()) as folder, contextlib.closing(Dataset(Path(folder))) as store:
         inbox = Inbox(
             store,
             spec,
@@ -240,7 +240,7 @@ def _disk() -> Path:
 
 def _stored(sample: Sequence[Trajectory]) -> float:
     few = sample[:_ENOUGH]
-    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Store(Path(folder), durable=False)) as store:
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Dataset(Path(folder), durable=False)) as store:
         store.append(list(few))
         return sum(file.stat().st_size for file in Path(folder).iterdir()) / len(few)
 

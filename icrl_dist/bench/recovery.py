@@ -23,9 +23,9 @@ import psutil
 
 from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config.run import ConfigError
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Keys, Refused, Unanswered
+from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 from icrl_dist.types import Identity
@@ -54,8 +54,8 @@ def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3)
                 heard.until(trajectories)
                 learner_s, stored = _kill_the_learner(process, link, out)
         used = sum(file.stat().st_size for file in (out / "dataset").iterdir())
-        store = Store(out / "dataset", readonly=True)
-        raw = sum(a.nbytes for row in store.ledger for a in store.read(row.identity).arrays().values())
+        store = Dataset(out / "dataset", readonly=True)
+        raw = sum(a.nbytes for row in store.index for a in store.read(row.identity).arrays().values())
         found = len(store)
         store.close()
     return {
@@ -86,7 +86,7 @@ class _Heard:
         self._stored = 0
         self._sent: list[tuple[float, str, Identity]] = []
         self._freed: list[tuple[str, str]] = []
-        link.subscribe(Keys(name).monitor_all, self._hear)
+        link.subscribe(StreamKeys(name).monitor_all, self._hear)
         threading.Thread(target=self._read, daemon=True).start()
 
     def _hear(self, key: str, payload: bytes) -> None:
@@ -162,13 +162,13 @@ def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path
     while time.monotonic() < began + 120:
         need_alive(process)
         try:
-            link.request(Keys(out.name).work, hello, timeout_s=0.5)
+            link.request(StreamKeys(out.name).work, hello, timeout_s=0.5)
         except Refused:  # it answers: it knows no such message
             break
         except Unanswered:
             time.sleep(0.02)
     answered = time.monotonic() - began
-    store = Store(out / "dataset", readonly=True)
+    store = Dataset(out / "dataset", readonly=True)
     try:
         return answered, len(store)
     finally:

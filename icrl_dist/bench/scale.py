@@ -31,7 +31,7 @@ import psutil
 from icrl_dist.bench import ingest
 from icrl_dist.bench.stream import KEYS, LIMIT, example
 from icrl_dist.config.run import ConfigError, StreamConfig
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.endpoints import parse
@@ -150,7 +150,7 @@ def _size(folder: Path, count: int, seconds: float) -> dict[str, Any]:
     process = psutil.Process()
     stored: list[float] = []
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
-    with contextlib.closing(Store(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
+    with contextlib.closing(Dataset(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
         inbox = _inbox(store, count, stored, failures)
         link.serve(KEYS.data, inbox.put)
         before = process.memory_info().rss
@@ -189,7 +189,7 @@ def _cpu(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def _inbox(store: Store, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Inbox:
+def _inbox(store: Dataset, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Inbox:
     one = example()
     size, actions = one.observations.shape[1], one.labels.shape[1]
     spec = Spec((0.0,) * size, (1.0,) * size, actions, len(one.actions))

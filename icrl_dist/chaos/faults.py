@@ -17,7 +17,7 @@ from icrl_dist.chaos.proxy import Proxy
 from icrl_dist.chaos.schedule import Strike
 from icrl_dist.chaos.training import Broken, Training, gone
 from icrl_dist.storage import segment
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import endpoints
 
 STOP_S, CUT_S = 15.0, 12.0
@@ -187,7 +187,7 @@ def full_disk(training: Training, strike: Strike, room: int) -> Struck:
                 raise Broken(
                     f"on a full disk: exit code {code}, {len(lines)} lines on it, and at last: {words.splitlines()[-1]}"
                 )
-            store = Store(training.view / "dataset", readonly=True)
+            store = Dataset(training.view / "dataset", readonly=True)
             stored = len(store)
             store.close()
             where = f"disk of {size >> 10} KiB, {stored} trajectories stored"

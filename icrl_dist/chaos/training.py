@@ -20,7 +20,7 @@ from icrl_dist.chaos.schedule import Strike
 from icrl_dist.config.run import Run
 from icrl_dist.methods.recipes import METHODS
 from icrl_dist.stream import monitor_messages, security, wire
-from icrl_dist.stream.link import Keys, LinkError
+from icrl_dist.stream.link import LinkError, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
@@ -155,7 +155,7 @@ class Training:
         certificates = security.client(self.run.stream.certificates, "monitor")
         try:
             with ZenohLink.connect(endpoint.read_text().strip(), 30.0, certificates) as link:
-                link.subscribe(Keys(self.folder.name).monitor_all, ear.hear)
+                link.subscribe(StreamKeys(self.folder.name).monitor_all, ear.hear)
                 while not ear.due.wait(_POLL_S):
                     if self.ended():
                         return ""

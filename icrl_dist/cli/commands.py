@@ -119,7 +119,7 @@ def evaluate(arguments: Evaluate, console: Console) -> int:
     from icrl_dist.config.run import default_deployment, parse
     from icrl_dist.console.terminal import Display
     from icrl_dist.results import heldout
-    from icrl_dist.storage.files import load_checkpoint
+    from icrl_dist.storage.checkpoint import load_checkpoint
 
     what, folder = _evaluated(arguments)
     checkpoint = load_checkpoint(checkpoint_file(what))
@@ -167,7 +167,7 @@ def export(arguments: Export, console: Console) -> int:
     from icrl_dist.agent.in_context_agent import checkpoint_file, is_slim, slim
     from icrl_dist.console.terminal import Display
     from icrl_dist.results import heldout
-    from icrl_dist.storage.files import save_checkpoint
+    from icrl_dist.storage.checkpoint import save_checkpoint
 
     source = checkpoint_file(arguments.what)
     out = arguments.out or (arguments.what if arguments.what.is_dir() else source.parent) / "agent.npz"

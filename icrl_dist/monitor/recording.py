@@ -18,10 +18,10 @@ from typing import Any
 
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.methods.recipes import METHODS, about
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 
 _BEAT_S = 1.0
 _EPISODES_S = 1.0
@@ -38,10 +38,10 @@ class Recording:
         """Raises ConfigError if the folder has no run, or nothing of it to play."""
         if not (folder / "run.toml").is_file():
             raise ConfigError(f"{folder}: not a run folder (no run.toml); name one, or a run that is on with --connect")
-        self._run, self._folder, self._keys = load(str(folder / "run.toml")), folder, Keys(folder.absolute().name)
+        self._run, self._folder, self._keys = load(str(folder / "run.toml")), folder, StreamKeys(folder.absolute().name)
         self._rows = sorted(_read(folder / "metrics.jsonl"), key=lambda row: float(row["time"]))
-        self._store = Store(folder / "dataset", readonly=True)
-        self._ordered = sorted(self._store.ledger, key=lambda row: (row.segment, row.offset))
+        self._store = Dataset(folder / "dataset", readonly=True)
+        self._ordered = sorted(self._store.index, key=lambda row: (row.segment, row.offset))
         if not self._rows or not self._ordered:
             self._store.close()
             raise ConfigError(f"{folder}: nothing to play: no trajectory was stored, or metrics.jsonl is empty")

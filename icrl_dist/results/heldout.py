@@ -24,8 +24,9 @@ from icrl_dist.problems.darkroom import divergence
 from icrl_dist.problems.darkroom.exact_agents import RULES
 from icrl_dist.results import evaluate, plots
 from icrl_dist.rollout import deployment
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import Checkpoint, atomic_write, load_checkpoint, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Variation
 
 
@@ -173,7 +174,7 @@ def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | i
 
 def show_experts(folder: Path, console: Console) -> dict[str, Any]:
     """Print what each expert's first and last recorded episode returned; returns the rows."""
-    data = Store(folder / "dataset", readonly=True)
+    data = Dataset(folder / "dataset", readonly=True)
     rows = []
     for key in data.variations("pretrain", 0):
         trials = data.trials(key)

@@ -23,10 +23,10 @@ _PATTERN = "segment-*.frames"
 
 
 class Damaged(StoreError):  # noqa: N818
-    """Bytes that changed after they were written; ``Store.repair`` takes them out."""
+    """Bytes that changed after they were written; ``Dataset.repair`` takes them out."""
 
 
-class Store:
+class Dataset:
     """A run's dataset: appended to by one process, durable when ``append`` returns.
 
     Opened to be written, it mends what a crash or a disk did to it; ``repaired`` says what.
@@ -45,7 +45,7 @@ class Store:
         if not self._readonly:
             self.folder.mkdir(parents=True, exist_ok=True)
         self.repaired: list[str] = []
-        self.ledger = Ledger()
+        self.index = Ledger()
         self._names: dict[int, segment.Names] = {}
         self._sealed: dict[int, str] = {}
         self._readers: dict[int, int] = {}
@@ -100,7 +100,7 @@ class Store:
                     except segment.MissingName:
                         nameless.append((offset, length))
 
-        self.ledger.enter(rows())
+        self.index.enter(rows())
         return nameless
 
     def append(self, trajectories: Sequence[Trajectory]) -> None:
@@ -127,7 +127,7 @@ class Store:
                 length = len(frame) - segment.HEADER_BYTES
                 rows.append(Row.of(trajectory, number, at - length, length))
             self._write(b"".join(parts), start)
-            self.ledger.enter(rows)
+            self.index.enter(rows)
 
     def seal(self) -> None:
         """End the present segment: it will never change again, and says its own SHA-256."""
@@ -180,26 +180,26 @@ class Store:
                 self._file = None
             while self._readers:
                 os.close(self._readers.popitem()[1])
-            self.ledger.close()
+            self.index.close()
 
     def __contains__(self, identity: Identity) -> bool:
         with self._lock:
-            return identity in self.ledger
+            return identity in self.index
 
     def __len__(self) -> int:
-        return len(self.ledger)
+        return len(self.index)
 
     def read(self, identity: Identity) -> Trajectory:
         """The trajectory of this identity.  Raises KeyError if there is none, Damaged if its bytes changed."""
-        return self._read(self.ledger[identity])
+        return self._read(self.index[identity])
 
     def variations(self, stage: str, round: int) -> list[tuple[str, int, int, int]]:
         """Which variations of one stage and round there are, in canonical order: (stage, round, task, variation)."""
-        return self.ledger.variations(stage, round)
+        return self.index.variations(stage, round)
 
     def trials(self, key: tuple[str, int, int, int]) -> list[Trajectory]:
         """The trajectories of one variation, in order of trial.  Raises Damaged at one whose bytes changed."""
-        return [self._read(row) for row in self.ledger.trials(key)]
+        return [self._read(row) for row in self.index.trials(key)]
 
     def _read(self, row: Row) -> Trajectory:
         if row.segment not in self._readers:
@@ -218,7 +218,7 @@ class Store:
         whatever died on the way.
         """
         total = hashlib.sha256()
-        for sha256 in self.ledger.digests(version):
+        for sha256 in self.index.digests(version):
             total.update(sha256.encode())
         return total.hexdigest()
 

@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Keys:
+class StreamKeys:
     """The keys of one run.  Raises ValueError for a name that cannot be part of a key."""
 
     run: str

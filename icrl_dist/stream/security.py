@@ -15,7 +15,7 @@ import ssl
 from pathlib import Path
 from typing import Literal
 
-from icrl_dist.stream.link import Keys, LinkError
+from icrl_dist.stream.link import LinkError, StreamKeys
 
 FOLDER = "ICRL_CERTIFICATES"
 """Environment variable: the folder of certificates on a machine where they lie elsewhere."""
@@ -37,7 +37,7 @@ def learner(certificates: str, run_name: str) -> Settings:
         **_tls(authority),
         "transport/link/tls/listen_certificate": certificate,
         "transport/link/tls/listen_private_key": key,
-        "access_control": _access(Keys(run_name)),
+        "access_control": _access(StreamKeys(run_name)),
     }
 
 
@@ -65,7 +65,7 @@ def _tls(authority: str) -> Settings:
     }
 
 
-def _access(keys: Keys) -> dict[str, object]:
+def _access(keys: StreamKeys) -> dict[str, object]:
     """The rules, as the learner's end of each connection sees them: what comes in, what goes out.
 
     What is not allowed is denied.  The answers to a client's own declarations (``declare_*``

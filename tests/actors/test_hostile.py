@@ -16,13 +16,13 @@ import pytest
 from actors.fleet import Fleet, FleetFailed
 from icrl_dist.methods.recipes import METHODS
 from icrl_dist.stream import batching, wire
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner.scheduler import Board
 from learner.worker_api import Desk
 from tests.e2e.training import wait_for
 
-KEYS = Keys("test")
+KEYS = StreamKeys("test")
 HOSTILE = Path(__file__).parent / "hostile"
 WORKER = """  # hostile-worker
 import sys

@@ -33,7 +33,7 @@ def test_it_measures_every_size_and_leaves_nothing_behind(on_disk, tmp_path, mon
 
         def counted(group):
             take(group)
-            stored.append({row.identity.task for row in store.ledger})
+            stored.append({row.identity.task for row in store.index})
 
         made.take = counted
         return made

@@ -13,9 +13,9 @@ import pytest
 
 from icrl_dist.stream import batching
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys, Link, LinkError, Outcome, Query, Refused, Unanswered
+from icrl_dist.stream.link import Link, LinkError, Outcome, Query, Refused, StreamKeys, Unanswered
 
-KEYS = Keys("battery")
+KEYS = StreamKeys("battery")
 
 
 class Links(Protocol):

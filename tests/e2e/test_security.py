@@ -10,13 +10,13 @@ import zenoh
 
 from icrl_dist.cli import main
 from icrl_dist.stream import security
-from icrl_dist.stream.link import Keys, LinkError, Refused, Unanswered
+from icrl_dist.stream.link import LinkError, Refused, StreamKeys, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
 from tests.contracts.link_battery import eventually
 from tests.e2e.training import ONE_LIFE, SMOKE, endpoint_of, equal, finish, result_of, start
 
-KEYS = Keys("run")
+KEYS = StreamKeys("run")
 TLS = "transport/link/tls/"
 OPEN_S, SHUT_S = 20.0, 0.5
 """How long to wait for what must happen, and for what must not."""
@@ -200,7 +200,7 @@ def forge_the_monitor_key(scene):
 
 def speak_for_another_run(scene):
     scene.monitor.subscribe("icrl/*/mon/**", scene.tell)
-    return scene.gained(lambda: scene.intruder.put(Keys("other").monitor("learner"), b"forged"))
+    return scene.gained(lambda: scene.intruder.put(StreamKeys("other").monitor("learner"), b"forged"))
 
 
 def read_the_data_of_others(scene):

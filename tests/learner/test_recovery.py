@@ -10,7 +10,7 @@ from icrl_dist.collect import jobs
 from icrl_dist.config.run import ConfigError, override
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch import train
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError, hold
 from icrl_dist.storage.fork import parse_source
 from icrl_dist.types import Identity
@@ -41,7 +41,7 @@ def test_a_changed_byte_in_data_of_any_round_is_named_and_collected_again(parent
     texts = [event["text"] for event in events if "text" in event]
     assert any(segments[segment].name in text and "damaged range" in text for text in texts)
     assert any("are missing: collecting them again" in text for text in texts)
-    assert Store(folder / "dataset").digest() == parent[1]["dataset_digest"]
+    assert Dataset(folder / "dataset").digest() == parent[1]["dataset_digest"]
 
 
 def test_a_segment_that_is_gone_is_collected_again_with_the_weights_of_its_round(parent, tmp_path):
@@ -93,7 +93,7 @@ def test_a_fork_with_other_numbers_keeps_the_data_that_it_began_with(parent, tmp
     (folder / "dataset" / "segment-000001.frames").unlink()
     again = run_inline(run, folder, resume=True)
     assert same(again, result), "an ancestor's data is asked for with the ancestor's numbers"
-    assert Store(parent[0] / "dataset", readonly=True).digest() == before
+    assert Dataset(parent[0] / "dataset", readonly=True).digest() == before
     grandchild = run_inline(run, tmp_path / "grandchild", source=(folder, 2))
     assert same(grandchild, result)
 
@@ -122,14 +122,14 @@ def test_what_to_fork_from_is_checked(parent, tmp_path):
 def test_rounds_that_overlap_name_weights_one_version_old_at_most(parent, tmp_path):
     folder = tmp_path / "async"
     result = run_inline(override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set"), folder)
-    store = Store(folder / "dataset", readonly=True)
+    store = Dataset(folder / "dataset", readonly=True)
     adapt = 7 * 3 * (parent[2].icaa.trials + 1)
     assert result["trajectories"] == 42 + 3 * adapt == len(store)
     lags = {int(lag): count for lag, count in result["lag"].items()}
     assert set(lags) == {0, 1} and sum(lags.values()) == 3 * adapt, "round 1's first jobs go out before T^1 is there"
     for task in range(7):
         for round_ in range(3):
-            acted = store.ledger.acted("adapt", round_, (task - task % 2, task - task % 2 + 2))
+            acted = store.index.acted("adapt", round_, (task - task % 2, task - task % 2 + 2))
             assert len(acted) == 1 and round_ - 1 <= acted[0] <= round_, "one T^j in all trials of a job"
     assert parent[1]["lag"] == {"0": 2 * adapt} and parent[1]["staleness"] == 0
 
@@ -148,10 +148,10 @@ def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began
         run_inline(run, tmp_path / "run", stop)
     result = run_inline(run, tmp_path / "run", resume=True)
     assert result["trajectories"] == 42 + 3 * 7 * 3 * (run.icaa.trials + 1)
-    store = Store(tmp_path / "run" / "dataset", readonly=True)
+    store = Dataset(tmp_path / "run" / "dataset", readonly=True)
     for round_ in range(3):
         for first in range(0, 7, 2):
-            assert len(store.ledger.acted("adapt", round_, (first, first + 2))) == 1
+            assert len(store.index.acted("adapt", round_, (first, first + 2))) == 1
 
 
 def test_explain_checks_everything_that_is_left(parent):

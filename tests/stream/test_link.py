@@ -18,7 +18,7 @@ import pytest
 from icrl_dist.stream import monitor_messages
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.dispatch import Dispatcher, Mailbox
-from icrl_dist.stream.link import Keys, Link, LinkError, Unanswered, matches
+from icrl_dist.stream.link import Link, LinkError, StreamKeys, Unanswered, matches
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
@@ -97,7 +97,7 @@ def test_key_expressions(key_expr: str, key: str, expected: bool) -> None:
 def test_names_that_cannot_be_keys_are_refused() -> None:
     for name in ("", "a/b", "*", "a?", "a#", "a\nb"):
         with pytest.raises(ValueError, match="part of a key"):
-            Keys(name)
+            StreamKeys(name)
         with pytest.raises(ValueError, match="part of a key"):
             KEYS.alive(name)
 
@@ -142,17 +142,17 @@ def test_a_worker_finds_a_learner_that_listens_again() -> None:
 
 WORKER = """
 import sys, time
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 link = ZenohLink.connect(sys.argv[1], 10.0)
-link.announce(Keys("battery").alive("doomed"))
+link.announce(StreamKeys("battery").alive("doomed"))
 time.sleep(60)
 """
 
 LEARNER = """
 import sys, time
 from icrl_dist.stream import batching
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 known = set(open(sys.argv[2]).read().split())
 file = open(sys.argv[2], "a")
@@ -166,7 +166,7 @@ def store(query):
 def take_apart(query):
     for part in batching.split(query, 1 << 20):
         store(part)
-ZenohLink.listen(sys.argv[1]).serve(Keys("battery").data, take_apart)
+ZenohLink.listen(sys.argv[1]).serve(StreamKeys("battery").data, take_apart)
 time.sleep(60)
 """
 

@@ -20,8 +20,9 @@ from icrl_dist.methods.recipes import METHODS
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.storage import segment
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import StoreError
 
 
 class Bomb:
@@ -237,7 +238,7 @@ SEGMENTS = {
 def dataset(tmp_path, small_run):
     """A good dataset, and its file."""
     phase = METHODS["dpt"].phases(small_run)[0]
-    with contextlib.closing(Store(tmp_path / "dataset")) as store:
+    with contextlib.closing(Dataset(tmp_path / "dataset")) as store:
         store.append([t for job in METHODS["dpt"].ask(small_run, phase)[:1] for t in jobs.do(job, None, "w")])
         count = len(store)
     (file,) = (f for f in (tmp_path / "dataset").iterdir() if f.stat().st_size)
@@ -250,7 +251,7 @@ def test_a_malicious_dataset(bomb, dataset, what, behind):
     file, count = dataset
     file.write_bytes((file.read_bytes() if behind else b"") + SEGMENTS[what](bomb))
     try:
-        store = Store(file.parent)
+        store = Dataset(file.parent)
     except StoreError as error:
         assert str(file) in str(error)
         return
