@@ -68,7 +68,7 @@ class Herald:
     def began(self) -> None:
         """A phase begins to be collected."""
         with self._lock:
-            self._alerts.began()
+            self._alerts.begin_phase()
 
     def stored(self, trajectory: Trajectory) -> None:
         """A trajectory was stored."""
@@ -76,7 +76,7 @@ class Herald:
         if identity.stage == "adapt" or self._run.problem != "darkroom":  # a random walk in the dark may well find nothing
             place = identity.task, identity.variation, identity.trial
             with self._lock:
-                self._alerts.returned(place, trajectory.policy_version, trajectory.episode_return)
+                self._alerts.add_return(place, trajectory.policy_version, trajectory.episode_return)
 
     def fitted(self, loss: float, seconds: float) -> None:
         """The newest version of the weights is fitted and published."""
@@ -92,7 +92,7 @@ class Herald:
         self._report({"event": "labels", "round": round, **quality})
         self.say("labels", text)
         with self._lock:
-            self._alerts.labels(round, quality["agreement"])
+            self._alerts.add_label_quality(round, quality["agreement"])
 
     def progress(self, fields: dict[str, Any], force: bool, desk: Mapping[str, Any]) -> None:
         """How far a phase is; told if ``force``, or if it is time.
@@ -129,7 +129,7 @@ class Herald:
         now = time.time()
         with self._lock:
             if fields["stage"] == "collect":
-                self._alerts.waited(time.monotonic(), desk["waited"])
+                self._alerts.add_waiting(time.monotonic(), desk["waited"])
             changed = self._alerts.check(desk["silent"], now)
         for alert in changed:
             self._report({"event": "alert", "text": f"{'ALERT' if alert.active else 'alert'}: {alert.text}"})
@@ -140,13 +140,13 @@ class Herald:
     def _on(self) -> list[dict[str, Any]]:
         """The alerts that are on: told again and again, for viewers that come late or missed how one began or ended."""
         with self._lock:
-            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.on[:_ALERTS]]
+            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.active[:_ALERTS]]
 
     def write(self) -> None:
         """Everything said so far into the metrics.  Raises StoreError if it cannot be written."""
         while self._rows:
             at, stage, about = self._rows.popleft()
-            self._metrics.tell(at, self._version(), stage, **about)
+            self._metrics.write_text(at, self._version(), stage, **about)
 
     def _due(self, what: str, period_s: float) -> bool:
         now = time.monotonic()

@@ -187,20 +187,20 @@ class LinkBattery:
         tap, worker = links.worker(), links.worker()
         tap.subscribe(KEYS.monitor("trajectories/w0"), lambda key, payload: None)
         links.settle()
-        assert not worker.watched(belief)
+        assert not worker.has_subscribers(belief)
         links.settle()
-        assert not worker.watched(belief), "what others listen to is not this"
+        assert not worker.has_subscribers(belief), "what others listen to is not this"
         tap.subscribe(belief, lambda key, payload: None)
-        eventually(lambda: worker.watched(belief))
-        assert not worker.watched(other)
+        eventually(lambda: worker.has_subscribers(belief))
+        assert not worker.has_subscribers(other)
         everything = links.worker()
         everything.subscribe(KEYS.monitor_all, lambda key, payload: None)
-        eventually(lambda: worker.watched(other))
+        eventually(lambda: worker.has_subscribers(other))
         everything.close()
-        eventually(lambda: not worker.watched(other))
-        assert worker.watched(belief)
+        eventually(lambda: not worker.has_subscribers(other))
+        assert worker.has_subscribers(belief)
         tap.close()
-        eventually(lambda: not worker.watched(belief))
+        eventually(lambda: not worker.has_subscribers(belief))
 
     def test_reliable_messages_wait_for_a_slow_subscriber(self, links: Links) -> None:
         heard: list[int] = []
@@ -279,7 +279,7 @@ class LinkBattery:
         for use in (
             lambda: worker.request(KEYS.work, b"", 1.0),
             lambda: worker.publish(KEYS.weights, b"", droppable=True),
-            lambda: worker.watched(KEYS.weights),
+            lambda: worker.has_subscribers(KEYS.weights),
             lambda: worker.serve(KEYS.work, held.append),
             lambda: worker.announce(KEYS.alive("w")),
         ):

@@ -119,9 +119,9 @@ def test_a_worker_and_a_monitor_do_their_work(ours):
         monitor.subscribe("icrl/*/mon/trajectories/**", lambda key, payload: heard.append((key, payload)))
         for link, topic in ((worker, "trajectories/w0"), (learner, "trajectories/learner")):
             eventually(lambda link=link, topic=topic: published(link, KEYS.monitor(topic), b"look", heard), OPEN_S)
-        assert worker.watched(KEYS.monitor("trajectories/w0")) and not worker.watched(KEYS.monitor("belief/w0"))
+        assert worker.has_subscribers(KEYS.monitor("trajectories/w0")) and not worker.watched(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
-        eventually(lambda: worker.watched(KEYS.monitor("belief/w0")), OPEN_S)
+        eventually(lambda: worker.has_subscribers(KEYS.monitor("belief/w0")), OPEN_S)
         eventually(lambda: published(learner, KEYS.weights, b"T^1", weights), OPEN_S)
         eventually(lambda: alive == [("w0", True)], OPEN_S)
         assert (KEYS.monitor("trajectories/w0"), b"look") in heard and b"T^1" in weights
