@@ -68,7 +68,7 @@ class Plan:
         """
         if job.policy_version < 0:
             return job.policy_version
-        acted = self._store.index.acted(job.stage, job.round, (job.task, job.task + job.tasks))
+        acted = self._store.index.policy_versions(job.stage, job.round, (job.task, job.task + job.tasks))
         return acted[0] if acted else min(version, job.policy_version)
 
     def give_up(self, variations: dict[str, str]) -> None:

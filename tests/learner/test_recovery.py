@@ -129,7 +129,7 @@ def test_rounds_that_overlap_name_weights_one_version_old_at_most(parent, tmp_pa
     assert set(lags) == {0, 1} and sum(lags.values()) == 3 * adapt, "round 1's first jobs go out before T^1 is there"
     for task in range(7):
         for round_ in range(3):
-            acted = store.index.acted("adapt", round_, (task - task % 2, task - task % 2 + 2))
+            acted = store.index.policy_versions("adapt", round_, (task - task % 2, task - task % 2 + 2))
             assert len(acted) == 1 and round_ - 1 <= acted[0] <= round_, "one T^j in all trials of a job"
     assert parent[1]["lag"] == {"0": 2 * adapt} and parent[1]["staleness"] == 0
 
@@ -151,7 +151,7 @@ def test_a_stopped_asynchronous_run_goes_on_with_the_weights_that_its_jobs_began
     store = Dataset(tmp_path / "run" / "dataset", readonly=True)
     for round_ in range(3):
         for first in range(0, 7, 2):
-            assert len(store.index.acted("adapt", round_, (first, first + 2))) == 1
+            assert len(store.index.policy_versions("adapt", round_, (first, first + 2))) == 1
 
 
 def test_explain_checks_everything_that_is_left(parent):
