@@ -22,6 +22,7 @@ from icrl_dist.stream.link import Link, LinkError, StreamKeys, Unanswered, match
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
+from tests.contracts.credit_battery import CreditBattery
 from tests.contracts.link_battery import KEYS, LinkBattery, Links, eventually
 
 ANYWHERE = "tcp/127.0.0.1:0"
@@ -57,7 +58,7 @@ class ZenohLinks:
         time.sleep(0.1)  # time for the learner's declarations to arrive
 
 
-class TestMemoryLink(LinkBattery):
+class TestMemoryLink(LinkBattery, CreditBattery):
     @pytest.fixture
     def links(self) -> Iterator[Links]:
         links = MemoryLinks()
@@ -66,7 +67,7 @@ class TestMemoryLink(LinkBattery):
             link.close()
 
 
-class TestZenohLink(LinkBattery):
+class TestZenohLink(LinkBattery, CreditBattery):
     @pytest.fixture
     def links(self) -> Iterator[Links]:
         links = ZenohLinks()
