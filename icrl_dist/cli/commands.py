@@ -299,7 +299,7 @@ def explain(arguments: Explain, console: Console) -> int:
 def chaos(arguments: Chaos, console: Console) -> int:
     """``icrl-dist chaos``: exit code 1 if a fault did not land or changed a digest."""
     from icrl_dist.chaos.campaign import Campaign
-    from icrl_dist.chaos.training import Broken
+    from icrl_dist.chaos.training import TrainingFailed
     from icrl_dist.launch.learner_process import TrainFailed
 
     given = arguments
@@ -309,7 +309,7 @@ def chaos(arguments: Chaos, console: Console) -> int:
     with Campaign(given.run, given.set, given.actors, given.out, console) as campaign:
         try:
             answer = campaign.run(given.faults, seeds, given.reference)
-        except Broken as error:
+        except TrainingFailed as error:
             raise TrainFailed(f"undisturbed: {error}") from None
     if given.json:
         print(json.dumps(answer))
