@@ -75,7 +75,7 @@ class Worker:
                 if kind == "wait":
                     self._stop.wait(read(messages.Wait, fields, kind).seconds)
                 else:
-                    lease = read(messages.Lease, fields, kind)
+                    lease = read(messages.LeasedJob, fields, kind)
                     self._do(
                         wire.decode_job(lease.job), lease.deadline_s, policy, beliefs, sender, watchdog, run.stream.lease_s
                     )

@@ -102,7 +102,7 @@ def cut_link(training: Training, strike: Strike, disk_bytes: int) -> Struck:
         result = training.result()
         after = training.output[printed:]
     back, resent = after.count("is back"), result["resent"]
-    evidence = f"{before >> 10} KiB passed before; sent again: {resent}, workers seen gone and back: {back}"
+    evidence = f"{before >> 10} KiB passed before; sent again: {resent}, workers that left and came back: {back}"
     return Struck(where, before > 0 and (resent > 0 or back > 0), evidence, result)
 
 
@@ -112,33 +112,33 @@ def torn_tail(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     path = training.segments()[-1] if training.segments() else training.folder
     found = segment.scan(path) if path.is_file() else segment.Scan()
     if found.sealed or not found.frames:
-        raise Missed(f"{path.name} had no open end")
+        raise Missed(f"{path.name} was sealed or empty")
     offset, length = found.frames[-1]
     start = offset - segment.HEADER_BYTES
     content = path.read_bytes()
     cut = 1 + int(strike.place * (segment.HEADER_BYTES + length - 2))
-    if strike.odd:
+    if strike.variant:
         path.write_bytes(content + content[start : start + cut])
         change = f"{path.name}: {cut} bytes of a frame added"
     else:
         os.truncate(path, len(content) - cut)
         change = f"{path.name}: {cut} bytes of the last frame cut off"
     result = _resume(training)
-    landed = f"{path.name}: cut a torn tail of" in training.output and result["repaired"] > 0
+    landed = f"{path.name}: cut off a torn tail of" in training.output and result["repaired"] > 0
     return Struck(where, landed, f"{change}, repaired: {result['repaired']}", result)
 
 
 def flip_byte(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """One byte of a sealed segment changes, in a killed run that is then resumed, or during a run."""
-    if strike.odd:
+    if strike.variant:
         training.start()
         where = _reach(training, strike)
     else:
         where, _ = _kill_all(training, strike)
     change, path = _flip(training, strike)
-    result = training.result() if strike.odd else _resume(training)
-    landed = f"{path.name}: took out" in training.output and result["repaired"] > 0
-    how = "during the run" if strike.odd else "then resumed"
+    result = training.result() if strike.variant else _resume(training)
+    landed = f"{path.name}: removed" in training.output and result["repaired"] > 0
+    how = "during the run" if strike.variant else "then resumed"
     return Struck(where, landed, f"{change} {how}, repaired: {result['repaired']}", result)
 
 
@@ -148,8 +148,10 @@ def _flip(training: Training, strike: Strike) -> tuple[str, Path]:
     if not sealed:
         raise Missed("no segment was sealed yet")
     path, found = sealed[strike.worker % len(sealed)]
-    first = found.frames[0][0] - segment.HEADER_BYTES if strike.odd else 0  # during a run only the trajectories are read again
-    place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.odd else 0) - first))
+    first = (
+        found.frames[0][0] - segment.HEADER_BYTES if strike.variant else 0
+    )  # during a run only the trajectories are read again
+    place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.variant else 0) - first))
     with path.open("r+b") as file:
         file.seek(place)
         (byte,) = file.read(1)
@@ -182,7 +184,7 @@ def full_disk(training: Training, strike: Strike, disk_bytes: int) -> Struck:
             output = training.output
             lines = [line for line in output.splitlines() if "No space left on device" in line]
             if code == 0:
-                raise Missed(f"the run fitted on a disk of {size >> 10} KiB")
+                raise Missed(f"the run did not fill a disk of {size >> 10} KiB")
             if code != 1 or len(lines) != 1 or "free space, then use --resume" not in lines[0] or "Traceback" in output:
                 last = output.splitlines()[-1]
                 raise TrainingFailed(f"on a full disk: exit code {code}, {len(lines)} lines about it; the last line: {last}")
@@ -231,7 +233,7 @@ def _kill_all(training: Training, strike: Strike) -> tuple[str, int]:
     where = _reach(training, strike)
     count = len(training.tree())
     if left := training.kill():
-        raise TrainingFailed(f"{len(left)} processes outlived SIGKILL, such as {left[0].pid}")
+        raise TrainingFailed(f"{len(left)} processes are alive after SIGKILL, such as {left[0].pid}")
     if training.finished():
         raise Missed("the run had ended")
     return where, count

@@ -44,7 +44,7 @@ class Strike:
     """Number of the worker, modulo the number of workers."""
     place: float
     """Place in a segment or a frame, or size of the disk, as a share."""
-    odd: bool
+    variant: bool
     """Variant: half a frame added (else a tail cut off), a byte changed during the run (else after a kill)."""
 
     def __str__(self) -> str:
@@ -66,7 +66,7 @@ def draw(run: Run, seed: int, fault: str, attempt: int = 0) -> Strike:
     number = int(rng.integers(first, len(phases)))
     phase = phases[number]
     share, place = rng.uniform(*_AFTER), float(rng.random())
-    worker, odd = int(rng.integers(1 << 16)), bool(rng.integers(2))
-    fit = fault == "kill-learner" and odd and phase.steps > 1
+    worker, variant = int(rng.integers(1 << 16)), bool(rng.integers(2))
+    fit = fault == "kill-learner" and variant and phase.steps > 1
     of = phase.steps if fit else sum(job.trials * len(job.variations) for job in method.ask(run, phase))
-    return Strike(fault, number, f"{phase.stage}/{phase.round}", fit, max(1, round(share * of)), of, worker, place, odd)
+    return Strike(fault, number, f"{phase.stage}/{phase.round}", fit, max(1, round(share * of)), of, worker, place, variant)

@@ -151,7 +151,7 @@ class Training:
             if self.ended():
                 return ""
             time.sleep(_POLL_S)
-        progress = _Progress(self.run, strike)
+        progress = _ProgressCounter(self.run, strike)
         certificates = security.client(self.run.stream.certificates, "monitor")
         try:
             with ZenohLink.connect(endpoint.read_text().strip(), 30.0, certificates) as link:
@@ -177,7 +177,7 @@ class Training:
         return sorted((self.view / "dataset").glob("segment-*.frames"))
 
 
-class _Progress:
+class _ProgressCounter:
     """Counts messages of the monitor plane until a strike is due."""
 
     def __init__(self, run: Run, strike: Strike) -> None:

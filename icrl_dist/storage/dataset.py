@@ -69,12 +69,12 @@ class Dataset:
             if found.damaged and not self._readonly:
                 torn = last and not found.sealed and [end for _, end in found.damaged] == [found.size]
                 for start, end in found.damaged:
-                    what = "cut a torn tail of" if torn else "took out a damaged range of"
+                    what = "cut off a torn tail of" if torn else "removed a damaged range of"
                     self.repaired.append(f"{path.name}: {what} {end - start} bytes at byte {start}")
                 found = self._remove_damage(path, found, sealed=not last)
             unnamed = self._add(path, number, found)
             if unnamed and not self._readonly:
-                self.repaired.append(f"{path.name}: took out {len(unnamed)} trajectories whose names were damaged")
+                self.repaired.append(f"{path.name}: removed {len(unnamed)} trajectories whose names were damaged")
                 found = self._remove_damage(path, found.without(unnamed), sealed=not last)
         except (ValueError, OSError) as error:
             raise StoreError(

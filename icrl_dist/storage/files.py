@@ -33,7 +33,7 @@ def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
         except BlockingIOError:
             if time.monotonic() > deadline:
                 file.close()
-                raise StoreError(f"{folder}: another learner is at work in this folder; end it, or use another --out") from None
+                raise StoreError(f"{folder}: another learner uses this folder; end it, or use another --out") from None
             time.sleep(0.05)
         file.close()
 

@@ -148,7 +148,7 @@ class Link(Protocol):
         """Send a message to all subscribers.  A droppable message is dropped where it would have to wait."""
 
     def has_subscribers(self, key: str) -> bool:
-        """Whether a droppable message on ``key`` would have a subscriber, as far as this process knows now."""
+        """Whether a droppable message on ``key`` would have a subscriber, according to the declarations received so far."""
 
     def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
         """Call ``handler``, on a thread of its own, with each message on ``key_expr`` (``*`` one part, ``**`` any number).

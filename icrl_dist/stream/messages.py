@@ -1,7 +1,7 @@
 """The messages between a worker and the learner on the work key: one dataclass a kind.
 
 A worker sends the requests in ``REQUESTS``.  The learner replies to ``hello`` with ``Welcome``, to
-``ask`` with ``Wait`` (kind ``wait``), ``Lease`` (kind ``job``) or ``stop``, and to the others with
+``ask`` with ``Wait`` (kind ``wait``), ``LeasedJob`` (kind ``job``) or ``stop``, and to the others with
 ``noted``; ``stop`` and ``noted`` have no fields.  A heartbeat on the monitor plane (kind
 ``worker``) has the fields of ``Progress``.
 """
@@ -98,7 +98,7 @@ class Wait:
 
 
 @dataclass(frozen=True, slots=True)
-class Lease:
+class LeasedJob:
     """Reply to a request for a job."""
 
     job: bytes

@@ -63,7 +63,7 @@ TEXTS = ("event", "alert")
 
 
 class Metrics:
-    """Appends rows to ``folder/metrics.jsonl`` and, if asked, to TensorBoard events beside it and a Prometheus endpoint.
+    """Appends rows to ``folder/metrics.jsonl`` and optionally to TensorBoard events and a Prometheus endpoint.
 
     Writing raises StoreError if a row cannot be written.
     """

@@ -22,7 +22,7 @@ class Links(Protocol):
     def worker(self) -> Link: ...
 
     def settle(self) -> None:
-        """Wait until every link knows the declarations of the others."""
+        """Wait until every link has received the declarations of the others."""
 
 
 def eventually(condition: Callable[[], object], seconds: float = 30.0) -> None:
@@ -116,7 +116,7 @@ class LinkBattery:
 
         for i in range(200):
             worker.send(KEYS.data, b"%d" % i, 60.0, done)
-            worker.send("icrl/battery/nobody", b"", 60.0, done)
+            worker.send("icrl/battery/unserved", b"", 60.0, done)
         eventually(lambda: len(answers) == 400, 60.0)
         time.sleep(0.05)
         assert sorted(a for a in answers if isinstance(a, bytes)) == sorted(b"%d" % i for i in range(200))
@@ -138,7 +138,7 @@ class LinkBattery:
         assert sorted(received) == [(KEYS.monitor("learner"), b"2"), (KEYS.monitor("worker/w0"), b"1")]
         assert exact == [(KEYS.weights, b"3")]
 
-    def test_a_publisher_knows_whether_a_key_has_subscribers(self, links: Links) -> None:
+    def test_has_subscribers_follows_subscriptions(self, links: Links) -> None:
         belief, other = KEYS.monitor("belief/w0"), KEYS.monitor("belief/w1")
         tap, worker = links.worker(), links.worker()
         tap.subscribe(KEYS.monitor("trajectories/w0"), lambda key, payload: None)

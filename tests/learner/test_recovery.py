@@ -61,13 +61,13 @@ def test_damage_while_the_run_is_on_is_found_before_it_is_learned_from(parent, t
             struck.append(event["text"])
 
     result = run_inline(parent[2], folder, strike)
-    assert len(struck) == 2 and "segment-000000.frames: took out a damaged range" in struck[1]
+    assert len(struck) == 2 and "segment-000000.frames: removed a damaged range" in struck[1]
     assert same(result, parent[1])
 
 
 def test_one_learner_a_folder(parent, monkeypatch):
     monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
-    with hold(parent[0]), pytest.raises(StoreError, match="another learner is at work"):
+    with hold(parent[0]), pytest.raises(StoreError, match="another learner uses this folder"):
         train.train_inline(parent[2], parent[0], print)
 
 

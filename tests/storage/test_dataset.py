@@ -143,7 +143,7 @@ def test_a_torn_tail_is_cut_off_and_reported(Dataset, tmp_path, trajectories):
     for cut in (len(whole) - 1, begins + 3, begins + HEADER_BYTES + 3):
         path.write_bytes(whole[:cut])
         torn = Dataset(tmp_path)
-        assert torn.repaired == [f"{path.name}: cut a torn tail of {cut - begins} bytes at byte {begins}"]
+        assert torn.repaired == [f"{path.name}: cut off a torn tail of {cut - begins} bytes at byte {begins}"]
         assert len(torn) == len(trajectories) - 1 and trajectories[-1].identity not in torn
         torn.append(trajectories[-1:])
         torn.close()

@@ -69,7 +69,7 @@ def test_a_missing_field_is_refused(kind: str) -> None:
 
 
 @given(
-    st.sampled_from([*messages.REQUESTS.values(), messages.Welcome, messages.Wait, messages.Lease]),
+    st.sampled_from([*messages.REQUESTS.values(), messages.Welcome, messages.Wait, messages.LeasedJob]),
     st.dictionaries(
         st.sampled_from(sorted({name for fields in VALID.values() for name in fields})) | st.text(max_size=4),
         st.none()
