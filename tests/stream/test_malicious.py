@@ -206,7 +206,7 @@ def test_an_invalid_manifest(tmp_path, agent, what):
 def test_a_run_folder_with_pickles_in_every_file_but_the_checkpoint(tmp_path, bomb, agent):
     folder = tmp_path / "run"
     save_checkpoint(version_file(folder, 0), Checkpoint(*agent))
-    others = ["run.toml", "env.json", "metrics.jsonl", "result.json", "endpoint", "learner.log", "ledger.db", "__init__.py"]
+    others = ["run.toml", "env.json", "metrics.jsonl", "result.json", "endpoint", "learner.log", "index.db", "__init__.py"]
     for name in [*others, "conftest.py", "dataset/segment-000000.frames", "dataset/index", "sitecustomize.py", "torch.py"]:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(code(bomb).encode() if name.endswith(".py") else pickle.dumps(bomb))
