@@ -225,7 +225,9 @@ class Desk:
         try:
             kind, fields = wire.decode_message(query.payload, self._run.stream.max_message_bytes)
             query.reply(self._answer(kind, fields))
-        except (wire.WireError, KeyError, TypeError, ValueError) as error:
+        except wire.WireError as error:
+            query.refuse(f"schema: {error.detail}")
+        except (KeyError, TypeError, ValueError) as error:
             query.refuse(f"schema: {error}")
 
     def _answer(self, kind: str, fields: dict[str, Any]) -> bytes:
