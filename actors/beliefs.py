@@ -38,7 +38,7 @@ class BeliefPublisher:
             return
         spent = time.thread_time()
         try:
-            if self._link.watched(self._key):
+            if self._link.has_subscribers(self._key):
                 self._link.publish(self._key, self._message(policy, row, identity, variation), droppable=True)
         except Exception as error:
             _log.warning("a belief is lost: %s", error)

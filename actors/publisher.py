@@ -6,7 +6,7 @@ import threading
 import time
 
 from icrl_dist.stream import monitor_messages
-from icrl_dist.stream.link import Keys, Link
+from icrl_dist.stream.link import Link, StreamKeys
 from icrl_dist.types import Identity, Trajectory
 
 PERIOD_S = 0.1
@@ -18,7 +18,7 @@ _MAX_SUMMARIES = 256
 class TrajectoryPublisher:
     """Publishes the trajectories of one worker on the monitor plane; several threads may use it."""
 
-    def __init__(self, link: Link, keys: Keys, worker: str) -> None:
+    def __init__(self, link: Link, keys: StreamKeys, worker: str) -> None:
         self._link, self._lock = link, threading.Lock()
         self._summaries, self._episodes = keys.monitor(f"trajectories/{worker}"), keys.monitor(f"episode/{worker}")
         self._waiting: list[Trajectory] = []

@@ -10,7 +10,7 @@ from torch import nn
 
 from icrl_dist.models.weights import load_weights
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link, Refused, Unanswered
+from icrl_dist.stream.link import Link, Refused, StreamKeys, Unanswered
 from icrl_dist.types import Weights
 
 _KEPT = 4
@@ -20,7 +20,7 @@ _KEPT = 4
 class WeightCache:
     """Keeps the learner's newest broadcasts; ``at`` waits for one policy version (Algorithm 3, line 12)."""
 
-    def __init__(self, link: Link, keys: Keys, model: nn.Module, limit: int, timeout_s: float = 60.0) -> None:
+    def __init__(self, link: Link, keys: StreamKeys, model: nn.Module, limit: int, timeout_s: float = 60.0) -> None:
         self._link, self._keys, self._limit, self._timeout_s = link, keys, limit, timeout_s
         self._model = model.eval()
         self._loaded: Weights | None = None

@@ -25,9 +25,10 @@ from icrl_dist.config.run import parse
 from icrl_dist.interfaces import Problem
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
-from icrl_dist.stream import wire
+from icrl_dist.stream import messages, wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys, Link, LinkError, Refused, Unanswered
+from icrl_dist.stream.link import Link, LinkError, Refused, StreamKeys, Unanswered
+from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Identity, Job, Payload, Trajectory
 
@@ -45,7 +46,7 @@ class Worker:
         ``folder``: the run folder, for a worker that has its process to itself: there it leaves
         its crash records, and its stacks when it must end because a job outlasts its deadline.
         """
-        self._link, self._keys, self.name, self._patience_s = link, Keys(run_name), name, patience_s
+        self._link, self._keys, self.name, self._patience_s = link, StreamKeys(run_name), name, patience_s
         self._folder = folder
         self._stop = threading.Event()
         self._episodes = self._steps = 0
@@ -65,7 +66,7 @@ class Worker:
         """
         self._link.announce(self._keys.alive(self.name))
         _, hello = self._ask("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
-        run = parse(hello["run"], "the learner's run")
+        run = parse(read(messages.Welcome, hello, "hello").run, "the learner's run")
         problem, method = problems.of(run), methods.of(run)
         weights = WeightCache(self._link, self._keys, method.build(problem.spec, run), run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)
@@ -77,12 +78,13 @@ class Worker:
                 if kind == "stop":
                     return
                 if kind == "wait":
-                    self._stop.wait(float(fields["seconds"]))
+                    self._stop.wait(read(messages.Wait, fields, kind).seconds)
                 else:
-                    job = wire.decode_job(fields["job"], functools.partial(_payload, problem))
+                    lease = read(messages.LeasedJob, fields, kind)
+                    job = wire.decode_job(lease.job, functools.partial(_payload, problem))
                     waiting = _Waiting(weights, watchdog)
                     work = functools.partial(kinds.do, job, problem, method, waiting, self.name, self._tell, beliefs)
-                    self._do(job, work, float(fields["deadline_s"]), sender, watchdog, run.stream.lease_s)
+                    self._do(job, work, lease.deadline_s, sender, watchdog, run.stream.lease_s)
 
     def _do(
         self,

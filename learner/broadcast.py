@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link, Query
+from icrl_dist.stream.link import Link, Query, StreamKeys
 from icrl_dist.types import Weights
 
 
@@ -16,7 +16,7 @@ class Broadcast:
     ``older`` loads a version that was published before; it raises for a version that does not exist.
     """
 
-    def __init__(self, link: Link, keys: Keys, older: Callable[[int], Weights]) -> None:
+    def __init__(self, link: Link, keys: StreamKeys, older: Callable[[int], Weights]) -> None:
         self._link, self._keys, self._older = link, keys, older
         self._lock = threading.Lock()
         self._newest = self._loaded = (-1, b"")

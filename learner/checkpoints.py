@@ -16,7 +16,7 @@ from icrl_dist.agent.loading import spec_from
 from icrl_dist.config.run import ConfigError, Run, dumps
 from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.problems import registry
-from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.stream.wire import weights_digest
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.types import Spec, Weights

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.link import Query
 from icrl_dist.types import Identity, Job, Spec, Trajectory
@@ -69,7 +69,7 @@ class Ingest:
 
     def __init__(
         self,
-        store: Store,
+        store: Dataset,
         spec: Spec,
         limit: int,
         pending_job: Callable[[Identity], Job | None],
@@ -116,7 +116,7 @@ class Ingest:
         query.refuse(str(error))
 
     def close(self) -> None:
-        """Store what is queued, then stop the thread."""
+        """Dataset what is queued, then stop the thread."""
         self._queue.put(None)
         self._thread.join()
 

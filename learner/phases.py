@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Method, Phase
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.types import Identity, Job
 
@@ -12,7 +12,7 @@ from icrl_dist.types import Identity, Job
 class PhasePlan:
     """A method's phases and what the dataset holds of each."""
 
-    def __init__(self, run: Run, lineage: Lineage, store: Store, method: Method, given_up: dict[str, str]) -> None:
+    def __init__(self, run: Run, lineage: Lineage, store: Dataset, method: Method, given_up: dict[str, str]) -> None:
         self.method = method
         self.phases = self.method.phases(run)
         self.given_up = given_up
@@ -43,7 +43,7 @@ class PhasePlan:
 
     def _count(self, phase: Phase) -> bool:
         expected = sum(job.trials * sum(_name(job, *row) not in self.given_up for row in job.rows()) for job in self.ask(phase))
-        return self._store.ledger.count(phase.stage, phase.round) >= expected
+        return self._store.index.count(phase.stage, phase.round) >= expected
 
     def incomplete(self, phase: Phase) -> list[Job]:
         """The phase's jobs of which something is missing."""
@@ -60,7 +60,7 @@ class PhasePlan:
 
     def have(self, job: Job) -> list[Identity]:
         """What need not be asked for: what is stored, and what was given up before."""
-        stored = self._store.ledger.identities(job.stage, job.round, (job.task, job.task + job.tasks))
+        stored = self._store.index.identities(job.stage, job.round, (job.task, job.task + job.tasks))
         given_up = {row for row in job.rows() if _name(job, *row) in self.given_up}
         return stored + [i for i in job.identities() if (i.task, i.variation) in given_up]
 
@@ -71,7 +71,7 @@ class PhasePlan:
         """
         if job.policy_version < 0:
             return job.policy_version
-        acted = self._store.ledger.acted(job.stage, job.round, (job.task, job.task + job.tasks))
+        acted = self._store.index.policy_versions(job.stage, job.round, (job.task, job.task + job.tasks))
         return acted[0] if acted else min(version, job.policy_version)
 
     def give_up(self, variations: dict[str, str]) -> None:
@@ -80,7 +80,7 @@ class PhasePlan:
         for name in self.given_up:
             stage, *numbers = name.split("/")
             round_, task, variation = map(int, numbers)
-            self._store.ledger.drop((stage, round_, task, variation))
+            self._store.index.drop((stage, round_, task, variation))
 
 
 def _name(job: Job, task: int, variation: int) -> str:

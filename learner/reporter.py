@@ -14,7 +14,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
 from icrl_dist.problems import registry
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Link, LinkError
+from icrl_dist.stream.link import Link, LinkError, StreamKeys
 from icrl_dist.telemetry.about import about
 from icrl_dist.telemetry.alerts import Alerts
 from icrl_dist.telemetry.metrics import Metrics
@@ -40,7 +40,7 @@ class Reporter:
         run: Run,
         folder: Path,
         link: Link,
-        keys: Keys,
+        keys: StreamKeys,
         metrics: Metrics,
         report: Callable[[dict[str, Any]], None],
         version: Callable[[], int],
@@ -77,7 +77,7 @@ class Reporter:
     def phase_started(self) -> None:
         """Reset the alerts at the start of a phase's collection."""
         with self._lock:
-            self._alerts.began()
+            self._alerts.begin_phase()
 
     def stored(self, trajectory: Trajectory) -> None:
         """Pass the return of a stored trajectory to the alerts."""
@@ -85,7 +85,7 @@ class Reporter:
         if identity.stage == "adapt" or registry.of(self._run).earns_in_contexts:
             trial = identity.task, identity.variation, identity.trial
             with self._lock:
-                self._alerts.returned(trial, trajectory.policy_version, trajectory.episode_return)
+                self._alerts.add_return(trial, trajectory.policy_version, trajectory.episode_return)
 
     def fitted(self, loss: float, seconds: float) -> None:
         """Report that the newest policy version is fitted and published."""
@@ -101,7 +101,7 @@ class Reporter:
         self._report({"event": "labels", "round": round, **quality})
         self.log("labels", text)
         with self._lock:
-            self._alerts.labels(round, quality["agreement"])
+            self._alerts.add_label_quality(round, quality["agreement"])
 
     def progress(self, fields: dict[str, Any], force: bool, totals: Mapping[str, Any]) -> None:
         """Send the progress of a phase, if ``force`` is set or ``PERIOD_S`` have passed.
@@ -138,7 +138,7 @@ class Reporter:
         now = time.time()
         with self._lock:
             if fields["stage"] == "collect":
-                self._alerts.waited(time.monotonic(), totals["waited"])
+                self._alerts.add_waiting(time.monotonic(), totals["waited"])
             changed = self._alerts.check(totals["silent"], now)
         for alert in changed:
             self._report({"event": "alert", "text": f"{'ALERT' if alert.active else 'alert'}: {alert.text}"})
@@ -149,13 +149,13 @@ class Reporter:
     def _active_alerts(self) -> list[dict[str, Any]]:
         """The active alerts; they repeat for viewers that connect later or missed a change."""
         with self._lock:
-            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.on[:_MAX_ALERTS]]
+            return [{"name": on.name, "text": on.text, "since": on.since} for on in self._alerts.active[:_MAX_ALERTS]]
 
     def flush(self) -> None:
         """Write all rows so far into the metrics file.  Raises StoreError if it cannot be written."""
         while self._rows:
             at, stage, fields = self._rows.popleft()
-            self._metrics.tell(at, self._version(), stage, **fields)
+            self._metrics.write_text(at, self._version(), stage, **fields)
 
     def _due(self, what: str, period_s: float) -> bool:
         now = time.monotonic()

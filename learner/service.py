@@ -17,10 +17,10 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
-from icrl_dist.storage import files
-from icrl_dist.storage.dataset import Damaged, Store
+from icrl_dist.storage import checkpoint, files
+from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
-from icrl_dist.stream.link import Keys, Link
+from icrl_dist.stream.link import Link, StreamKeys
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.training import fit
 from icrl_dist.types import Identity, Job, Trajectory, Weights
@@ -59,7 +59,7 @@ class Service:
 
     def _begin(self, closing: contextlib.ExitStack) -> None:
         run, folder, link, report = self._run, self._folder, self._link, self._report
-        self._keys = Keys(folder.name)
+        self._keys = StreamKeys(folder.name)
         self._spec = registry.of(run).spec
         lineage = Lineage.of(folder, run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
@@ -69,7 +69,7 @@ class Service:
         self._method = methods.of(run)
         self.model = self._method.build(self._spec, run).to(self._device)
         self._opt = fit.Optimizer(self.model, run.optim)
-        self.version = files.newest_version(folder)
+        self.version = checkpoint.newest_version(folder)
         self._partial = 0
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
@@ -82,7 +82,7 @@ class Service:
         self._error: BaseException | None = None
         self._lag = 0
         self._mended = 0
-        self.store = Store(folder / "dataset")
+        self.store = Dataset(folder / "dataset")
         closing.callback(self.store.close)
         self._tell_repairs()
         self._plan = PhasePlan(run, lineage, self.store, self._method, {})
@@ -144,7 +144,7 @@ class Service:
             self._changed.set()
 
     def _older(self, version: int) -> Weights:
-        return checkpoints.weights_of_file(files.version_file(self._folder, version), version)
+        return checkpoints.weights_of_file(checkpoint.version_file(self._folder, version), version)
 
     # The run, on the caller's thread.
 
@@ -192,7 +192,7 @@ class Service:
             "repaired": self._mended,
             "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
             "staleness": self._run.stream.staleness,
-            "lag": {str(lag): count for lag, count in self.store.ledger.lags().items()},
+            "lag": {str(lag): count for lag, count in self.store.index.lags().items()},
             "threads": self._threads,
             "instruction_set": torch.backends.cpu.get_cpu_capability(),
         }
@@ -236,7 +236,7 @@ class Service:
             self._scheduler.close(phase.stage, phase.round)
             self._opened.discard(phase)
         self._plan.give_up(blamed)
-        if not self.store.ledger.count(phase.stage, phase.round):
+        if not self.store.index.count(phase.stage, phase.round):
             raise RunFailed(
                 f"{phase.stage}/{phase.round}: no trajectory was stored, and {len(blamed)} of its variations are "
                 f"quarantined; first: {next(iter(blamed.values()))}"
@@ -282,7 +282,7 @@ class Service:
             "quarantined": self._plan.given_up,
         }
         weights = self._weights()
-        self._save(files.version_file(self._folder, self.version), weights, loss=loss, **where)
+        self._save(checkpoint.version_file(self._folder, self.version), weights, loss=loss, **where)
         partial.unlink(missing_ok=True)
         self._broadcast.publish(weights)
         self._reporter.fitted(loss, time.monotonic() - began)
@@ -298,7 +298,7 @@ class Service:
     def _take_up(self) -> None:
         """Continue from the newest version, and from the fit that was interrupted, if there are any."""
         if self.version >= 0:
-            checkpoints.restore(files.version_file(self._folder, self.version), self._spec, self.model, self._opt)
+            checkpoints.restore(checkpoint.version_file(self._folder, self.version), self._spec, self.model, self._opt)
             self._broadcast.publish(self._weights())
         partial = self._folder / "checkpoints" / checkpoints.PARTIAL
         if partial.exists() and checkpoints.read_manifest(partial)["next_version"] == self.version + 1:

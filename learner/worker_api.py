@@ -11,9 +11,10 @@ from typing import Any
 import icrl_dist
 from icrl_dist import version
 from icrl_dist.config.run import Run, dumps
-from icrl_dist.stream import wire
+from icrl_dist.stream import messages, wire
 from icrl_dist.stream.dispatch import Dispatcher
-from icrl_dist.stream.link import Keys, Link, Query
+from icrl_dist.stream.link import Link, Query, StreamKeys
+from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from icrl_dist.types import Job
 from learner.scheduler import LeaseScheduler
@@ -27,7 +28,7 @@ _STACKS_DELAY_S = 0.3
 _LINES = 60
 """Lines of a worker's stacks in its crash record; the newest call of the first thread comes first."""
 
-_COUNTS = {"episodes": int, "steps": int, "resent": int, "trajectories": int, "waited_s": float}
+_COUNTS = ("episodes", "steps", "resent", "trajectories", "waited_s")
 
 
 class WorkerAPI:
@@ -38,7 +39,7 @@ class WorkerAPI:
         run: Run,
         folder: Path,
         link: Link,
-        keys: Keys,
+        keys: StreamKeys,
         scheduler: LeaseScheduler,
         lock: threading.Lock,
         report: Callable[[dict[str, Any]], None],
@@ -212,42 +213,48 @@ class WorkerAPI:
 
     def _update_counters(self, fields: dict[str, Any]) -> None:
         """Keep a worker's newest counters; they never decrease, because heartbeats may arrive late."""
-        worker = str(fields["worker"])
+        progress = read(messages.Progress, fields, "progress")
+        worker = progress.worker
         with self._lock:
             before = self.counters.get(worker, {})
-            counts = {name: max(kind(fields[name]), before.get(name, 0)) for name, kind in _COUNTS.items()}
+            counts = {name: max(getattr(progress, name), before.get(name, 0)) for name in _COUNTS}
             self.counters[worker] = {**before, **fields, **counts}
             self._last_message[worker] = time.monotonic()
-            self._scheduler.reached(worker, str(fields.get("job")), int(fields.get("reached", 0)))
+            self._scheduler.reached(worker, progress.job, progress.reached)
 
     def _on_request(self, query: Query) -> None:
         try:
             kind, fields = wire.decode_message(query.payload, self._run.stream.max_message_bytes)
             query.reply(self._answer(kind, fields))
-        except (wire.WireError, KeyError, TypeError, ValueError) as error:
+        except wire.WireError as error:
+            query.refuse(f"schema: {error.detail}")
+        except (KeyError, TypeError, ValueError) as error:
             query.refuse(f"schema: {error}")
 
     def _answer(self, kind: str, fields: dict[str, Any]) -> bytes:
-        worker = str(fields["worker"])
-        if kind == "hello":
-            if fields["version"] != icrl_dist.__version__:
-                theirs, ours = fields["version"], icrl_dist.__version__
-                raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
-            if fields["code"] != version.digest():
-                theirs, ours = str(fields["code"])[:8], version.digest()[:8]
-                raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code")
-            return wire.encode_message("hello", run=dumps(self._run))
-        if kind == "ask":
-            self._update_counters(fields)
-            return self._lease(worker)
-        if kind == "failed":
-            stage, round_, task, first = fields["job"]
-            self._failed(worker, (stage, round_, task, first), fields["record"], fields["file"])
-            return wire.encode_message("noted")
-        if kind == "note":
-            self._report({"event": "note", "text": f"worker {worker}: {str(fields['text'])[:200]}"})
-            return wire.encode_message("noted")
-        raise ValueError(f"message kind {kind!r} is not known; use hello, ask, failed or note")
+        if kind not in messages.REQUESTS:
+            raise ValueError(f"message kind {kind!r} is not known; use hello, ask, failed or note")
+        request: Any = read(messages.REQUESTS[kind], fields, kind)
+        worker = request.worker
+        match request:
+            case messages.Hello():
+                if request.version != icrl_dist.__version__:
+                    theirs, ours = request.version, icrl_dist.__version__
+                    raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
+                if request.code != version.digest():
+                    theirs, ours = request.code[:8], version.digest()[:8]
+                    raise ValueError(
+                        f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code"
+                    )
+                return wire.encode_message("hello", run=dumps(self._run))
+            case messages.Progress():
+                self._update_counters(fields)
+                return self._lease(worker)
+            case messages.Failed():
+                self._failed(worker, request.job, request.record, request.file)
+            case messages.Note():
+                self._report({"event": "note", "text": f"worker {worker}: {request.text[:200]}"})
+        return wire.encode_message("noted")
 
     def _lease(self, worker: str) -> bytes:
         if self._finished.is_set():

@@ -14,7 +14,8 @@ from icrl_dist.config.run import ConfigError, Deployment, parse
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
 from icrl_dist.models.weights import load_weights
-from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, newest_version, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, newest_version, version_file
+from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist.agent.shipped")))

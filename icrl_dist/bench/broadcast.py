@@ -25,7 +25,7 @@ from icrl_dist.config.sections import ModelConfig
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Query
+from icrl_dist.stream.link import Query, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Spec, Weights
 from learner.broadcast import Broadcast
@@ -112,7 +112,7 @@ class _OurBroadcast:
         self._reports: queue.SimpleQueue[Query] = queue.SimpleQueue()
         self._broadcasts = {size: Broadcast(link, Keys(f"bench-{size}"), _no_older_version) for size in WIDTHS}
         for size in WIDTHS:
-            link.serve(Keys(f"bench-{size}").work, self._reports.put)
+            link.serve(StreamKeys(f"bench-{size}").work, self._reports.put)
         for _ in WIDTHS:
             self._last(-1)
 

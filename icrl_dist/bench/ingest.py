@@ -26,7 +26,7 @@ import psutil
 from icrl_dist.bench.stream import KEYS, LIMIT, example
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import StreamConfig
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query
@@ -150,7 +150,7 @@ class _LearnerSide:
         """Trajectories per second into a new store, until the last one sent is stored."""
         folder = self._folder / f"turn-{next(self._numbers)}"
         stored: list[float] = []
-        with contextlib.closing(Store(folder, durable=durable)) as store:
+        with contextlib.closing(Dataset(folder, durable=durable)) as store:
             self._ingest = ingest = self._open(store, stored)
             began = time.monotonic()
             self._waiting.reply(b"%f" % seconds)
@@ -167,7 +167,7 @@ class _LearnerSide:
     def stop(self) -> None:
         self._waiting.reply(b"0")
 
-    def _open(self, store: Store, stored: list[float]) -> Ingest:
+    def _open(self, store: Dataset, stored: list[float]) -> Ingest:
         trajectory = example()
         size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
         spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))

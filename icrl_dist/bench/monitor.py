@@ -27,7 +27,6 @@ import psutil
 
 from icrl_dist.bench.training import need_alive, training
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 

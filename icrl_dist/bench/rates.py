@@ -34,10 +34,8 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry, splits
 from icrl_dist.results import evaluate
-from icrl_dist.storage.dataset import Store
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.training import batches, fit
 from icrl_dist.types import Job, Trajectory

@@ -23,9 +23,9 @@ import psutil
 
 from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config.run import ConfigError
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Keys, Refused, Unanswered
+from icrl_dist.stream.link import Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 from icrl_dist.types import Identity
@@ -54,8 +54,8 @@ def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3)
                 events.wait_for(trajectories)
                 learner_s, stored = _kill_the_learner(process, link, out)
         used = sum(file.stat().st_size for file in (out / "dataset").iterdir())
-        store = Store(out / "dataset", readonly=True)
-        raw = sum(a.nbytes for row in store.ledger for a in store.read(row.identity).arrays().values())
+        store = Dataset(out / "dataset", readonly=True)
+        raw = sum(a.nbytes for row in store.index for a in store.read(row.identity).arrays().values())
         found = len(store)
         store.close()
     return {
@@ -168,7 +168,7 @@ def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path
         except Unanswered:
             time.sleep(0.02)
     answered = time.monotonic() - began
-    store = Store(out / "dataset", readonly=True)
+    store = Dataset(out / "dataset", readonly=True)
     try:
         return answered, len(store)
     finally:

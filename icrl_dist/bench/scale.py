@@ -32,7 +32,7 @@ from icrl_dist.bench import ingest
 from icrl_dist.bench.stream import KEYS, LIMIT, example
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import StreamConfig
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.endpoints import parse
@@ -153,7 +153,7 @@ def _measure(folder: Path, count: int, seconds: float) -> dict[str, Any]:
     process = psutil.Process()
     stored: list[float] = []
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
-    with contextlib.closing(Store(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
+    with contextlib.closing(Dataset(folder)) as store, ZenohLink.listen("tcp/127.0.0.1:0") as link:
         ingest = _ingest(store, count, stored, failures)
         link.serve(KEYS.data, ingest.put)
         before = process.memory_info().rss
@@ -192,7 +192,7 @@ def _cpu(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def _ingest(store: Store, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
+def _ingest(store: Dataset, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
     trajectory = example()
     size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
     spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))

@@ -22,7 +22,7 @@ import numpy as np
 from actors import local
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.credit import CreditSender
-from icrl_dist.stream.link import Keys, Query
+from icrl_dist.stream.link import Query, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 
@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 CREDITS = 8
 LIMIT = 1 << 20
-KEYS = Keys("bench")
+KEYS = StreamKeys("bench")
 
 
 def example(trial: int = 0) -> Trajectory:

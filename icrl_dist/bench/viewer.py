@@ -19,7 +19,6 @@ from actors.publisher import PERIOD_S
 from icrl_dist.monitor.feed import PERIOD_S as SNAPSHOT_S
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Keys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 

@@ -1,1 +1,1 @@
-"""Faults on purpose: a run is disturbed on a seeded schedule and must end as if it had not been."""
+"""Fault injection: faults strike a run on a seeded schedule, and its digests must not change."""

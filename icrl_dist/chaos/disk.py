@@ -1,4 +1,4 @@
-"""A disk of a chosen size: a tmpfs that is a run folder, and can be made larger."""
+"""A disk of a chosen size: a tmpfs mounted as a run folder, which can be enlarged."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from types import TracebackType
 from typing import Self
 
 PAGE = 4096
-"""Bytes that a tmpfs takes at a time."""
+"""The unit in which a tmpfs allocates, bytes."""
 
 
 class NoDisk(RuntimeError):  # noqa: N818
-    """This machine lets us mount nothing."""
+    """This node does not allow a mount."""
 
 
 def allocated(folder: Path) -> int:
-    """Bytes that a folder's files take on a tmpfs."""
+    """Bytes that the files of a folder occupy on a tmpfs."""
     return sum(-(-file.stat().st_size // PAGE) * PAGE for file in folder.rglob("*") if file.is_file())
 
 
 class Disk:
-    """A tmpfs of ``size`` bytes mounted at ``folder``; what it held lies in ``folder`` after the end.
+    """A tmpfs of ``size`` bytes mounted at ``folder``; at the end its files are copied to ``folder``.
 
-    Root mounts it for all to see; others in a namespace of their own, where programs must be
-    started with ``prefix``, and whose files are seen at ``view``.
+    Root mounts it for all processes.  Other users mount it in a namespace: programs must be
+    started there with ``prefix``, and its files are visible at ``view``.
     """
 
     def __init__(self, folder: Path, size: int) -> None:
-        """Raises NoDisk if neither way is open."""
+        """Raises NoDisk if neither mount is allowed."""
         self.folder, self.view, self.prefix = folder, folder, list[str]()
         self._holder: subprocess.Popen[str] | None = None
         folder.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ class Disk:
             raise NoDisk(f"{error.filename} is missing") from None
 
     def _hold(self, mount: list[str], refusal: str) -> None:
-        """Mount it in a namespace, which lives as long as a process of ours in it."""
+        """Mount it in a namespace, which exists as long as the process that this starts in it."""
         script = '"$@" && echo mounted && exec cat'
         self._holder = subprocess.Popen(
             ["unshare", "-rm", "sh", "-c", script, "sh", *mount],
@@ -55,9 +55,9 @@ class Disk:
         )
         assert self._holder.stdout is not None and self._holder.stderr is not None
         if self._holder.stdout.readline().strip() != "mounted":
-            words = self._holder.stderr.read().strip()
+            output = self._holder.stderr.read().strip()
             self._release()
-            raise NoDisk(f"mount: {refusal}; unshare: {words}")
+            raise NoDisk(f"mount: {refusal}; unshare: {output}")
         pid = str(self._holder.pid)
         self.prefix = ["nsenter", "-t", pid, "-U", "-m", "--preserve-credentials", "--", "env", "-C", str(Path.cwd())]
         self.view = Path("/proc", pid, "root", *self.folder.absolute().parts[1:])
@@ -84,7 +84,7 @@ class Disk:
         self._holder.wait()
 
     def grow(self, size: int) -> None:
-        """Make it ``size`` bytes large."""
+        """Enlarge it to ``size`` bytes."""
         subprocess.run(
             [*self.prefix, "mount", "--options-mode", "ignore", "-o", f"remount,size={size}", str(self.folder)], check=True
         )

@@ -1,4 +1,4 @@
-"""The eight faults: each disturbs one training, lets it finish, and says what shows that it landed."""
+"""The eight faults: each strikes one training, waits for its end, and returns the evidence that it landed."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ import psutil
 from icrl_dist.chaos.disk import PAGE, Disk
 from icrl_dist.chaos.proxy import Proxy
 from icrl_dist.chaos.schedule import Strike
-from icrl_dist.chaos.training import Broken, Training, gone
+from icrl_dist.chaos.training import Training, TrainingFailed, gone
 from icrl_dist.storage import segment
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import endpoints
 
 STOP_S, CUT_S = 15.0, 12.0
-"""How long the learner is stopped, and the link cut: beyond ``stream.reply_timeout_s``."""
+"""Durations of a stopped learner and of a cut link, longer than ``stream.reply_timeout_s``."""
 
 
 @dataclass(frozen=True)
 class Struck:
-    """What a fault did."""
+    """The effect of a fault."""
 
     where: str
-    """How far the run was."""
+    """The run's progress when it struck."""
     landed: bool
     evidence: str
     result: dict[str, Any]
-    """The run's, at its end."""
+    """The run's ``result.json``."""
 
 
 class Missed(Exception):  # noqa: N818
     """The strike found nothing to hit; the message says why."""
 
 
-def kill_worker(training: Training, strike: Strike, room: int) -> Struck:
-    """SIGKILL of a drawn worker; another takes its place."""
+def kill_worker(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGKILL of a random worker, which is replaced."""
     training.start()
     where = _reach(training, strike)
     workers = training.workers()
@@ -54,8 +54,8 @@ def kill_worker(training: Training, strike: Strike, room: int) -> Struck:
     return Struck(where, bool(deaths) and gone(victim), f"process {victim.pid} is gone, worker deaths: {deaths}", result)
 
 
-def kill_learner(training: Training, strike: Strike, room: int) -> Struck:
-    """SIGKILL of the learner, while it collects or fits; it starts again from its checkpoint and its dataset."""
+def kill_learner(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGKILL of the learner during collection or a fit; it restarts from its checkpoint and its dataset."""
     training.start()
     where = _reach(training, strike)
     victim = _learner(training)
@@ -65,32 +65,32 @@ def kill_learner(training: Training, strike: Strike, room: int) -> Struck:
     return Struck(where, bool(deaths) and gone(victim), f"process {victim.pid} is gone, learner deaths: {deaths}", result)
 
 
-def kill_tree(training: Training, strike: Strike, room: int) -> Struck:
-    """SIGKILL of every process at once, then ``--resume``."""
+def kill_tree(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGKILL of all processes at once, then ``--resume``."""
     where, killed = _kill_all(training, strike)
     result = _resume(training)
     return Struck(where, True, f"all of {killed} processes gone, resumed", result)
 
 
-def stop_learner(training: Training, strike: Strike, room: int) -> Struck:
-    """SIGSTOP of the learner for 15 s: longer than a worker waits for an answer."""
+def stop_learner(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGSTOP of the learner for 15 s, longer than a worker waits for a reply."""
     training.start()
     where = _reach(training, strike)
     learner = _learner(training)
     learner.suspend()
     try:
         time.sleep(STOP_S)
-        stood = learner.status() == psutil.STATUS_STOPPED
+        stopped = learner.status() == psutil.STATUS_STOPPED
     finally:
         learner.resume()
     result = training.result()
     return Struck(
-        where, stood and result["resent"] > 0, f"stopped: {stood}, trajectories sent again: {result['resent']}", result
+        where, stopped and result["resent"] > 0, f"stopped: {stopped}, trajectories sent again: {result['resent']}", result
     )
 
 
-def cut_link(training: Training, strike: Strike, room: int) -> Struck:
-    """Nothing passes between workers and learner for 12 s, and neither side is told."""
+def cut_link(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """No data passes between workers and learner for 12 s, and no connection is closed."""
     protocol = endpoints.parse(training.run.stream.endpoint).protocol
     with Proxy(training.target) as proxy:
         training.start("--stream.connect", f"{protocol}/127.0.0.1:{proxy.port}")
@@ -102,54 +102,56 @@ def cut_link(training: Training, strike: Strike, room: int) -> Struck:
         result = training.result()
         after = training.output[printed:]
     back, resent = after.count("is back"), result["resent"]
-    evidence = f"{before >> 10} KiB passed before; sent again: {resent}, workers seen gone and back: {back}"
+    evidence = f"{before >> 10} KiB passed before; sent again: {resent}, workers that left and came back: {back}"
     return Struck(where, before > 0 and (resent > 0 or back > 0), evidence, result)
 
 
-def torn_tail(training: Training, strike: Strike, room: int) -> Struck:
-    """A power cut amid an append: everything dies, and the newest segment ends in half a frame."""
+def torn_tail(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """A power cut during an append: all processes die, and the newest segment ends in half a frame."""
     where, _ = _kill_all(training, strike)
     path = training.segments()[-1] if training.segments() else training.folder
     found = segment.scan(path) if path.is_file() else segment.Scan()
     if found.sealed or not found.frames:
-        raise Missed(f"{path.name} had no open end")
+        raise Missed(f"{path.name} was sealed or empty")
     offset, length = found.frames[-1]
     start = offset - segment.HEADER_BYTES
-    whole = path.read_bytes()
+    content = path.read_bytes()
     cut = 1 + int(strike.place * (segment.HEADER_BYTES + length - 2))
-    if strike.odd:
-        path.write_bytes(whole + whole[start : start + cut])
-        did = f"{path.name}: {cut} bytes of a frame added"
+    if strike.variant:
+        path.write_bytes(content + content[start : start + cut])
+        change = f"{path.name}: {cut} bytes of a frame added"
     else:
-        os.truncate(path, len(whole) - cut)
-        did = f"{path.name}: {cut} bytes of the last frame cut off"
+        os.truncate(path, len(content) - cut)
+        change = f"{path.name}: {cut} bytes of the last frame cut off"
     result = _resume(training)
-    landed = f"{path.name}: cut a torn tail of" in training.output and result["repaired"] > 0
-    return Struck(where, landed, f"{did}, repaired: {result['repaired']}", result)
+    landed = f"{path.name}: cut off a torn tail of" in training.output and result["repaired"] > 0
+    return Struck(where, landed, f"{change}, repaired: {result['repaired']}", result)
 
 
-def flip_byte(training: Training, strike: Strike, room: int) -> Struck:
-    """One byte of a sealed segment changes, in a killed run that is resumed, or under a run that is on."""
-    if strike.odd:
+def flip_byte(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """One byte of a sealed segment changes, in a killed run that is then resumed, or during a run."""
+    if strike.variant:
         training.start()
         where = _reach(training, strike)
     else:
         where, _ = _kill_all(training, strike)
-    did, path = _flip(training, strike)
-    result = training.result() if strike.odd else _resume(training)
-    landed = f"{path.name}: took out" in training.output and result["repaired"] > 0
-    how = "while the run was on" if strike.odd else "then resumed"
-    return Struck(where, landed, f"{did} {how}, repaired: {result['repaired']}", result)
+    change, path = _flip(training, strike)
+    result = training.result() if strike.variant else _resume(training)
+    landed = f"{path.name}: removed" in training.output and result["repaired"] > 0
+    how = "during the run" if strike.variant else "then resumed"
+    return Struck(where, landed, f"{change} {how}, repaired: {result['repaired']}", result)
 
 
 def _flip(training: Training, strike: Strike) -> tuple[str, Path]:
-    """Change one byte of a sealed segment; says which."""
+    """Change one byte of a sealed segment; returns a description and the segment."""
     sealed = [(path, found) for path in training.segments() if (found := segment.scan(path)).sealed]
     if not sealed:
         raise Missed("no segment was sealed yet")
     path, found = sealed[strike.worker % len(sealed)]
-    first = found.frames[0][0] - segment.HEADER_BYTES if strike.odd else 0  # what a run that is on reads again
-    place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.odd else 0) - first))
+    first = (
+        found.frames[0][0] - segment.HEADER_BYTES if strike.variant else 0
+    )  # during a run only the trajectories are read again
+    place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.variant else 0) - first))
     with path.open("r+b") as file:
         file.seek(place)
         (byte,) = file.read(1)
@@ -160,7 +162,7 @@ def _flip(training: Training, strike: Strike) -> tuple[str, Path]:
 
 
 def _readable(path: Path) -> int:
-    """How many trajectories of a segment are whole, and their names too."""
+    """The number of intact trajectories of a segment whose names are intact too."""
     found, count = segment.scan(path), 0
     with path.open("rb") as file:
         for offset, length in found.frames:
@@ -171,27 +173,26 @@ def _readable(path: Path) -> int:
     return count
 
 
-def full_disk(training: Training, strike: Strike, room: int) -> Struck:
-    """The run folder is a disk that fills up; the run ends with the remedy, which is then followed."""
-    size = int((0.1 + 0.9 * strike.place) * room) // PAGE * PAGE
+def full_disk(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """The disk of the run folder fills up; the run ends with a remedy, which is then applied."""
+    size = int((0.1 + 0.9 * strike.place) * disk_bytes) // PAGE * PAGE
     with Disk(training.folder, size) as disk:
         training.prefix, training.view = disk.prefix, disk.view
         try:
             training.start()
             code = training.wait()
-            words = training.output
-            lines = [line for line in words.splitlines() if "No space left on device" in line]
+            output = training.output
+            lines = [line for line in output.splitlines() if "No space left on device" in line]
             if code == 0:
-                raise Missed(f"the run fitted on a disk of {size >> 10} KiB")
-            if code != 1 or len(lines) != 1 or "free space, then use --resume" not in lines[0] or "Traceback" in words:
-                raise Broken(
-                    f"on a full disk: exit code {code}, {len(lines)} lines on it, and at last: {words.splitlines()[-1]}"
-                )
-            store = Store(training.view / "dataset", readonly=True)
-            stored = len(store)
-            store.close()
+                raise Missed(f"the run did not fill a disk of {size >> 10} KiB")
+            if code != 1 or len(lines) != 1 or "free space, then use --resume" not in lines[0] or "Traceback" in output:
+                last = output.splitlines()[-1]
+                raise TrainingFailed(f"on a full disk: exit code {code}, {len(lines)} lines about it; the last line: {last}")
+            dataset = Dataset(training.view / "dataset", readonly=True)
+            stored = len(dataset)
+            dataset.close()
             where = f"disk of {size >> 10} KiB, {stored} trajectories stored"
-            disk.grow(4 * room + (64 << 20))
+            disk.grow(4 * disk_bytes + (64 << 20))
             result = _resume(training)
         finally:
             training.kill()
@@ -232,7 +233,7 @@ def _kill_all(training: Training, strike: Strike) -> tuple[str, int]:
     where = _reach(training, strike)
     count = len(training.tree())
     if left := training.kill():
-        raise Broken(f"{len(left)} processes outlived SIGKILL, such as {left[0].pid}")
+        raise TrainingFailed(f"{len(left)} processes are alive after SIGKILL, such as {left[0].pid}")
     if training.finished():
         raise Missed("the run had ended")
     return where, count

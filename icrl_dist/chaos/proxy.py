@@ -1,4 +1,4 @@
-"""A TCP proxy that can go silent, as a cut cable does: nothing passes, and nobody is told."""
+"""A TCP proxy that can stop forwarding, like a cut cable: no data passes and no connection is closed."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ _POLL_S = 0.1
 
 
 class Proxy:
-    """Forwards every connection to ``target()``, both ways, except while it is cut."""
+    """Forwards every connection to ``target()``, in both directions, except while it is cut."""
 
     def __init__(self, target: Callable[[], tuple[str, int] | None]) -> None:
         """Listens on a free port of 127.0.0.1.
 
-        ``target`` tells host and port for each new connection; None closes the connection.
+        ``target`` returns host and port for each new connection; None closes the connection.
         """
         self._target = target
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self.forwarded = 0
-        """Bytes passed on so far."""
-        self._passing = threading.Event()
-        self._passing.set()
+        """Bytes forwarded so far."""
+        self._forwarding = threading.Event()
+        self._forwarding.set()
         self._closed = False
         self._sockets: set[socket.socket] = set()
         self._lock = threading.Lock()
@@ -39,7 +39,7 @@ class Proxy:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._closed = True
-        self._passing.set()
+        self._forwarding.set()
         with self._lock:
             for one in (*self._sockets, self._listener):
                 with contextlib.suppress(OSError):
@@ -47,21 +47,21 @@ class Proxy:
                 one.close()
 
     def cut(self) -> None:
-        """Pass nothing on and accept nobody; open connections stay open and silent."""
-        self._passing.clear()
+        """Stop forwarding and accepting connections; open connections stay open."""
+        self._forwarding.clear()
 
     def mend(self) -> None:
-        """Pass everything on again, first what was on its way."""
-        self._passing.set()
+        """Forward again, first the data that was held back."""
+        self._forwarding.set()
 
     def _accept(self) -> None:
         while not self._closed:
-            self._passing.wait()
+            self._forwarding.wait()
             try:
-                if not select.select([self._listener], [], [], _POLL_S)[0] or not self._passing.is_set():
+                if not select.select([self._listener], [], [], _POLL_S)[0] or not self._forwarding.is_set():
                     continue
                 near, _ = self._listener.accept()
-            except (OSError, ValueError):  # closed meanwhile
+            except (OSError, ValueError):  # the proxy was closed
                 return
             threading.Thread(target=self._join, args=(near,), name="proxy connection", daemon=True).start()
 
@@ -88,13 +88,13 @@ class Proxy:
         far.close()
 
     def _pump(self, source: socket.socket, target: socket.socket) -> None:
-        """One way of a connection, until one of its ends is gone: then the other learns of it."""
+        """Forward one direction of a connection until one end closes; then close the other."""
         with contextlib.suppress(OSError):
             while content := source.recv(_CHUNK):
-                self._passing.wait()
+                self._forwarding.wait()
                 target.sendall(content)
                 self.forwarded += len(content)
-        self._passing.wait()
+        self._forwarding.wait()
         for one in (source, target):
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)

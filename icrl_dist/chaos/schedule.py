@@ -1,4 +1,4 @@
-"""When and where each fault strikes: a function of a seed, and of nothing else."""
+"""When and where each fault strikes, as a function of a seed."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ FAULTS = {
     "stop-learner": "SIGSTOP of the learner for 15 s",
     "cut-link": "the link between workers and learner cut for 12 s",
     "torn-tail": "kill-tree, and the newest segment ends in half a frame",
-    "flip-byte": "a byte of a sealed segment changes, after kill-tree or while the run is on",
-    "full-disk": "a run folder too small for the run, made larger, then --resume",
+    "flip-byte": "a byte of a sealed segment changes, after kill-tree or during the run",
+    "full-disk": "a disk too small for the run, enlarged, then --resume",
 }
-"""Every fault, and what it is."""
+"""Every fault with its description."""
 
 _AFTER = (0.1, 0.5)
-"""A strike falls after this share of a phase, at least and at most: what it hits is under way then."""
+"""Range of the share of a phase after which a strike falls, so that it interrupts the phase."""
 
 
 @dataclass(frozen=True)
 class Strike:
-    """One fault's drawn numbers."""
+    """The drawn parameters of one fault."""
 
     fault: str
     phase: int
-    """Which phase of the run, counted from 0."""
+    """Number of the run's phase, from 0."""
     name: str
     """That phase's name, such as ``adapt/0``."""
     fit: bool
-    """Whether it strikes in the phase's fit, else while trajectories are collected."""
+    """Whether it strikes during the phase's fit; otherwise during collection."""
     after: int
-    """Trajectories of the phase heard before, or steps of its fit."""
+    """Trajectories of the phase, or steps of its fit, before the strike."""
     of: int
-    """Trajectories of the phase, or steps of its fit, in all."""
+    """All trajectories of the phase, or all steps of its fit."""
     worker: int
-    """Which worker, counted round and round."""
+    """Number of the worker, modulo the number of workers."""
     place: float
-    """Where in a segment, a frame, or how large a disk: a share."""
-    odd: bool
-    """Which of two ways: a tail cut off or half a frame added, a byte changed in a live or in a killed run."""
+    """Place in a segment or a frame, or size of the disk, as a share."""
+    variant: bool
+    """Variant: half a frame added (else a tail cut off), a byte changed during the run (else after a kill)."""
 
     def __str__(self) -> str:
         where = f"fit of {self.name}, step" if self.fit else self.name
@@ -53,20 +53,20 @@ class Strike:
 
 
 def draw(run: Run, seed: int, fault: str, attempt: int = 0) -> Strike:
-    """The strike of one fault; a new ``attempt`` draws anew.
+    """The strike of one fault; another ``attempt`` gives another strike.
 
-    Raises ConfigError for a fault that this run gives no chance to.
+    Raises ConfigError for a fault that cannot strike this run.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(list(FAULTS).index(fault), attempt)))
     method = methods.of(run)
     phases = method.phases(run)
     first = 1 if fault == "flip-byte" else 0
     if first >= len(phases):
-        raise ConfigError(f"--faults {fault}: {run.method} has one phase, and its segment is sealed at the end; leave it out")
+        raise ConfigError(f"--faults {fault}: {run.method} has one phase, and seals its segment at the end; list others")
     number = int(rng.integers(first, len(phases)))
     phase = phases[number]
     share, place = rng.uniform(*_AFTER), float(rng.random())
-    worker, odd = int(rng.integers(1 << 16)), bool(rng.integers(2))
-    fit = fault == "kill-learner" and odd and phase.steps > 1
+    worker, variant = int(rng.integers(1 << 16)), bool(rng.integers(2))
+    fit = fault == "kill-learner" and variant and phase.steps > 1
     of = phase.steps if fit else sum(job.trials * len(job.variations) for job in method.ask(run, phase))
-    return Strike(fault, number, f"{phase.stage}/{phase.round}", fit, max(1, round(share * of)), of, worker, place, odd)
+    return Strike(fault, number, f"{phase.stage}/{phase.round}", fit, max(1, round(share * of)), of, worker, place, variant)

@@ -1,4 +1,4 @@
-"""A training under observation: ``icrl-dist train`` as a process, all that it starts, and how far it is."""
+"""A training as a process: ``icrl-dist train``, all processes that it starts, and its progress."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from icrl_dist.chaos.schedule import Strike
 from icrl_dist.config.run import Run
 from icrl_dist.methods import registry as methods
 from icrl_dist.stream import monitor_messages, security, wire
-from icrl_dist.stream.link import Keys, LinkError
+from icrl_dist.stream.link import LinkError, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
 _POLL_S = 0.02
-_LOOK_S = 2.0
-"""The tree is looked at so often, so that none of it is lost sight of when its parent ends."""
+_LIST_S = 2.0
+"""Interval at which child processes are listed, so that all are known when their parent ends, seconds."""
 
 
-class Broken(RuntimeError):  # noqa: N818
-    """The run did not end as it should have; the message says how."""
+class TrainingFailed(RuntimeError):  # noqa: N818
+    """The run ended with an error or did not end; the message says how."""
 
 
 def gone(process: psutil.Process) -> bool:
-    """Whether a process is dead, even if nobody has asked for its exit code yet."""
+    """Whether a process is dead, even if its parent has not read its exit code yet."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
     return True
@@ -44,10 +44,10 @@ class Training:
     """One ``icrl-dist train``; its terminal output goes to a file beside the run folder."""
 
     def __init__(self, name: str, run: Run, settings: Sequence[str], folder: Path, actors: int, limit_s: float) -> None:
-        """``name`` and ``settings`` are the command's RUN and ``--set``; it is ended after ``limit_s``."""
+        """``name`` and ``settings`` are the command's RUN and ``--set``; it is killed after ``limit_s``."""
         self.run, self.folder, self.view, self._limit_s = run, folder, folder, limit_s
         self.prefix: list[str] = []
-        """What the command is started with, if its files are to be seen elsewhere (``view``)."""
+        """Words before the command, for a run folder that is visible at ``view`` (see ``Disk``)."""
         self.log = folder.with_name(f"{folder.name}.log")
         words = [name, *(word for setting in settings for word in ("--set", setting))]
         self._command = [sys.executable, "-m", "icrl_dist.cli", "train", *words, "--out", str(folder), "--actors", str(actors)]
@@ -61,55 +61,55 @@ class Training:
         self.kill()
 
     def start(self, *options: str) -> None:
-        """Start it, as with ``--resume``; once the one before has ended."""
+        """Start the command with further options, such as ``--resume``; an earlier one must have ended."""
         with self.log.open("ab") as log:
             command = [*self.prefix, *self._command, *options]
             log.write(f"$ {' '.join(command)}\n".encode())
             log.flush()
             self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         self._deadline = time.monotonic() + self._limit_s
-        self._looked = 0.0
+        self._listed = 0.0
 
     @property
     def output(self) -> str:
-        """All that it printed so far, in all of its lives."""
+        """Everything that it has printed, in all starts."""
         return self.log.read_text(errors="replace")
 
     def ended(self) -> bool:
-        """Whether it is over.  Raises Broken when it takes longer than its limit."""
+        """Whether the command has ended.  Raises TrainingFailed after its time limit."""
         assert self._process is not None
-        if time.monotonic() - self._looked > _LOOK_S:
+        if time.monotonic() - self._listed > _LIST_S:
             self.tree()
         if self._process.poll() is not None:
             return True
         if time.monotonic() > self._deadline:
-            raise Broken(f"the run did not end within {self._limit_s:.0f} s")
+            raise TrainingFailed(f"the run did not end within {self._limit_s:.0f} s")
         return False
 
     def wait(self) -> int:
-        """Its exit code, once it has ended.  Raises Broken as ``ended`` does."""
+        """Wait for its end and return the exit code.  Raises TrainingFailed as ``ended`` does."""
         assert self._process is not None
         while not self.ended():
             time.sleep(_POLL_S)
         return self._process.returncode
 
     def result(self) -> dict[str, Any]:
-        """Wait for its end; what it left in ``result.json``.  Raises Broken unless it ended well."""
+        """Wait for its end and return ``result.json``.  Raises TrainingFailed for an exit code other than 0."""
         code = self.wait()
         if code:
-            words = [line for line in self.output.splitlines() if line.strip()]
-            raise Broken(f"exit code {code}: {words[-1]}")
+            lines = [line for line in self.output.splitlines() if line.strip()]
+            raise TrainingFailed(f"exit code {code}: {lines[-1]}")
         found: dict[str, Any] = json.loads((self.view / "result.json").read_text())
         return found
 
     def finished(self) -> bool:
-        """Whether it left a result."""
+        """Whether it has written a result."""
         return (self.view / "result.json").exists()
 
     def tree(self) -> list[psutil.Process]:
-        """Every process of it, parents before children."""
+        """Its living processes, parents before children."""
         assert self._process is not None
-        self._looked = time.monotonic()
+        self._listed = time.monotonic()
         with contextlib.suppress(psutil.NoSuchProcess):
             root = psutil.Process(self._process.pid)
             found = [root, *root.children(recursive=True)]
@@ -118,19 +118,19 @@ class Training:
         return []
 
     def workers(self) -> list[psutil.Process]:
-        """The workers' processes, by age."""
+        """Its worker processes, oldest first."""
         return sorted((p for p in self.tree() if is_worker(p)), key=lambda p: p.create_time())
 
     def learner(self) -> psutil.Process | None:
-        """The learner's process, if there is one."""
+        """Its learner process, if there is one."""
         return next((p for p in self.tree() if is_learner(p)), None)
 
     def kill(self) -> list[psutil.Process]:
-        """SIGKILL everything at one stroke; returns what is left of it."""
+        """SIGKILL all processes at once; returns those that are still alive."""
         if self._process is None:
             return []
         stopped: set[psutil.Process] = set()
-        while fresh := set(self.tree()) - stopped:  # nobody starts anybody, nor notices, meanwhile
+        while fresh := set(self.tree()) - stopped:  # stopped processes start no others and react to nothing
             for process in fresh:
                 with contextlib.suppress(psutil.NoSuchProcess):
                     process.suspend()
@@ -145,61 +145,61 @@ class Training:
         return left
 
     def reach(self, strike: Strike) -> str:
-        """Wait until the strike is due, as heard on the monitor plane; where the run is then, empty if it ended before."""
+        """Wait until the monitor plane shows that the strike is due; the run's progress then, empty if it has ended before."""
         endpoint = self.folder / "endpoint"
         while not (endpoint.exists() and endpoint.read_text().strip()):
             if self.ended():
                 return ""
             time.sleep(_POLL_S)
-        ear = _Ear(self.run, strike)
+        progress = _ProgressCounter(self.run, strike)
         certificates = security.client(self.run.stream.certificates, "monitor")
         try:
             with ZenohLink.connect(endpoint.read_text().strip(), 30.0, certificates) as link:
-                link.subscribe(Keys(self.folder.name).monitor_all, ear.hear)
-                while not ear.due.wait(_POLL_S):
+                link.subscribe(StreamKeys(self.folder.name).monitor_all, progress.on_message)
+                while not progress.due.wait(_POLL_S):
                     if self.ended():
                         return ""
-                return ear.where
+                return progress.where
         except LinkError as error:
             if self.wait() == 0:
                 return ""
-            raise Broken(str(error)) from None
+            raise TrainingFailed(str(error)) from None
 
     def target(self) -> tuple[str, int] | None:
-        """Where its learner listens now, for a proxy."""
+        """Host and port at which its learner listens, for the proxy."""
         with contextlib.suppress(OSError, ValueError):
             host, _, port = (self.view / "endpoint").read_text().strip().partition("/")[2].rpartition(":")
             return host.strip("[]"), int(port)
         return None
 
     def segments(self) -> list[Path]:
-        """Its sealed segments and the newest one, oldest first."""
+        """Its segment files, oldest first."""
         return sorted((self.view / "dataset").glob("segment-*.frames"))
 
 
-class _Ear:
-    """Counts what the monitor plane tells, until a strike is due."""
+class _ProgressCounter:
+    """Counts messages of the monitor plane until a strike is due."""
 
     def __init__(self, run: Run, strike: Strike) -> None:
         self._order = {f"{phase.stage}/{phase.round}": n for n, phase in enumerate(methods.of(run).phases(run))}
         self._strike = strike
-        self._heard: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self.where = ""
         self.due = threading.Event()
 
-    def hear(self, key: str, payload: bytes) -> None:
-        """One message of the monitor plane."""
+    def on_message(self, key: str, payload: bytes) -> None:
+        """Count one message of the monitor plane."""
         kind, fields = wire.decode_message(payload)
         if kind == "trajectories":
             for one in monitor_messages.rows(fields):
                 name = "/".join(one["identity"].split("/")[:2])
-                self._heard[name] += 1
-                self._note(name, False, self._heard[name])
+                self._counts[name] += 1
+                self._check(name, False, self._counts[name])
         elif kind == "learner" and fields["stage"] == "fit":
-            self._note(f"{fields['phase']}/{fields['round']}", True, fields["step"])
+            self._check(f"{fields['phase']}/{fields['round']}", True, fields["step"])
 
-    def _note(self, name: str, fit: bool, count: int) -> None:
+    def _check(self, name: str, fit: bool, count: int) -> None:
         strike = self._strike
         if not self.due.is_set() and (self._order[name], fit, count) >= (strike.phase, strike.fit, strike.after):
-            self.where = f"fit of {name}, step {count}" if fit else f"{name}, {count} heard"
+            self.where = f"fit of {name}, step {count}" if fit else f"{name}, {count} trajectories"
             self.due.set()

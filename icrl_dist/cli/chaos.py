@@ -47,7 +47,7 @@ class ChaosArguments:
 def chaos(arguments: ChaosArguments, console: Console) -> int:
     """Run the campaign.  Returns FAILED if a fault had no effect or changed a digest, else OK."""
     from icrl_dist.chaos.campaign import Campaign
-    from icrl_dist.chaos.training import Broken
+    from icrl_dist.chaos.training import TrainingFailed
     from icrl_dist.launch.learner_process import TrainFailed
 
     if arguments.seeds < 1 or arguments.actors < 1:
@@ -56,7 +56,7 @@ def chaos(arguments: ChaosArguments, console: Console) -> int:
     with Campaign(arguments.run, arguments.set, arguments.actors, arguments.out, console) as campaign:
         try:
             answer = campaign.run(arguments.faults, seeds, arguments.reference)
-        except Broken as error:
+        except TrainingFailed as error:
             raise TrainFailed(f"undisturbed: {error}") from None
     if arguments.json:
         print(json.dumps(answer))

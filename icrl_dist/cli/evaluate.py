@@ -52,7 +52,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     from icrl_dist.console.display import Display
     from icrl_dist.methods import registry as methods
     from icrl_dist.results import heldout
-    from icrl_dist.storage.files import load_checkpoint
+    from icrl_dist.storage.checkpoint import load_checkpoint
 
     what, folder = _source_and_report(arguments)
     checkpoint = load_checkpoint(checkpoint_file(what))

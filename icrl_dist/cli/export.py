@@ -31,7 +31,7 @@ def export(arguments: ExportArguments, console: Console) -> int:
     from icrl_dist.agent.loading import checkpoint_file, is_slim, slim
     from icrl_dist.console.display import Display
     from icrl_dist.results import heldout
-    from icrl_dist.storage.files import save_checkpoint
+    from icrl_dist.storage.checkpoint import save_checkpoint
 
     source = checkpoint_file(arguments.what)
     out = arguments.out or (arguments.what if arguments.what.is_dir() else source.parent) / "agent.npz"

@@ -14,8 +14,8 @@ from icrl_dist.collect import kinds
 from icrl_dist.config.run import ConfigError, Run, load
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import load_checkpoint, newest_version
+from icrl_dist.storage.checkpoint import load_checkpoint, newest_version
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import wire
@@ -29,7 +29,7 @@ def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, 
     """
     store, lineage = _open(folder)
     try:
-        row = store.ledger[identity]
+        row = store.index[identity]
         trajectory = store.read(identity)
     except KeyError:
         raise ConfigError(f"{folder}: has no trajectory {identity}; `icrl-dist explain {folder}` lists all of them") from None
@@ -60,7 +60,7 @@ def ledger(folder: Path) -> Iterator[dict[str, Any]]:
     """The ledger as dictionaries, one per trajectory of a run, in canonical order."""
     store, lineage = _open(folder)
     try:
-        for row in store.ledger:
+        for row in store.index:
             yield ledger_line(row, lineage.run_of(row.identity.next_version).seed)
     finally:
         store.close()
@@ -112,11 +112,11 @@ def describe(answer: dict[str, Any]) -> str:
     return "\n".join(f"{name:<12} {fact}" for name, fact in facts.items())
 
 
-def _open(folder: Path) -> tuple[Store, Lineage]:
+def _open(folder: Path) -> tuple[Dataset, Lineage]:
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"{folder}: no such run folder")
     run = load(str(folder / "run.toml"))
-    return Store(folder / "dataset", readonly=True), Lineage.of(folder, run)
+    return Dataset(folder / "dataset", readonly=True), Lineage.of(folder, run)
 
 
 def _describe(part: Task | Adversary) -> str:

@@ -15,7 +15,8 @@ from jaxtyping import Float32
 
 from icrl_dist import version
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import wire
 from icrl_dist.types import Variation
 

@@ -24,7 +24,8 @@ from icrl_dist.experts.delivery import Act, delivered, labelled, lead, scripted
 from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.interfaces import Batch, Problem, Progress, no_progress
 from icrl_dist.rollout.recorder import Recorder
-from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Job, Trajectory, Variation
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.storage.files import StoreError, held, hold, newest_version
+from icrl_dist.storage.checkpoint import newest_version
+from icrl_dist.storage.files import StoreError, held, hold
 
 ReportEvent = Callable[[dict[str, Any]], None]
 """Shows one event of a run, such as ``{"event": "note", "text": ...}``."""

@@ -26,7 +26,7 @@ from icrl_dist.launch.run_folder import FolderTransaction, ReportEvent
 from icrl_dist.storage.files import atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 
 
 class TrainInterrupted(Exception):  # noqa: N818
@@ -46,7 +46,7 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
         raise ConfigError(f"--resume --overwrite: one continues the run in {folder}, the other replaces it; leave one out")
     run_folder.check_place(folder, source[0] if source else None)
     try:
-        Keys(folder.name)
+        StreamKeys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
     run_folder.recover(folder)

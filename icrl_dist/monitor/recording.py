@@ -19,10 +19,10 @@ from typing import Any
 
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.methods import registry as methods
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry.about import about
 
 _HEARTBEAT_S = 1.0
@@ -41,10 +41,10 @@ class Recording:
         """Raises ConfigError if the folder is not a run folder, or contains nothing to play."""
         if not (folder / "run.toml").is_file():
             raise ConfigError(f"{folder}: not a run folder (no run.toml); name a run folder, or a live run with --connect")
-        self._run, self._folder, self._keys = load(str(folder / "run.toml")), folder, Keys(folder.absolute().name)
+        self._run, self._folder, self._keys = load(str(folder / "run.toml")), folder, StreamKeys(folder.absolute().name)
         self._rows = sorted(_read(folder / "metrics.jsonl"), key=lambda row: float(row["time"]))
-        self._store = Store(folder / "dataset", readonly=True)
-        self._ordered = sorted(self._store.ledger, key=lambda row: (row.segment, row.offset))
+        self._store = Dataset(folder / "dataset", readonly=True)
+        self._ordered = sorted(self._store.index, key=lambda row: (row.segment, row.offset))
         if not self._rows or not self._ordered:
             self._store.close()
             raise ConfigError(

@@ -25,8 +25,9 @@ from icrl_dist.problems import registry
 from icrl_dist.results import evaluate, plots
 from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import Checkpoint, atomic_write, load_checkpoint, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Variation
 
 
@@ -159,7 +160,7 @@ def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | i
 
 def show_experts(folder: Path, console: Console) -> dict[str, Any]:
     """Print what each expert's first and last recorded episode returned; returns the rows."""
-    data = Store(folder / "dataset", readonly=True)
+    data = Dataset(folder / "dataset", readonly=True)
     rows = []
     for key in data.variations("pretrain", 0):
         trials = data.trials(key)

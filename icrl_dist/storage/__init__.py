@@ -1,1 +1,1 @@
-"""The run folder on disk: segments, index, dataset, checkpoints, forks."""
+"""The run folder on disk: segments, index, dataset, checkpoints, forks, the lock."""

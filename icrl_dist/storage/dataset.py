@@ -1,6 +1,6 @@
-"""A run's dataset: append-only segments on disk, mended when they are opened, and their ledger.
+"""A run's dataset: append-only segment files, repaired when they are opened, and an index of them.
 
-Nothing here is pickled, so opening a stranger's run executes none of their code.
+Nothing is pickled, so opening the dataset of an untrusted run executes no code of it.
 """
 
 from __future__ import annotations
@@ -16,26 +16,27 @@ from typing import Any
 
 from icrl_dist.storage import segment
 from icrl_dist.storage.files import StoreError, atomic_write, sync_folder, unwritten
-from icrl_dist.storage.index import Ledger, Row
+from icrl_dist.storage.index import Index, Row
 from icrl_dist.types import Identity, Trajectory
 
 _PATTERN = "segment-*.frames"
 
 
 class Damaged(StoreError):  # noqa: N818
-    """Bytes that changed after they were written; ``Store.repair`` takes them out."""
+    """Bytes changed after they were written; ``Dataset.repair`` removes them."""
 
 
-class Store:
-    """A run's dataset: appended to by one process, durable when ``append`` returns.
+class Dataset:
+    """A run's dataset: one process appends to it, and trajectories are durable when ``append`` returns.
 
-    Opened to be written, it mends what a crash or a disk did to it; ``repaired`` says what.
+    Unless it is opened ``readonly``, damage by a crash or a disk is removed on opening;
+    ``repaired`` lists what was removed.
     """
 
     def __init__(self, folder: Path, seal_bytes: int = 256 << 20, durable: bool = True, readonly: bool = False) -> None:
-        """``readonly`` changes nothing on disk; ``durable=False`` leaves the fsync out, to measure its cost.
+        """``readonly`` changes nothing on disk; ``durable=False`` omits the fsync, to measure its cost.
 
-        Raises StoreError for files that are not of this system, or that cannot be written.
+        Raises StoreError for files of another format, and for files that cannot be written.
         """
         self.folder, self._seal_bytes, self._durable, self._readonly = folder, seal_bytes, durable, readonly
         self._lock = threading.RLock()
@@ -45,7 +46,7 @@ class Store:
         if not self._readonly:
             self.folder.mkdir(parents=True, exist_ok=True)
         self.repaired: list[str] = []
-        self.ledger = Ledger()
+        self.index = Index()
         self._names: dict[int, segment.Names] = {}
         self._sealed: dict[int, str] = {}
         self._readers: dict[int, int] = {}
@@ -53,43 +54,43 @@ class Store:
         self._hash = hashlib.sha256()
         paths = sorted(self.folder.glob(_PATTERN))
         for path in paths:
-            self._take_up(path, last=path == paths[-1])
+            self._load(path, last=path == paths[-1])
         self._count = max(self._names, default=-1) + 1
         last = self._path(self._count - 1)
         if not self._readonly and self._count and self._count - 1 not in self._sealed:
             self._file = last.open("ab", buffering=0)
             self._hash = hashlib.sha256(last.read_bytes())
 
-    def _take_up(self, path: Path, last: bool) -> None:
-        """Check a segment, mend it, and enter its trajectories into the ledger."""
+    def _load(self, path: Path, last: bool) -> None:
+        """Check a segment, remove damage, and add its trajectories to the index."""
         try:
             number = int(path.stem.removeprefix("segment-"))
             found = segment.scan(path)
             if found.damaged and not self._readonly:
                 torn = last and not found.sealed and [end for _, end in found.damaged] == [found.size]
                 for start, end in found.damaged:
-                    what = "cut a torn tail of" if torn else "took out a damaged range of"
+                    what = "cut off a torn tail of" if torn else "removed a damaged range of"
                     self.repaired.append(f"{path.name}: {what} {end - start} bytes at byte {start}")
-                found = self._mend(path, found, sealed=not last)
-            nameless = self._enter(path, number, found)
-            if nameless and not self._readonly:
-                self.repaired.append(f"{path.name}: took out {len(nameless)} trajectories whose names were damaged")
-                found = self._mend(path, found.without(nameless), sealed=not last)
+                found = self._remove_damage(path, found, sealed=not last)
+            unnamed = self._add(path, number, found)
+            if unnamed and not self._readonly:
+                self.repaired.append(f"{path.name}: removed {len(unnamed)} trajectories whose names were damaged")
+                found = self._remove_damage(path, found.without(unnamed), sealed=not last)
         except (ValueError, OSError) as error:
             raise StoreError(
-                f"{path}: not a dataset of this version of icrl-dist ({error}): restore it, or begin anew"
+                f"{path}: not a dataset of this version of icrl-dist ({error}): restore the file, or start a new run"
             ) from None
         self._names[number] = found.names
         if found.sealed:
             self._sealed[number] = found.sealed
 
-    def _mend(self, path: Path, found: segment.Scan, sealed: bool) -> segment.Scan:
-        atomic_write(path, lambda file: segment.copy(path, found.whole, file, sealed))
+    def _remove_damage(self, path: Path, found: segment.Scan, sealed: bool) -> segment.Scan:
+        atomic_write(path, lambda file: segment.copy(path, found.intact, file, sealed))
         return segment.scan(path)
 
-    def _enter(self, path: Path, number: int, found: segment.Scan) -> list[tuple[int, int]]:
-        """Enter a segment's trajectories; returns the frames that refer to names which are lost."""
-        nameless: list[tuple[int, int]] = []
+    def _add(self, path: Path, number: int, found: segment.Scan) -> list[tuple[int, int]]:
+        """Add a segment's trajectories to the index; returns the frames whose names were damaged."""
+        unnamed: list[tuple[int, int]] = []
 
         def rows() -> Iterator[Row]:
             with path.open("rb") as file:
@@ -98,16 +99,16 @@ class Store:
                     try:
                         yield Row.of(segment.decode(file.read(length), found.names), number, offset, length)
                     except segment.MissingName:
-                        nameless.append((offset, length))
+                        unnamed.append((offset, length))
 
-        self.ledger.enter(rows())
-        return nameless
+        self.index.add(rows())
+        return unnamed
 
     def append(self, trajectories: Sequence[Trajectory]) -> None:
-        """Append trajectories; all are durable on return (one fsync).
+        """Append trajectories; all of them are durable on return (one fsync).
 
-        Whoever acknowledges a trajectory to its sender calls this first.  Raises StoreError, and
-        keeps none of them, if they could not be written.
+        The learner acknowledges a trajectory to its sender only afterwards.  Raises StoreError if
+        they cannot be written; then none of them is kept.
         """
         if not trajectories:
             return
@@ -121,16 +122,16 @@ class Store:
             parts: list[bytes] = []
             rows: list[Row] = []
             for trajectory in trajectories:
-                fresh, frame = segment.encode(trajectory, self._names[number])
-                parts += [fresh, frame]
-                at += len(fresh) + len(frame)
+                new_names, frame = segment.encode(trajectory, self._names[number])
+                parts += [new_names, frame]
+                at += len(new_names) + len(frame)
                 length = len(frame) - segment.HEADER_BYTES
                 rows.append(Row.of(trajectory, number, at - length, length))
             self._write(b"".join(parts), start)
-            self.ledger.enter(rows)
+            self.index.add(rows)
 
     def seal(self) -> None:
-        """End the present segment: it will never change again, and says its own SHA-256."""
+        """End the current segment with its SHA-256; it never changes afterwards."""
         with self._lock:
             if self._file is None:
                 return
@@ -167,7 +168,7 @@ class Store:
         self._count += 1
 
     def repair(self) -> list[str]:
-        """Check every byte again and take out what is damaged; says what that was."""
+        """Check every byte again and remove damage; returns what was removed."""
         with self._lock:
             self.close()
             self._open()
@@ -180,50 +181,50 @@ class Store:
                 self._file = None
             while self._readers:
                 os.close(self._readers.popitem()[1])
-            self.ledger.close()
+            self.index.close()
 
     def __contains__(self, identity: Identity) -> bool:
         with self._lock:
-            return identity in self.ledger
+            return identity in self.index
 
     def __len__(self) -> int:
-        return len(self.ledger)
+        return len(self.index)
 
     def read(self, identity: Identity) -> Trajectory:
         """The trajectory of this identity.  Raises KeyError if there is none, Damaged if its bytes changed."""
-        return self._read(self.ledger[identity])
+        return self._read(self.index[identity])
 
     def variations(self, stage: str, round: int) -> list[tuple[str, int, int, int]]:
-        """Which variations of one stage and round there are, in canonical order: (stage, round, task, variation)."""
-        return self.ledger.variations(stage, round)
+        """The stored variations of one stage and round, in canonical order: (stage, round, task, variation)."""
+        return self.index.variations(stage, round)
 
     def trials(self, key: tuple[str, int, int, int]) -> list[Trajectory]:
-        """The trajectories of one variation, in order of trial.  Raises Damaged at one whose bytes changed."""
-        return [self._read(row) for row in self.ledger.trials(key)]
+        """The trajectories of one variation, in order of trial.  Raises Damaged if the bytes of one changed."""
+        return [self._read(row) for row in self.index.trials(key)]
 
     def _read(self, row: Row) -> Trajectory:
         if row.segment not in self._readers:
             self._readers[row.segment] = os.open(self._path(row.segment), os.O_RDONLY)
-        whole = os.pread(self._readers[row.segment], segment.HEADER_BYTES + row.length, row.offset - segment.HEADER_BYTES)
-        payload = segment.payload(whole)
+        content = os.pread(self._readers[row.segment], segment.HEADER_BYTES + row.length, row.offset - segment.HEADER_BYTES)
+        payload = segment.payload(content)
         if payload is None:
             path = self._path(row.segment)
-            raise Damaged(f"{path}: damaged at byte {row.offset}, where {row.identity} lies; --resume mends it")
+            raise Damaged(f"{path}: damaged at byte {row.offset}, in {row.identity}; --resume removes and collects it again")
         return segment.decode(payload, self._names[row.segment])
 
     def digest(self, version: int | None = None) -> str:
-        """One digest of the dataset: every array and label byte, in canonical order.
+        """SHA-256 over every array and label byte, in canonical order.
 
-        Of all of it, or of what T^version was fitted to.  Equal for any number of workers,
-        whatever died on the way.
+        With ``version``, only over the data that T^version was fitted to.  It does not depend on
+        the number of workers or on crashes.
         """
         total = hashlib.sha256()
-        for sha256 in self.ledger.digests(version):
+        for sha256 in self.index.digests(version):
             total.update(sha256.encode())
         return total.hexdigest()
 
     def manifest(self) -> list[dict[str, Any]]:
-        """The sealed segments: ``segment`` (its file's name), ``bytes``, and ``sha256`` of all before the seal."""
+        """The sealed segments: ``segment`` (file name), ``bytes``, and ``sha256`` of everything before the seal."""
         return [
             {"segment": path.name, "bytes": path.stat().st_size, "sha256": self._sealed[number]}
             for number in sorted(self._sealed)

@@ -13,8 +13,9 @@ from typing import Any
 
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load, parse
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import StoreError, atomic_write, load_checkpoint, newest_version, version_file
+from icrl_dist.storage.checkpoint import load_checkpoint, newest_version, version_file
+from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.sharing import adopt
 from icrl_dist.types import Identity
 
@@ -79,7 +80,7 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
         return identity.next_version <= version
 
     adopt(theirs / "dataset", folder / "dataset", keep)
-    store = Store(folder / "dataset")
+    store = Dataset(folder / "dataset")
     digest = store.digest(version)
     store.close()
     if digest != manifest["dataset_digest"]:

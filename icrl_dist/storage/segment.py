@@ -1,12 +1,12 @@
-"""A segment of the dataset: checked frames in a row, self-contained, as small as its arrays.
+"""The format of a segment file: a sequence of frames with checksums.
 
-A frame is ``magic, length, checksum of the payload, checksum of these`` and a payload:
+A frame is a header ``magic, length, checksum of the payload, checksum of the header`` and a payload:
 
-- a *name*: ``[number, value]``, a variation or a text that the trajectories after it refer to;
+- a *name*: ``[number, value]``, a variation or a text to which later trajectories refer by number;
 - a *trajectory*: small integers (identity, numbers of names, shapes), then its arrays' bytes;
-- a *seal*: SHA-256 of all before it; nothing follows it.
+- a *seal*: SHA-256 of everything before it, at the end of a finished segment.
 
-The header's own checksum lets a reader find the next whole frame behind a damaged one.
+The header's own checksum lets a reader find the next intact frame after a damaged one.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ _DTYPES, _VECTOR_DTYPES = ({name: np.dtype(dtype) for name, (dtype, _) in kinds.
 
 
 def frame(magic: bytes, payload: bytes) -> bytes:
-    """One frame."""
+    """A frame with this payload."""
     head = _HEAD.pack(magic, len(payload), zlib.crc32(payload))
     return head + _CHECKSUM.pack(zlib.crc32(head)) + payload
 
 
 class MissingName(ValueError):  # noqa: N818
-    """A frame refers to a name whose own frame was damaged."""
+    """A frame refers to a name whose frame was damaged."""
 
 
 @dataclass
 class Names:
-    """The names of one segment: each is written once and referred to by its number."""
+    """The names of one segment: variations and texts, each written once and referred to by its number."""
 
     values: dict[int, Variation | str] = field(default_factory=dict)
     _numbers: dict[bytes | str, int] = field(default_factory=dict)
     _next: int = 0
 
     def number(self, value: Variation | str) -> tuple[int, bytes]:
-        """The value's number, and the frame that must be written first if it is new."""
-        # Packed, a variation is told from one that Python holds equal: 0 from 0.0.
+        """The value's number, and the frame to write first; empty if the value has a number already."""
+        # The packed bytes differ where Python's equality does not: 0 and 0.0.
         key = value if isinstance(value, str) else msgpack.packb(wire.from_variation(value))
         known = self._numbers.get(key)
         if known is not None:
@@ -68,7 +68,7 @@ class Names:
         return number, frame(NAME, msgpack.packb(number) + (msgpack.packb(key) if isinstance(key, str) else key))
 
     def read(self, payload: bytes) -> None:
-        """Take up a name frame.  Raises ValueError for a payload that is none."""
+        """Read a name frame.  Raises ValueError for an invalid payload."""
         reader = _reader(payload[:16])
         number = validation.integer(_next(reader), "name", 0)
         packed = payload[reader.tell() :]
@@ -81,14 +81,14 @@ class Names:
         self._next = max(self._next, number + 1)
 
     def variation(self, number: int) -> Variation:
-        """Raises MissingName if there is none of this number."""
+        """The name of this number.  Raises MissingName if there is none."""
         found = self.values.get(number)
         if not isinstance(found, Variation):
             raise MissingName(f"variation {number} of this segment is missing")
         return found
 
     def text(self, number: int) -> str:
-        """Raises MissingName if there is none of this number."""
+        """The name of this number.  Raises MissingName if there is none."""
         found = self.values.get(number)
         if not isinstance(found, str):
             raise MissingName(f"text {number} of this segment is missing")
@@ -96,39 +96,43 @@ class Names:
 
 
 def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
-    """Frames to write: of names that are new in this segment, and of the trajectory."""
-    t, fresh, numbers = trajectory, [], []
+    """The frames to write: those of names that are new in this segment, and that of the trajectory."""
+    t, new_names, numbers = trajectory, [], []
     for value in (t.variation, t.weights_digest, t.worker, t.origin):
         number, new = names.number(value)
         numbers.append(number)
-        fresh.append(new)
+        new_names.append(new)
     shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.taken))
-    disturbance = () if t.adversary.ndim == 1 else (t.adversary.shape[1],)
-    head = msgpack.packb([*t.identity.key(), t.policy_version, *numbers, *shape, *disturbance])
-    return b"".join(fresh), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
+    adversary_width = () if t.adversary.ndim == 1 else (t.adversary.shape[1],)
+    head = msgpack.packb([*t.identity.key(), t.policy_version, *numbers, *shape, *adversary_width])
+    return b"".join(new_names), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
 
 
 def decode(payload: bytes, names: Names) -> Trajectory:
-    """The trajectory in a frame's payload; its arrays are views of it.
+    """The trajectory in a frame's payload; its arrays are views of the payload.
 
-    Raises ValueError for a payload that is none, MissingName if it refers to a name that is lost.
+    Raises ValueError for an invalid payload, MissingName if the frame of one of its names was damaged.
     """
     reader = _reader(payload[:256])
     numbers = [validation.integer(n, "frame", -1) for n in validation.as_list(_next(reader), "frame")]
-    vectors = len(numbers) == _NUMBERS + 1  # the last is their adversary's components
+    vectors = len(numbers) == _NUMBERS + 1  # the last one is the number of the adversary's components
     if len(numbers) != _NUMBERS and not vectors:
-        raise ValueError(f"a trajectory frame of {len(numbers)} numbers")
-    disturbance = numbers.pop() if vectors else 0
-    stage, round_, task, variation, trial, weights, phi, digest, worker, origin, *sizes = numbers
+        raise ValueError(f"a trajectory frame has {len(numbers)} numbers, expected {_NUMBERS} or {_NUMBERS + 1}")
+    adversary_width = numbers.pop() if vectors else 0
+    stage, round_, task, variation, trial, version, phi, digest, worker, origin, *sizes = numbers
     steps, components, queries, actions, taken = sizes
-    if min(numbers[:5] + numbers[6:] + [disturbance]) < 0 or max(*numbers, disturbance) >= 1 << 31 or stage >= len(STAGES):
-        raise ValueError(f"a trajectory frame of {numbers}")
+    if (
+        min(numbers[:5] + numbers[6:] + [adversary_width]) < 0
+        or max(*numbers, adversary_width) >= 1 << 31
+        or stage >= len(STAGES)
+    ):
+        raise ValueError(f"a trajectory frame has the numbers {numbers}, out of range")
     width = (actions,) if vectors else ()
     shapes = {
         "observations": (steps + 1, components),
         "actions": (steps, *width),
         "rewards": (steps,),
-        "adversary": (steps, disturbance) if vectors else (steps,),
+        "adversary": (steps, adversary_width) if vectors else (steps,),
         "queries": (queries, components),
         "labels": (queries, actions),
         "taken": (taken, *width),
@@ -136,7 +140,7 @@ def decode(payload: bytes, names: Names) -> Trajectory:
     }
     arrays, at, dtypes = {}, reader.tell(), _VECTOR_DTYPES if vectors else _DTYPES
     if len(payload) - at != sum(prod(shape) * dtypes[name].itemsize for name, shape in shapes.items()):
-        raise ValueError(f"a trajectory frame of {len(payload)} bytes that claims the shapes {shapes}")
+        raise ValueError(f"a trajectory frame has {len(payload)} bytes, which do not fit the shapes {shapes}")
     for name, dtype in dtypes.items():
         count = prod(shapes[name])
         arrays[name] = np.frombuffer(payload, dtype, count, at).reshape(shapes[name])
@@ -144,7 +148,7 @@ def decode(payload: bytes, names: Names) -> Trajectory:
     return Trajectory(
         identity=Identity(STAGES[stage], round_, task, variation, trial),
         variation=names.variation(phi),
-        policy_version=weights,
+        policy_version=version,
         weights_digest=names.text(digest),
         worker=names.text(worker),
         origin=names.text(origin),
@@ -153,7 +157,7 @@ def decode(payload: bytes, names: Names) -> Trajectory:
 
 
 def _reader(payload: bytes) -> msgpack.Unpacker:
-    """A reader of whole numbers, and of lists as short as ours; the limits keep a list's claims from filling the memory."""
+    """A msgpack reader of integers and short lists; its limits bound the memory that a false list length can take."""
     reader = msgpack.Unpacker(
         max_buffer_size=max(1, len(payload)),
         max_array_len=_NUMBERS + 1,
@@ -175,46 +179,46 @@ def _next(reader: msgpack.Unpacker) -> Any:
 
 
 def seal(sha256: bytes) -> bytes:
-    """The frame that ends a segment, given the hash of all before it."""
+    """The frame that ends a segment; ``sha256`` is the hash of everything before it."""
     return frame(SEAL, sha256)
 
 
-def payload(whole: bytes) -> bytes | None:
-    """The payload of one frame; None if it is damaged."""
-    if not _is_header(whole, 0):
+def payload(content: bytes) -> bytes | None:
+    """The payload in the bytes of one frame; None if they are damaged."""
+    if not _is_header(content, 0):
         return None
-    found, checksum = whole[HEADER_BYTES:], _HEADER.unpack_from(whole)[2]
+    found, checksum = content[HEADER_BYTES:], _HEADER.unpack_from(content)[2]
     return found if zlib.crc32(found) == checksum else None
 
 
 @dataclass
 class Scan:
-    """What is in a segment file."""
+    """The content of a segment file."""
 
     names: Names = field(default_factory=Names)
     frames: list[tuple[int, int]] = field(default_factory=list)
     """Offset and length of each trajectory's payload."""
     damaged: list[tuple[int, int]] = field(default_factory=list)
-    """First byte, and the one after the last, of each damaged range."""
+    """Start and end (exclusive) of each damaged range."""
     sealed: str = ""
-    """SHA-256 that the seal names; empty for a segment that is not sealed."""
+    """The SHA-256 in the seal; empty for a segment without a seal."""
     size: int = 0
 
     @property
-    def whole(self) -> list[tuple[int, int]]:
-        """First byte, and the one after the last, of each range between the damaged ones, without the seal."""
+    def intact(self) -> list[tuple[int, int]]:
+        """Start and end (exclusive) of each range between the damaged ones, without the seal."""
         cuts = [(0, 0), *self.damaged, (self.size - SEAL_BYTES if self.sealed else self.size, self.size)]
         spans = ((before[1], after[0]) for before, after in itertools.pairwise(cuts))
         return [span for span in spans if span[0] < span[1]]
 
     def without(self, frames: Sequence[tuple[int, int]]) -> Scan:
-        """The same with these frames counted as damaged."""
+        """The same content, with these frames counted as damaged."""
         out = [(offset - HEADER_BYTES, offset + length) for offset, length in frames]
         return replace(self, damaged=sorted([*self.damaged, *out]))
 
 
 def scan(path: Path) -> Scan:
-    """Read and check a whole segment.  Raises ValueError for frames that are whole but not ours."""
+    """Read and check a whole segment.  Raises ValueError for intact frames with invalid content."""
     found = Scan(size=path.stat().st_size)
     if not found.size:
         return found
@@ -223,20 +227,20 @@ def scan(path: Path) -> Scan:
         while offset < found.size:
             end, checksum = _end(data, offset)
             if checksum is None or end > found.size or zlib.crc32(data[offset + HEADER_BYTES : end]) != checksum:
-                _damage(found, offset, min(end, found.size))
+                _add_damage(found, offset, min(end, found.size))
             else:
-                _take(data, offset, end, found)
+                _add_frame(data, offset, end, found)
             offset = end
     return found
 
 
-def _damage(found: Scan, start: int, end: int) -> None:
+def _add_damage(found: Scan, start: int, end: int) -> None:
     if found.damaged and found.damaged[-1][1] == start:
         start = found.damaged.pop()[0]
     found.damaged.append((start, end))
 
 
-def _take(data: mmap.mmap, offset: int, end: int, found: Scan) -> None:
+def _add_frame(data: mmap.mmap, offset: int, end: int, found: Scan) -> None:
     magic, start = data[offset : offset + 4], offset + HEADER_BYTES
     if found.sealed:
         raise ValueError(f"a frame after the seal at byte {offset}")
@@ -244,14 +248,14 @@ def _take(data: mmap.mmap, offset: int, end: int, found: Scan) -> None:
         found.names.read(data[start:end])
     elif magic == SEAL:
         if end - offset != SEAL_BYTES:
-            raise ValueError(f"a seal of {end - offset} bytes at byte {offset}")
+            raise ValueError(f"a seal of {end - offset} bytes at byte {offset}, expected {SEAL_BYTES}")
         found.sealed = data[start:end].hex()
     else:
         found.frames.append((start, end - start))
 
 
 def _end(data: mmap.mmap, offset: int) -> tuple[int, int | None]:
-    """Where the frame at ``offset`` ends, and its payload's checksum; where no frame begins, where the next one does."""
+    """The end of the frame at ``offset`` and its payload's checksum; without a frame there, the next frame's start and None."""
     if _is_header(data, offset):
         _, length, checksum, _ = _HEADER.unpack_from(data, offset)
         return offset + HEADER_BYTES + length, checksum
@@ -269,7 +273,7 @@ def _is_header(data: mmap.mmap | bytes, offset: int) -> bool:
 
 
 def copy(source: Path, spans: Sequence[tuple[int, int]], target: BinaryIO, sealed: bool) -> None:
-    """Write these ranges of a segment as a segment, with a seal of its own if ``sealed``."""
+    """Write these ranges of a segment to ``target``, with a new seal if ``sealed``."""
     digest = hashlib.sha256()
     with source.open("rb") as file:
         for start, end in spans:

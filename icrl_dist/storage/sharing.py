@@ -1,4 +1,4 @@
-"""Sharing another run's data: the same files under a second name, held against its hashes."""
+"""Sharing the data of another run: hard links to its segments, checked against their hashes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from icrl_dist.types import Identity
 
 
 def adopt(theirs: Path, folder: Path, keep: Callable[[Identity], bool]) -> int:
-    """Share the trajectories of another dataset that ``keep`` accepts; returns the bytes shared.
+    """Share the trajectories of another dataset that ``keep`` accepts; returns the bytes of linked segments.
 
-    A sealed segment of nothing else is linked, where the file system can; others are written anew
-    without the rest.  Raises StoreError for a damaged segment.
+    A sealed segment of which all trajectories are kept is linked, if the file system can; of
+    others the kept trajectories are copied.  Raises StoreError for a damaged segment.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shared = 0
@@ -36,13 +36,13 @@ def adopt(theirs: Path, folder: Path, keep: Callable[[Identity], bool]) -> int:
 
 
 def _checked(path: Path) -> segment.Scan:
-    remedy = "`icrl-dist train --resume` that run first, which mends its dataset"
+    remedy = "`icrl-dist train --resume` that run first, which repairs its dataset"
     try:
         found = segment.scan(path)
-        whole = path.read_bytes()[: max(0, found.size - segment.SEAL_BYTES)]
+        content = path.read_bytes()[: max(0, found.size - segment.SEAL_BYTES)]
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: cannot be shared ({error}); {remedy}") from None
-    if found.damaged or (found.sealed and hashlib.sha256(whole).hexdigest() != found.sealed):
+    if found.damaged or (found.sealed and hashlib.sha256(content).hexdigest() != found.sealed):
         raise StoreError(f"{path}: damaged, so it cannot be shared; {remedy}")
     return found
 
@@ -58,16 +58,16 @@ def _unwanted(path: Path, found: segment.Scan, keep: Callable[[Identity], bool])
 
 
 def _write(target: Path, source: Path, found: segment.Scan) -> None:
-    atomic_write(target, lambda file: segment.copy(source, found.whole, file, sealed=True))
+    atomic_write(target, lambda file: segment.copy(source, found.intact, file, sealed=True))
 
 
 def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # another file system, or one without links
+    except OSError:  # another file system, or one without hard links
 
         def copy(file: BinaryIO) -> None:
-            with source.open("rb") as theirs:
-                shutil.copyfileobj(theirs, file)
+            with source.open("rb") as opened:
+                shutil.copyfileobj(opened, file)
 
         atomic_write(target, copy)

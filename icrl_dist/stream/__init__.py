@@ -1,1 +1,1 @@
-"""The streams between workers and learner: messages, links, credits."""
+"""The streams between workers and the learner: wire format, links, credits, value checks."""

@@ -1,16 +1,33 @@
-"""Several items in one request, each answered for itself.
+"""Several items in one request, with one answer for each.
 
-A request costs the two processes a few hundred microseconds of waking each other up, whatever
-it holds; so what is ready together travels together.
+A request wakes both processes, which costs a few hundred microseconds whatever it holds; so
+items that are ready at the same time share a request.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from icrl_dist.stream.link import Query
-from icrl_dist.stream.validation import as_list, exactly, pack, text, typed, unpack
+from icrl_dist.stream.validation import WireError, pack, read, unpack
+
+_ANSWERS_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    v: int
+    kind: str
+    items: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Answers:
+    v: int
+    kind: str
+    reasons: tuple[str, ...]
 
 
 def join(items: Sequence[bytes]) -> bytes:
@@ -19,28 +36,29 @@ def join(items: Sequence[bytes]) -> bytes:
 
 
 def split(query: Query, limit: int) -> list[Query]:
-    """The items of a request as queries of their own; the request is answered when they all are.
+    """The items of a request, each as a query; the request is answered when all of them are.
 
     Raises WireError if the request is not a batch, or is longer than ``limit`` bytes.
     """
-    fields = exactly(unpack(query.payload, limit), "batch", {"v", "kind", "items"})
-    items = [typed(item, bytes, "item") for item in as_list(fields["items"], "items")]
+    items = read(_Request, unpack(query.payload, limit), "batch").items
     if not items:
         query.reply(pack("answers", {"reasons": []}))
-    whole = _Whole(query, len(items))
-    return [_Part(whole, place, item) for place, item in enumerate(items)]
+    request = _SharedRequest(query, len(items))
+    return [_ItemQuery(request, place, item) for place, item in enumerate(items)]
 
 
 def reasons(answer: bytes, count: int) -> list[str]:
-    """Why each of ``count`` items was refused; empty for those that were taken.
+    """Why each of ``count`` items was refused; an empty text for an accepted item.
 
-    Raises WireError if the answer is not one to so many items.
+    Raises WireError if the answer does not have ``count`` reasons.
     """
-    fields = exactly(unpack(answer, 1 << 20), "answers", {"v", "kind", "reasons"})
-    return [text(reason, "reason") for reason in as_list(fields["reasons"], "reasons", count)]
+    found = read(_Answers, unpack(answer, _ANSWERS_BYTES), "answers").reasons
+    if len(found) != count:
+        raise WireError("schema", f"answers has {len(found)} reasons, expected {count}")
+    return list(found)
 
 
-class _Whole:
+class _SharedRequest:
     def __init__(self, query: Query, count: int) -> None:
         self.query = query
         self._lock = threading.Lock()
@@ -58,17 +76,17 @@ class _Whole:
             self.query.reply(pack("answers", {"reasons": self._reasons}))
 
 
-class _Part:
-    def __init__(self, whole: _Whole, place: int, payload: bytes) -> None:
-        self._whole, self._place = whole, place
+class _ItemQuery:
+    def __init__(self, request: _SharedRequest, place: int, payload: bytes) -> None:
+        self._request, self._place = request, place
         self.payload = payload
 
     @property
     def key(self) -> str:
-        return self._whole.query.key
+        return self._request.query.key
 
     def reply(self, payload: bytes) -> None:
-        self._whole.settle(self._place, "")
+        self._request.settle(self._place, "")
 
     def refuse(self, reason: str) -> None:
-        self._whole.settle(self._place, reason or "refused")
+        self._request.settle(self._place, reason or "refused")

@@ -1,4 +1,4 @@
-"""Sending without losing: at most so many items unanswered, each kept until its answer."""
+"""Sending without loss: a bounded number of items is unanswered, and each is kept until it is acknowledged."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from icrl_dist.stream.link import Link, LinkError, Outcome, Refused, Unanswered
 from icrl_dist.stream.validation import WireError
 
 BACKOFF_S = (0.05, 2.0)
-"""First and longest wait before an item is sent again, seconds; each wait doubles the last."""
+"""First and longest wait before an item is sent again, seconds; the wait doubles each time."""
 
-FLIGHTS = 2
-"""Requests under way: one is answered while the other travels.  The second leaves when half
-the credits wait, the first at once, so nothing is kept back from an idle link."""
+MAX_REQUESTS = 2
+"""Requests in flight: the learner answers one while the other travels.  The first is sent at once,
+so an idle link never waits; the second when half the credits are waiting."""
 
-TOGETHER_BYTES = 1 << 20
-"""Items travel together up to so many bytes; a larger one travels alone."""
+REQUEST_BYTES = 1 << 20
+"""Items share a request up to this size; a larger item has a request of its own."""
 
 
 @dataclass(slots=True)
@@ -33,12 +33,12 @@ class _Item:
 
 
 class CreditSender:
-    """Sends items to ``key`` until each is acknowledged, never more than ``credits`` at once.
+    """Sends items to ``key`` until each is acknowledged, with at most ``credits`` items unacknowledged.
 
-    Unanswered items, and those refused as ``busy``, are sent again for as long as it takes; the
-    other side drops duplicates.  Any other refusal is final: the item is given up and the next
-    ``send`` or ``drain`` raises Refused.  ``on_event`` hears ``resent`` and ``refused``, with why,
-    and must not block.  The other side takes requests apart with ``batch.split``.
+    Unanswered items, and items refused as ``busy``, are sent again without a limit; the receiver
+    drops duplicates.  Any other refusal is final: the item is given up, and the next ``send`` or
+    ``drain`` raises Refused.  ``on_event`` is called with ``resent`` or ``refused`` and the reason;
+    it must not block.  The receiver splits requests with ``batching.split``.
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class CreditSender:
         on_event: Callable[[str, str], None] | None = None,
     ) -> None:
         if credits < 1:
-            raise ValueError(f"credits={credits}: at least one item must be allowed under way")
+            raise ValueError(f"credits={credits}: must be at least 1")
         self.sent = 0
-        """Items taken in."""
+        """Items accepted by ``send``."""
         self.resent = 0
         """Times that an item was sent again."""
         self.acknowledged = 0
-        """Items answered positively."""
+        """Items that the receiver acknowledged."""
         self._link, self._key, self._timeout_s = link, key, timeout_s
         self._on_event = on_event
         self._changed = threading.Condition()
@@ -64,8 +64,8 @@ class CreditSender:
         for _ in range(credits):
             self._credit.put(None)
         self._waiting: deque[_Item] = deque()
-        self._enough = max(1, credits // FLIGHTS)
-        self._flights = 0
+        self._second_threshold = max(1, credits // MAX_REQUESTS)
+        self._requests = 0
         self._outstanding = 0
         self._failure: Refused | LinkError | None = None
         self._closed = False
@@ -74,13 +74,13 @@ class CreditSender:
 
     @property
     def outstanding(self) -> int:
-        """Items taken in and neither acknowledged nor refused."""
+        """Items accepted and neither acknowledged nor refused."""
         return self._outstanding
 
     @property
     def waited_s(self) -> float:
-        """Seconds that ``send`` and ``drain`` have waited for answers, until now."""
-        ended, since = self._waited  # one value: another thread may ask
+        """Seconds that ``send`` and ``drain`` have waited for answers so far."""
+        ended, since = self._waited  # one read, because another thread may write
         return ended if since is None else ended + time.monotonic() - since
 
     @contextlib.contextmanager
@@ -93,7 +93,7 @@ class CreditSender:
             self._waited = ended + time.monotonic() - since, None
 
     def send(self, payload: bytes) -> None:
-        """Take an item, waiting for a credit.  Raises Refused for an earlier item, LinkError if closed."""
+        """Accept an item, after waiting for a credit.  Raises Refused for an earlier item, LinkError if closed."""
         with self._wait():
             self._credit.get()
         with self._changed:
@@ -105,10 +105,10 @@ class CreditSender:
             self._outstanding += 1
             self.sent += 1
             self._waiting.append(_Item(payload))
-        self._fly()
+        self._send_waiting()
 
     def drain(self, timeout_s: float) -> None:
-        """Wait until every item is acknowledged.  Raises Refused for one that was not, Unanswered after ``timeout_s``."""
+        """Wait until every item is acknowledged.  Raises Refused for a refused item, Unanswered after ``timeout_s``."""
         with self._changed:
             with self._wait():
                 self._changed.wait_for(lambda: self._failure or self._closed or not self._outstanding, timeout_s)
@@ -117,7 +117,7 @@ class CreditSender:
                 raise Unanswered(f"{self._outstanding} items on {self._key} unanswered after {timeout_s:g} s")
 
     def close(self) -> None:
-        """Give up what is outstanding.  The link stays open."""
+        """Give up outstanding items.  The link stays open."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -129,36 +129,36 @@ class CreditSender:
         if failure is not None:
             raise failure
         if self._closed:
-            raise LinkError(f"the sender on {self._key} is closed, {self._outstanding} items were unanswered")
+            raise LinkError(f"the sender on {self._key} is closed with {self._outstanding} items unanswered: open another")
 
-    def _fly(self) -> None:
-        """Send what waits, together, if the link is idle or there is enough to be worth a second request."""
+    def _send_waiting(self) -> None:
+        """Send waiting items in one request, if no request is in flight or if enough wait for a second one."""
         with self._changed:
             if not self._ready():
                 return
             items, size = [self._waiting.popleft()], 0
-            while self._waiting and (size := size + len(items[-1].payload)) + len(self._waiting[0].payload) <= TOGETHER_BYTES:
+            while self._waiting and (size := size + len(items[-1].payload)) + len(self._waiting[0].payload) <= REQUEST_BYTES:
                 items.append(self._waiting.popleft())
-            self._flights += 1
+            self._requests += 1
         try:
             request = batching.join([item.payload for item in items])
-            self._link.send(self._key, request, self._timeout_s, lambda outcome: self._land(items, outcome))
+            self._link.send(self._key, request, self._timeout_s, lambda outcome: self._settle(items, outcome))
         except LinkError as error:
             with self._changed:
-                self._flights -= 1
+                self._requests -= 1
                 for _ in items:
                     self._give_up(error)
 
     def _ready(self) -> bool:
-        if self._closed or not self._waiting or self._flights >= FLIGHTS:
+        if self._closed or not self._waiting or self._requests >= MAX_REQUESTS:
             return False
-        return not self._flights or len(self._waiting) >= self._enough
+        return not self._requests or len(self._waiting) >= self._second_threshold
 
-    def _land(self, items: list[_Item], outcome: Outcome) -> None:
+    def _settle(self, items: list[_Item], outcome: Outcome) -> None:
         reasons, final = _reasons(outcome, len(items))
         events: list[tuple[str, str]] = []
         with self._changed:
-            self._flights -= 1
+            self._requests -= 1
             again: list[_Item] = []
             for item, reason in zip(items, reasons, strict=True):
                 if not reason:
@@ -175,18 +175,18 @@ class CreditSender:
             if again:
                 first, longest = BACKOFF_S
                 delay = min(longest, first * 2 ** min(again[0].resends - 1, 16))
-                self._dispatcher.post(lambda: self._again(again), delay)
+                self._dispatcher.post(lambda: self._resend(again), delay)
             if self._ready():
-                # Not from here: this may be the link's own thread, which must not use the link.
-                self._dispatcher.post(self._fly)
+                # On another thread: this one may be the link's own, which must not use the link.
+                self._dispatcher.post(self._send_waiting)
         if self._on_event is not None:
             for event, reason in events:
                 self._on_event(event, reason)
 
-    def _again(self, items: list[_Item]) -> None:
+    def _resend(self, items: list[_Item]) -> None:
         with self._changed:
             self._waiting.extendleft(reversed(items))
-        self._fly()
+        self._send_waiting()
 
     def _give_up(self, failure: Refused | LinkError) -> None:
         self._failure = self._failure or failure
@@ -200,10 +200,10 @@ class CreditSender:
 
 
 def _reasons(outcome: Outcome, count: int) -> tuple[list[str], bool]:
-    """Why each item was not taken, empty where it was; and whether a reason is the other side's own."""
+    """The reason against each item, empty if it was accepted; and whether the receiver gave the reasons."""
     if isinstance(outcome, bytes):
         try:
             return batching.reasons(outcome, count), True
         except WireError as error:
-            return [f"an answer that is none: {error}"] * count, False
+            return [f"invalid answer: {error}"] * count, False
     return [str(outcome)] * count, isinstance(outcome, Refused)

@@ -1,4 +1,4 @@
-"""What both links run handlers on: threads that never hold up whoever hands them work."""
+"""The threads on which both links run handlers, so that callers never wait for a handler."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Dispatcher:
         self._thread.start()
 
     def post(self, action: Callable[[], None], delay_s: float = 0.0) -> None:
-        """Run ``action`` after ``delay_s`` seconds; once closed, never."""
+        """Run ``action`` after ``delay_s`` seconds; after ``close`` do nothing."""
         with self._changed:
             heapq.heappush(self._due, (time.monotonic() + delay_s, next(self._order), action))
             self._changed.notify()
 
     def close(self) -> None:
-        """Run what is already due, forget the rest, and wait a second at most for that."""
+        """Run the actions that are due, discard the others, and wait at most a second for the thread to end."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -59,42 +59,42 @@ class Dispatcher:
 
 
 class Mailbox:
-    """What a subscriber has not read yet, and the thread on which its handler reads it.
+    """The queue of a subscriber's unread messages, and the thread that calls its handler.
 
-    Droppable messages beyond ``capacity``, or ``room`` bytes, are dropped and counted, others
-    always kept, so whoever puts a message in never waits.
+    ``put`` never waits: beyond ``capacity`` messages or ``max_bytes`` bytes, droppable messages are
+    dropped and counted.  Other messages are always kept.
     """
 
-    def __init__(self, handler: Callable[..., None], capacity: int = 1024, room: int = 32 << 20) -> None:
+    def __init__(self, handler: Callable[..., None], capacity: int = 1024, max_bytes: int = 32 << 20) -> None:
         self.dropped = 0
-        self._handler, self._capacity, self._room = handler, capacity, room
+        self._handler, self._capacity, self._max_bytes = handler, capacity, max_bytes
         self._lock, self._bytes = threading.Lock(), 0
-        self._waiting: deque[tuple[object, ...]] = deque()
+        self._unread: deque[tuple[object, ...]] = deque()
         self._dispatcher = Dispatcher("subscriber")
-        self._called = self._closed = False
+        self._posted = self._closed = False
 
     def put(self, *message: object, droppable: bool) -> None:
-        """Leave a message, never waiting."""
+        """Add a message, without waiting."""
         size = _bytes_in(message)
         with self._lock:
-            if droppable and (len(self._waiting) >= self._capacity or self._bytes + size > self._room):
+            if droppable and (len(self._unread) >= self._capacity or self._bytes + size > self._max_bytes):
                 self.dropped += 1
                 return
             self._bytes += size
-        self._waiting.append(message)
-        if not self._called:  # else it is being read, or about to be
-            self._called = True
+        self._unread.append(message)
+        if not self._posted:  # else a call of _read is due and will find the message
+            self._posted = True
             self._dispatcher.post(self._read)
 
     def close(self) -> None:
-        """Forget what is unread; wait a second at most for the handler to return."""
+        """Discard unread messages; wait at most a second for the handler to return."""
         self._closed = True
         self._dispatcher.close()
 
     def _read(self) -> None:
-        self._called = False  # before looking: whoever puts a message in from now on calls again
-        while self._waiting and not self._closed:
-            message = self._waiting.popleft()
+        self._posted = False  # before reading, so that a later put posts another call
+        while self._unread and not self._closed:
+            message = self._unread.popleft()
             with self._lock:
                 self._bytes -= _bytes_in(message)
             try:
@@ -108,7 +108,7 @@ def _bytes_in(message: tuple[object, ...]) -> int:
 
 
 def handle(handler: Callable[[Query], None], query: Query) -> None:
-    """Run a server's handler; what it raises is logged and becomes the answer."""
+    """Run a server's handler; an error that it raises is logged and becomes the answer."""
     try:
         handler(query)
     except Exception as error:
@@ -116,4 +116,4 @@ def handle(handler: Callable[[Query], None], query: Query) -> None:
         try:
             query.refuse(f"error: {type(error).__name__}: {error}")
         except RuntimeError:
-            _log.warning("%s had been answered before its handler failed", query.key)
+            _log.warning("%s was answered before its handler failed", query.key)

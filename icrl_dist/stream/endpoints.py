@@ -1,4 +1,4 @@
-"""Where a stream listens or is reached, as ``PROTOCOL/HOST:PORT``; and which of them are safe."""
+"""Endpoints, ``PROTOCOL/HOST:PORT``, at which a learner listens or is reached, and which of them are allowed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _FORM = re.compile(r"([a-z]+)/(\[[^\]]+\]|[^:\[\]/?#\s]+):(\d{1,5})([?#][^\n]*)?
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An endpoint taken apart; what Zenoh may find after the port is left out."""
+    """The parts of an endpoint, without Zenoh's options after the port."""
 
     protocol: str
     host: str
@@ -21,19 +21,19 @@ class Endpoint:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach it.  A name other than ``localhost`` is taken to be elsewhere."""
+        """Whether only this node can reach it.  A host name other than ``localhost`` counts as another node."""
         address = _address(self.host)
         return self.host == "localhost" if address is None else address.is_loopback
 
     @property
     def everywhere(self) -> bool:
-        """Whether it stands for every address of this machine, so that nobody can connect to it by that name."""
+        """Whether it means every address of this node (``0.0.0.0``); such an address cannot be connected to."""
         address = _address(self.host)
         return address is not None and address.is_unspecified
 
 
 def parse(endpoint: str) -> Endpoint:
-    """The endpoint's parts.  IPv6 addresses stand in brackets, as in ``tls/[::1]:0``.  Raises ValueError if it is none."""
+    """Split an endpoint; IPv6 addresses stand in brackets, as in ``tls/[::1]:0``.  Raises ValueError for another form."""
     found = _FORM.fullmatch(endpoint)
     if found is None or int(found[3]) > 65535:
         raise ValueError("write it as tcp/127.0.0.1:PORT, or as tls/HOST:PORT with stream.certificates")
@@ -41,10 +41,10 @@ def parse(endpoint: str) -> Endpoint:
 
 
 def objections(endpoint: str, connect: str, certificates: str) -> Iterator[tuple[str, str, str]]:
-    """What speaks against where a learner listens and is reached: which of the two, its value, the remedy.
+    """What is not allowed in ``stream.endpoint`` and ``stream.connect``: the name, its value, the remedy.
 
-    In the clear only on this machine; with certificates always by TLS.  ``connect`` may be
-    empty: workers then connect to ``endpoint``.
+    Without certificates only loopback addresses of this node are allowed; with certificates only
+    TLS.  If ``connect`` is empty, workers connect to ``endpoint``.
     """
     for name, value in (("endpoint", endpoint), ("connect", connect or endpoint)):
         remedy = _objection(value, bool(certificates))
@@ -62,11 +62,11 @@ def _objection(endpoint: str, certificates: bool) -> str:
     except ValueError as error:
         return str(error)
     if certificates:
-        return "" if where.protocol == "tls" else "stream.certificates is set: write it as tls/HOST:PORT, or leave those out"
+        return "" if where.protocol == "tls" else "stream.certificates is set: write it as tls/HOST:PORT, or unset that"
     if where.protocol == "tls":
         return f"TLS needs stream.certificates, a folder: see {HELP}"
     if not where.loopback:
-        return f"in the clear only on this machine, as tcp/127.0.0.1:0; else tls/HOST:PORT and stream.certificates: see {HELP}"
+        return f"unencrypted only on this node, as tcp/127.0.0.1:0; otherwise tls/HOST:PORT and stream.certificates: see {HELP}"
     return ""
 
 

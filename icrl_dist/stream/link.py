@@ -1,7 +1,7 @@
-"""The seam between this project and a network: key names, and what a link between processes does.
+"""The network interface of the system: the keys of a run, and the protocol of a link between processes.
 
-``memory_link.MemoryLink`` does it within one process, ``zenoh_link.ZenohLink`` between machines;
-one battery of tests runs over both.
+``memory_link.MemoryLink`` implements it within one process, ``zenoh_link.ZenohLink`` between
+nodes.  The same contract tests run on both.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Keys:
-    """The keys of one run.  Raises ValueError for a name that cannot be part of a key."""
+class StreamKeys:
+    """The keys of one run's streams.  Raises ValueError for a name that cannot be part of a key."""
 
     run: str
 
@@ -26,27 +26,27 @@ class Keys:
 
     @property
     def data(self) -> str:
-        """Trajectories in, answered when they are stored."""
+        """Workers send trajectories here; the learner replies when they are stored."""
         return f"icrl/{self.run}/data"
 
     @property
     def work(self) -> str:
-        """Work out, asked for by idle workers."""
+        """Workers request jobs here."""
         return f"icrl/{self.run}/work"
 
     @property
     def weights(self) -> str:
-        """Every new version of the weights, published."""
+        """The learner publishes every new weights version here."""
         return f"icrl/{self.run}/weights"
 
     @property
     def weights_latest(self) -> str:
-        """The newest version of the weights, for those who ask."""
+        """The learner answers requests for the newest or an older weights version here."""
         return f"icrl/{self.run}/weights/latest"
 
     @property
     def monitor_all(self) -> str:
-        """Everything on the monitor plane."""
+        """All topics of the monitor plane."""
         return f"icrl/{self.run}/mon/**"
 
     @property
@@ -56,7 +56,7 @@ class Keys:
 
     @property
     def alive_all(self) -> str:
-        """The liveliness of every worker."""
+        """The liveliness tokens of all workers."""
         return f"icrl/{self.run}/alive/*"
 
     def monitor(self, topic: str) -> str:
@@ -66,12 +66,12 @@ class Keys:
         return f"icrl/{self.run}/mon/{topic}"
 
     def alive(self, worker: str) -> str:
-        """The liveliness of one worker."""
+        """The liveliness token of one worker."""
         return f"icrl/{self.run}/alive/{_part(worker)}"
 
 
 def may_drop(key: str) -> bool:
-    """Whether messages on ``key`` are only looked at: a subscriber need not keep them all, whatever their sender says."""
+    """Whether a subscriber may drop messages on ``key``, whatever their sender asks for: those of the monitor plane."""
     return key.split("/", 3)[2:3] == ["mon"]
 
 
@@ -82,11 +82,11 @@ def _part(name: str) -> str:
 
 
 class LinkError(OSError):
-    """A link that cannot be opened, or is closed; says which and what to do."""
+    """A link cannot be opened, or is closed; the message names the link and the remedy."""
 
 
 class Refused(Exception):  # noqa: N818
-    """The other side answered, with a reason for not doing what was asked."""
+    """The other side refused the request and gave a reason."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -94,7 +94,7 @@ class Refused(Exception):  # noqa: N818
 
 
 class Unanswered(Exception):  # noqa: N818
-    """No answer: nobody there, nobody quick enough, or the link broke on the way."""
+    """No reply came: no process serves the key, it was too slow, or the link broke."""
 
 
 Outcome = bytes | Refused | Unanswered
@@ -102,10 +102,10 @@ Done = Callable[[Outcome], None]
 
 
 class Query(Protocol):
-    """A request as its server sees it; to be answered once, from any thread, now or later.
+    """A request, as its server receives it; the server answers it once, from any thread, at any time.
 
-    An answer that cannot reach the other side any more is lost, as on any network: the
-    request ends Unanswered there.  A second answer raises RuntimeError.
+    An answer that cannot reach the other side is lost: the request ends Unanswered there.  A
+    second answer raises RuntimeError.
     """
 
     @property
@@ -120,53 +120,54 @@ class Query(Protocol):
 
 
 class Link(Protocol):
-    """One process's end of the streams.  Using a closed link raises LinkError."""
+    """The connection of one process to the streams.  Using a closed link raises LinkError."""
 
     def request(self, key: str, payload: bytes, timeout_s: float) -> bytes:
-        """Ask and wait.  Raises Refused or Unanswered; never call it from a handler."""
+        """Send a request and wait for the reply.  Raises Refused or Unanswered.  Must not be called from a handler."""
         answers: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         self.send(key, payload, timeout_s, answers.put)
         try:
-            outcome = answers.get(timeout=timeout_s + 5.0)  # the link keeps the deadline; this is for one that is stuck
+            outcome = answers.get(timeout=timeout_s + 5.0)  # the link ends requests at their deadline, unless it is stuck
         except queue.Empty:
-            raise Unanswered(f"the link is stuck: {key} was to be answered within {timeout_s:g} s") from None
+            raise Unanswered(f"the link is stuck: no outcome on {key} 5 s after the timeout of {timeout_s:g} s") from None
         if isinstance(outcome, bytes):
             return outcome
         raise outcome
 
     def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
-        """Ask without waiting; ``done`` is called once, from another thread.
+        """Send a request without waiting; ``done`` is called once with the outcome, from another thread.
 
-        It must neither block nor use a link: it may run on the network's own thread, within its locks.
+        ``done`` must not block and must not use a link: it may run on the network's own thread,
+        while that holds locks.
         """
 
     def serve(self, key: str, handler: Callable[[Query], None]) -> None:
-        """Answer requests for ``key``.  The handler must not block; if it raises, the error is the answer."""
+        """Answer requests for ``key``.  The handler must not block; an error that it raises becomes the answer."""
 
     def publish(self, key: str, payload: bytes, droppable: bool) -> None:
-        """Tell whoever subscribes.  What is droppable is dropped sooner than it makes anyone wait."""
+        """Send a message to all subscribers.  A droppable message is dropped where it would have to wait."""
 
-    def watched(self, key: str) -> bool:
-        """Whether somebody subscribes to what is published, droppable, under ``key``, as far as is known here by now."""
+    def has_subscribers(self, key: str) -> bool:
+        """Whether a droppable message on ``key`` would have a subscriber, according to the declarations received so far."""
 
     def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
-        """Hear, on a thread of its own, what is published under ``key_expr`` (``*`` one part, ``**`` any).
+        """Call ``handler``, on a thread of its own, with each message on ``key_expr`` (``*`` one part, ``**`` any number).
 
-        A handler that falls behind misses droppable messages; it slows nobody down.
+        A slow handler misses droppable messages; it does not delay publishers or other subscribers.
         """
 
     def announce(self, key: str) -> None:
-        """Be seen alive under ``key`` until this link closes or its process dies."""
+        """Hold a liveliness token for ``key`` until this link closes or its process dies."""
 
     def watch(self, key_expr: str, handler: Callable[[str, bool], None]) -> None:
-        """Hear the last part of each key that comes alive (True, at once if it is) or goes (False)."""
+        """Call ``handler`` with the last part of each key whose token appears (True, also for present ones) or goes (False)."""
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Where other links can connect to."""
+        """The endpoints to which other links can connect."""
 
     def close(self) -> None:
-        """Let go of everything; requests under way end Unanswered.  Closing twice is fine."""
+        """Close the link; pending requests end Unanswered.  A second call does nothing."""
 
     def __enter__(self) -> Self:
         return self
@@ -176,7 +177,7 @@ class Link(Protocol):
 
 
 def matches(key_expr: str, key: str) -> bool:
-    """Whether a key expression covers a key: ``*`` stands for one part, ``**`` for any number."""
+    """Whether a key expression matches a key: ``*`` stands for one part, ``**`` for any number."""
     return _covers(key_expr.split("/"), key.split("/"))
 
 

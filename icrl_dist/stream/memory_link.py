@@ -1,4 +1,4 @@
-"""Links within one process: the same behavior as between machines, timeouts included."""
+"""Links within one process, with the behavior of links between nodes, timeouts included."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from icrl_dist.stream.link import Done, Link, LinkError, Outcome, Query, Refused
 
 
 class MemoryHub:
-    """The network within one process: every link of a hub reaches every other."""
+    """A network within one process: every link of a hub is connected to every other."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
         self._links: list[MemoryLink] = []
         self._dispatcher: Dispatcher | None = None
-        self._under_way: set[_MemoryQuery] = set()
+        self._pending: set[_MemoryQuery] = set()
         self._expiring = False
 
     def link(self) -> MemoryLink:
-        """Another link to this hub."""
+        """A new link to this hub."""
         made = MemoryLink(self)
         with self._lock:
             self._links.append(made)
@@ -29,16 +29,16 @@ class MemoryHub:
         return made
 
     def _expire_soon(self) -> None:
-        if self._under_way and not self._expiring and self._dispatcher is not None:
+        if self._pending and not self._expiring and self._dispatcher is not None:
             self._expiring = True
             self._dispatcher.post(self._expire, 0.02)
 
     def _expire(self) -> None:
         now = time.monotonic()
         with self._lock:
-            late = [query for query in self._under_way if query.deadline <= now]
+            late = [query for query in self._pending if query.deadline <= now]
         for query in late:
-            query.end(Unanswered(f"no answer on {query.key} in time"))
+            query.end(Unanswered(f"no reply on {query.key} within the timeout"))
         with self._lock:
             self._expiring = False
             self._expire_soon()
@@ -63,11 +63,11 @@ class MemoryLink(Link):
             dispatcher = self._dispatcher()
             found = [(link, link._servers[key]) for link in self._hub._links if key in link._servers]
             if not found:
-                dispatcher.post(lambda: done(Unanswered(f"nobody serves {key}")))
+                dispatcher.post(lambda: done(Unanswered(f"no process serves {key}")))
                 return
             server, handler = found[0]
             query = _MemoryQuery(self, server, key, payload, done, time.monotonic() + timeout_s)
-            self._hub._under_way.add(query)
+            self._hub._pending.add(query)
             dispatcher.post(lambda: handle(handler, query))
             self._hub._expire_soon()
 
@@ -84,7 +84,7 @@ class MemoryLink(Link):
                     if matches(expr, key):
                         mailbox.put(key, payload, droppable=droppable or may_drop(key))
 
-    def watched(self, key: str) -> bool:
+    def has_subscribers(self, key: str) -> bool:
         with self._hub._lock:
             self._dispatcher()
             return any(matches(expr, key) for link in self._hub._links for expr, _ in link._mailboxes)
@@ -98,7 +98,7 @@ class MemoryLink(Link):
         with self._hub._lock:
             self._dispatcher()
             self._alive.add(key)
-            self._tell(key, True)
+            self._notify_watchers(key, True)
 
     def watch(self, key_expr: str, handler: Callable[[str, bool], None]) -> None:
         with self._hub._lock:
@@ -122,8 +122,8 @@ class MemoryLink(Link):
             self._closed = True
             hub._links.remove(self)
             for key in self._alive:
-                self._tell(key, False)
-            cut = [query for query in hub._under_way if self in (query.asker, query.server)]
+                self._notify_watchers(key, False)
+            cut = [query for query in hub._pending if self in (query.sender, query.server)]
             if hub._dispatcher is not None:
                 for query in cut:
                     hub._dispatcher.post(lambda query=query: query.end(Unanswered("the link was closed")))  # type: ignore[misc]
@@ -139,7 +139,7 @@ class MemoryLink(Link):
             raise LinkError("this link is closed: open another")
         return self._hub._dispatcher
 
-    def _tell(self, key: str, alive: bool) -> None:
+    def _notify_watchers(self, key: str, alive: bool) -> None:
         for link in self._hub._links:
             for expr, mailbox in link._watchers:
                 if matches(expr, key):
@@ -147,8 +147,8 @@ class MemoryLink(Link):
 
 
 class _MemoryQuery:
-    def __init__(self, asker: MemoryLink, server: MemoryLink, key: str, payload: bytes, done: Done, deadline: float) -> None:
-        self.asker, self.server = asker, server
+    def __init__(self, sender: MemoryLink, server: MemoryLink, key: str, payload: bytes, done: Done, deadline: float) -> None:
+        self.sender, self.server = sender, server
         self.key, self.payload, self.deadline = key, payload, deadline
         self._done = done
         self._answered = False
@@ -160,18 +160,18 @@ class _MemoryQuery:
         self._answer(Refused(reason))
 
     def end(self, outcome: Outcome) -> None:
-        """Tell the asker, on the hub's thread; of all outcomes the first one counts."""
-        with self.asker._hub._lock:
-            if self not in self.asker._hub._under_way:
+        """Give the outcome to the sender, on the hub's thread; outcomes after the first are ignored."""
+        with self.sender._hub._lock:
+            if self not in self.sender._hub._pending:
                 return
-            self.asker._hub._under_way.remove(self)
+            self.sender._hub._pending.remove(self)
         self._done(outcome)
 
     def _answer(self, outcome: Outcome) -> None:
-        with self.asker._hub._lock:
+        with self.sender._hub._lock:
             if self._answered:
                 raise RuntimeError(f"this query on {self.key} has been answered already")
             self._answered = True
-            dispatcher = self.asker._hub._dispatcher
+            dispatcher = self.sender._hub._dispatcher
             if dispatcher is not None:
                 dispatcher.post(lambda: self.end(outcome))

@@ -185,8 +185,11 @@ def _float(infinite: bool) -> _Reader:
 
 
 def _literal(choices: tuple[Any, ...]) -> _Reader:
+    known = {(type(choice), choice) for choice in choices}  # True is no 1
+    kinds = {type(choice) for choice in choices}
+
     def read(value: Any, where: str) -> Any:
-        if not any(type(choice) is type(value) and choice == value for choice in choices):
+        if type(value) not in kinds or (type(value), value) not in known:
             _refuse(value, where, f"choose one of {', '.join(map(repr, choices))}")
         return value
 
@@ -292,13 +295,14 @@ def _ranged(inner: _Reader, metadata: Sequence[object]) -> _Reader:
             raise TypeError(f"{item!r}: a range of this kind is not checked")
     if not bounds and not lengths:
         return inner
+    checks = [(holds, bound) for holds, bound, _ in bounds]
     remedy = text or "must be " + " and ".join(words.format(bound) for _, bound, words in bounds)
     remedy_length = text or "must have a length of " + " and ".join(words.format(bound) for _, bound, words in lengths)
 
     def read(value: Any, where: str) -> Any:
         found = inner(value, where)
-        if bounds and isinstance(found, (int, float)):
-            for holds, bound, _ in bounds:
+        if checks and isinstance(found, (int, float)):
+            for holds, bound in checks:
                 if not holds(found, bound):
                     _refuse(found, where, remedy)
         if lengths and hasattr(found, "__len__"):

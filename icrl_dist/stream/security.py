@@ -1,11 +1,12 @@
-"""Who may talk to the learner, and about what: TLS both ways, and rules by role.
+"""Access to the learner: mutual TLS, and access rules by role.
 
-Without certificates a stream stays on its machine and all of this is empty.  With them the
-learner takes only clients whose certificate the same authority signed, and lets each do what
-its role does: the certificate's common name, ``worker`` or ``monitor``.  docs/security.md.
+Without certificates a stream stays on its node, and all settings here are empty.  With
+certificates the learner accepts only clients with a certificate of the same authority.  The
+certificate's common name is the client's role, ``worker`` or ``monitor``, and decides what the
+client may do (docs/security.md).
 
-Settings are Zenoh's keys, for ``ZenohLink.listen`` and ``ZenohLink.connect``; the templates in
-deploy/zenoh hold the same for other programs.
+Settings are Zenoh's keys, for ``ZenohLink.listen`` and ``ZenohLink.connect``.  The templates in
+deploy/zenoh hold the same settings for other programs.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ import ssl
 from pathlib import Path
 from typing import Literal
 
-from icrl_dist.stream.link import Keys, LinkError
+from icrl_dist.stream.link import LinkError, StreamKeys
 
 FOLDER = "ICRL_CERTIFICATES"
-"""Environment variable: the folder of certificates on a machine where they lie elsewhere."""
+"""Environment variable: the folder of certificates, on a node where it differs from the run file's."""
 
-REMEDY = "deploy/zenoh/certificates.sh makes what is needed, docs/security.md says what goes where"
+REMEDY = "deploy/zenoh/certificates.sh makes the files, docs/security.md says which node needs which"
 
 Settings = dict[str, object]
 
 
 def learner(certificates: str, run_name: str) -> Settings:
-    """What a learner that listens needs; nothing if ``certificates`` is empty.
+    """The settings of a learner; empty if ``certificates`` is.
 
-    Raises LinkError naming the file if one is missing or is not what it should be.
+    Raises LinkError with the file's name if one is missing or invalid.
     """
     if not certificates:
         return {}
@@ -37,14 +38,14 @@ def learner(certificates: str, run_name: str) -> Settings:
         **_tls(authority),
         "transport/link/tls/listen_certificate": certificate,
         "transport/link/tls/listen_private_key": key,
-        "access_control": _access(Keys(run_name)),
+        "access_control": _access(StreamKeys(run_name)),
     }
 
 
 def client(certificates: str, role: Literal["worker", "monitor"]) -> Settings:
-    """What a client of a learner needs; nothing if ``certificates`` is empty.
+    """The settings of a client of a learner; empty if ``certificates`` is.
 
-    Raises LinkError naming the file if one is missing or is not what it should be.
+    Raises LinkError with the file's name if one is missing or invalid.
     """
     if not certificates:
         return {}
@@ -65,24 +66,24 @@ def _tls(authority: str) -> Settings:
     }
 
 
-def _access(keys: Keys) -> dict[str, object]:
-    """The rules, as the learner's end of each connection sees them: what comes in, what goes out.
+def _access(keys: StreamKeys) -> dict[str, object]:
+    """The access rules, applied at the learner's end of each connection to incoming and outgoing messages.
 
-    What is not allowed is denied.  The answers to a client's own declarations (``declare_*``
-    going out) are allowed too: a publisher or querier that hears of nobody sends nothing.
+    Everything else is denied.  Outgoing ``declare_*`` messages are allowed, because a publisher
+    or querier that receives no declaration sends nothing.
     """
-    asked = [keys.data, keys.work, keys.weights_latest]
-    watched = ["icrl/*/mon/**"]  # a tap listens to whichever run is here
+    requested = [keys.data, keys.work, keys.weights_latest]
+    monitored = ["icrl/*/mon/**"]  # a tap need not know the run's name
     rules: dict[str, tuple[str, list[str], list[str]]] = {
-        "worker asks": ("ingress", ["query"], asked),
-        "worker is answered": ("egress", ["reply", "declare_queryable"], asked),
-        "worker follows the weights": ("ingress", ["declare_subscriber"], [keys.weights]),
-        "worker receives the weights": ("egress", ["put"], [keys.weights]),
-        "worker tells monitors": ("ingress", ["put"], [keys.monitor_all]),
-        "worker hears of monitors": ("egress", ["declare_subscriber"], watched),
-        "worker is alive": ("ingress", ["liveliness_token"], [keys.alive_all]),
-        "monitor watches": ("ingress", ["declare_subscriber"], watched),
-        "monitor is told": ("egress", ["put"], watched),
+        "worker sends requests": ("ingress", ["query"], requested),
+        "worker receives replies": ("egress", ["reply", "declare_queryable"], requested),
+        "worker subscribes to weights": ("ingress", ["declare_subscriber"], [keys.weights]),
+        "worker receives weights": ("egress", ["put"], [keys.weights]),
+        "worker publishes to monitors": ("ingress", ["put"], [keys.monitor_all]),
+        "worker learns of subscribers": ("egress", ["declare_subscriber"], monitored),
+        "worker holds a liveliness token": ("ingress", ["liveliness_token"], [keys.alive_all]),
+        "monitor subscribes": ("ingress", ["declare_subscriber"], monitored),
+        "monitor receives messages": ("egress", ["put"], monitored),
     }
     roles = ("worker", "monitor")
     return {
@@ -98,14 +99,14 @@ def _access(keys: Keys) -> dict[str, object]:
 
 
 def folder(certificates: str) -> str:
-    """The folder's whole path; empty if ``certificates`` is."""
+    """The folder's absolute path; empty if ``certificates`` is."""
     return str(Path(certificates).expanduser().absolute()) if certificates else ""
 
 
 def files(certificates: str, role: str) -> tuple[str, str, str]:
-    """The authority's certificate, the role's own and its key; empty if ``certificates`` is.
+    """The paths of the authority's certificate, the role's certificate and its key; empty if ``certificates`` is.
 
-    Raises LinkError naming the file if one is missing or is not what it should be.
+    Raises LinkError with the file's name if one is missing or invalid.
     """
     if not certificates:
         return "", "", ""
@@ -122,7 +123,7 @@ def files(certificates: str, role: str) -> tuple[str, str, str]:
     except ssl.SSLError as error:
         raise LinkError(f"{authority}: not a certificate ({_reason(error)}); {REMEDY}") from None
     try:
-        context.load_cert_chain(certificate, key, password=lambda: "")  # a key with a password would be asked for
+        context.load_cert_chain(certificate, key, password=lambda: "")  # so that OpenSSL does not prompt for one
     except ssl.SSLError as error:
         raise LinkError(f"{certificate} and {key.name}: not a certificate and its key ({_reason(error)}); {REMEDY}") from None
     return str(authority), str(certificate), str(key)

@@ -1,37 +1,45 @@
-"""Reading strangers' bytes: every field checked, sizes bounded, nothing executed.
+"""Decoding of untrusted bytes: every field is checked, sizes are bounded, nothing is executed.
 
-Whatever is wrong raises :class:`WireError` with one of the reasons in ``REASONS``.
+Every error is a :class:`WireError` with one of the reasons in ``REASONS``.  Maps with fixed fields
+are dataclasses that ``read`` decodes (``schema``); the functions here check what has no fixed
+fields: the bytes themselves, arrays, and free-form values.
 """
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Callable, Iterable, Mapping, Set
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 import msgpack
 import numpy as np
+from annotated_types import Ge
 
+from icrl_dist.stream import schema
+from icrl_dist.stream.excerpts import show
 from icrl_dist.types import ARRAYS
 
 _T = TypeVar("_T")
 
 VERSION = 1
-"""Version of every message; a reader refuses all others."""
+"""Version of the wire format, in every message; other versions are refused."""
 
 REASONS: dict[str, str] = {
     "oversized": "longer than the reader's limit",
     "not-msgpack": "not exactly one msgpack value of plain types",
-    "version": "written by another version of the wire",
+    "version": "written by another version of the wire format",
     "schema": "a field is missing, unknown, of the wrong type or out of range",
-    "dtype": "an array of a dtype that does not belong there",
-    "shape": "an array whose shape disagrees with its bytes, its rank or its companions",
-    "digest": "weights that do not hash to the digest they came with",
+    "dtype": "an array of a dtype that is not allowed there",
+    "shape": "an array whose shape does not fit its bytes, its rank or the other arrays",
+    "digest": "weights whose SHA-256 is not the digest in the message",
 }
-"""Every reason of a :class:`WireError`, fit to count drops by."""
+"""Every reason of a :class:`WireError`; the learner counts dropped messages by reason."""
 
 WEIGHT_DTYPES = frozenset({"<f2", "<f4", "<f8", "<i4", "<i8", "|u1"})
-"""Dtypes that a model's parameters may have."""
+"""Dtypes allowed for a model's parameters."""
+
+Count = Annotated[int, Ge(0)]
+Stage = Literal["pretrain", "adapt", "evaluate"]
+"""The values of ``types.STAGES``."""
 
 _ITEMS = 1 << 14
 _VALUES = 1 << 16
@@ -43,7 +51,7 @@ _DTYPES = {name: np.dtype(name) for name in WEIGHT_DTYPES | {dtype for dtype, _ 
 
 
 class WireError(ValueError):
-    """A message that is not what it should be; ``reason`` is a key of ``REASONS``."""
+    """A message that is not valid; ``reason`` is a key of ``REASONS``."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
@@ -52,33 +60,31 @@ class WireError(ValueError):
 
 
 def pack(kind: str, fields: Mapping[str, object]) -> bytes:
-    """A message of this version.  What msgpack cannot hold is refused."""
+    """The fields as a message of this version.  Raises WireError for values that msgpack cannot hold."""
     try:
         packed: bytes = msgpack.packb({"v": VERSION, "kind": kind, **fields}, use_bin_type=True)
     except (TypeError, ValueError, OverflowError) as error:
-        raise WireError("schema", f"{kind} holds what msgpack cannot: {error}") from error
+        raise WireError("schema", f"{kind} has a value that msgpack cannot hold: {error}") from error
     return packed
 
 
 def unpack(data: bytes, limit: int) -> dict[str, Any]:
-    """The one msgpack map that ``data`` is, of this version and within ``limit`` bytes."""
+    """Decode ``data``, of at most ``limit`` bytes, as one msgpack map of this version."""
     if len(data) > limit:
         raise WireError("oversized", f"{len(data)} bytes, the limit is {limit}")
     message = as_map(parse(data), "message")
     version = message.get("v")
     if type(version) is not int or version != VERSION:
-        raise WireError(
-            "version", f"version {show(version)}, this side reads {VERSION}: install the same release on both sides"
-        )
+        raise WireError("version", f"version {show(version)}, expected {VERSION}: install the same release on both sides")
     return message
 
 
 def parse(data: bytes) -> object:
-    """The one msgpack value that ``data`` is.  Takes at most 16 times its length and 8 MiB of memory."""
-    # msgpack makes room for as many entries as an array claims, before it looks for them: a thousand
-    # arrays within each other, 3 KB, claim 130 MB.  Skipping builds nothing and finds them missing.
+    """Decode ``data`` as one msgpack value.  Takes at most 16 times its length and 8 MiB of memory."""
+    # msgpack allocates as many entries as an array's header states before it reads them: a thousand
+    # nested headers, 3 KB, allocate 130 MB.  skip() allocates nothing and fails if entries are missing.
     reader = msgpack.Unpacker(max_buffer_size=max(1, len(data)), read_size=max(1, len(data)))
-    # An empty list takes 64 bytes of memory and one of the message.
+    # An empty list takes 64 bytes of memory and one byte of the message, so values are counted.
     count = _counter(_VALUES + len(data) // 8) if len(data) > _VALUES else None
     try:
         reader.feed(data)
@@ -116,12 +122,12 @@ def _counter(most: int) -> Callable[[Any], Any]:
 
 
 def no_extension(code: int, data: bytes) -> NoReturn:
-    """What msgpack is to do with an extension type: refuse it."""
+    """The ``ext_hook`` for msgpack: refuse every extension type."""
     raise ValueError(f"extension type {code}")
 
 
 def exactly(value: object, what: str, names: Set[str]) -> dict[str, Any]:
-    """``value`` as a map with these names, no fewer and no more."""
+    """``value`` as a map with exactly these names."""
     found = as_map(value, what)
     if found.keys() != names:
         odd = names ^ found.keys()
@@ -129,33 +135,23 @@ def exactly(value: object, what: str, names: Set[str]) -> dict[str, Any]:
     return found
 
 
-def show(value: object) -> str:
-    """A value for an error message, cut to fit a line, however large it is."""
-    text = _BRIEF.repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-class _Brief(reprlib.Repr):
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxlevel, self.maxlist, self.maxdict, self.maxstring, self.maxother = 3, 16, 16, 80, 80
-
-    def repr_bytes(self, value: bytes, level: int) -> str:
-        return repr(value[: self.maxstring])
-
-
-_BRIEF = _Brief()
+def read(cls: type[_T], fields: object, where: str = "") -> _T:
+    """A map with fixed fields as the dataclass ``cls``.  Raises WireError if the fields do not fit."""
+    try:
+        return schema.read(cls, fields, where)
+    except schema.Invalid as error:
+        raise WireError("schema", str(error)) from None
 
 
 def typed(value: object, kind: type[_T], what: str) -> _T:
-    """``value``, if it is exactly of this type."""
+    """``value``, which must be exactly of this type."""
     if type(value) is not kind:
         raise WireError("schema", f"{what} is {show(value)}, expected {kind.__name__}")
     return value
 
 
 def as_map(value: object, what: str) -> dict[str, Any]:
-    """``value`` as a map of names."""
+    """``value`` as a map whose keys are text."""
     found: dict[str, Any] = typed(value, dict, what)
     for name in found:
         if type(name) is not str:
@@ -164,7 +160,7 @@ def as_map(value: object, what: str) -> dict[str, Any]:
 
 
 def as_list(value: object, what: str, length: int | None = None) -> list[Any]:
-    """``value`` as a list, of this length if one is given."""
+    """``value`` as a list; with ``length``, as a list of that length."""
     if type(value) is not list:
         raise WireError("schema", f"{what} is {show(value)}, expected list")
     if length is not None and len(value) != length:
@@ -178,7 +174,7 @@ def text(value: object, what: str) -> str:
 
 
 def integer(value: object, what: str, low: int, high: int | None = None) -> int:
-    """``value`` as a whole number, at least ``low`` and at most ``high``."""
+    """``value`` as an integer of at least ``low`` and at most ``high``."""
     found = typed(value, int, what)
     if found < low:
         raise WireError("schema", f"{what} is {found}, expected at least {low}")
@@ -193,16 +189,16 @@ def from_array(array: np.ndarray) -> list[object]:
 
 
 def to_array(name: str, value: object, dtypes: Iterable[str], ndim: int | None) -> np.ndarray:
-    """The inverse of ``from_array``: read-only, without a copy, of an allowed dtype and rank."""
+    """Decode what ``from_array`` gives, without a copy; the array is read-only.  Refuses other dtypes and ranks."""
     dtype, shape, content = as_list(value, name, 3)
     if type(dtype) is not str or dtype not in dtypes:
         raise WireError("dtype", f"{name} is {show(dtype)}, expected one of {sorted(dtypes)}")
     if type(content) is not bytes:
-        raise WireError("schema", f"{name}'s content is {show(content)}, expected bytes")
+        raise WireError("schema", f"{name} has the content {show(content)}, expected bytes")
     cells = extent = 1
     for size in as_list(shape, name):
         if type(size) is not int or size < 0:
-            raise WireError("schema", f"{name} has shape {show(shape)}, expected whole numbers")
+            raise WireError("schema", f"{name} has shape {show(shape)}, expected integers of at least 0")
         cells *= size
         extent *= size or 1
     if len(shape) > DEPTH or extent > _CELLS or (ndim is not None and len(shape) != ndim):
@@ -214,7 +210,7 @@ def to_array(name: str, value: object, dtypes: Iterable[str], ndim: int | None) 
 
 
 def check_plain(value: object, where: str, depth: int) -> None:
-    """Refuse what is not nested plain values of builtin types."""
+    """Refuse everything but None, bool, int, float, str, bytes, and lists and maps of these, ``depth`` deep."""
     if value is None or isinstance(value, (bool, int, float, str, bytes)):
         if type(value).__module__ != "builtins":
             raise WireError("schema", f"{where} is a {type(value).__module__}.{type(value).__name__}: convert it first")
@@ -229,4 +225,4 @@ def check_plain(value: object, where: str, depth: int) -> None:
         for item in value:
             check_plain(item, f"{where}[]", depth - 1)
     else:
-        raise WireError("schema", f"{where} is {show(value)}: not a plain value")
+        raise WireError("schema", f"{where} is {show(value)}: expected None, a bool, number, text, bytes, list or map")

@@ -1,41 +1,45 @@
-"""The bytes that travel: msgpack maps with a version, checked field by field, read without pickle.
+"""The wire format: trajectories, weights, jobs and small messages as msgpack maps with a version number.
 
-An array is ``[dtype, shape, bytes]``.  Whatever is wrong with a message, in either direction,
-raises :class:`WireError` with one of the reasons in ``REASONS``; nothing else is raised.
+An array is ``[dtype, shape, bytes]``.  Every field is checked and nothing is unpickled.  An
+invalid message, whether it is encoded or decoded, raises :class:`WireError` with one of the
+reasons in ``REASONS``, and nothing else.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Set
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
 
 import msgpack
 import numpy as np
+from annotated_types import Ge, Interval
 
 from icrl_dist.stream import schema
+from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.validation import (
     DEPTH,
     REASONS,
     VERSION,
     WEIGHT_DTYPES,
+    Count,
+    Stage,
     WireError,
     as_list,
     as_map,
     check_plain,
     exactly,
     from_array,
-    integer,
     pack,
-    show,
+    read,
     text,
     to_array,
     unpack,
 )
 from icrl_dist.types import (
     ARRAYS,
-    STAGES,
     VECTORS,
     Adversary,
     Identity,
@@ -55,11 +59,47 @@ SMALL = 1 << 20
 """Default limit of jobs and messages, bytes."""
 
 _LARGEST = (1 << 31) - 1
-"""What store and ledger can hold of an identity's numbers and of weights versions."""
+"""Largest number of an identity, and largest weights version, that the dataset can store."""
+
+_T = TypeVar("_T")
+_Number = Annotated[int, Interval(ge=0, le=_LARGEST)]
+
+
+@dataclass(frozen=True, slots=True)
+class _TrajectoryFields:
+    identity: tuple[Stage, _Number, _Number, _Number, _Number]
+    variation: Any
+    policy_version: Annotated[int, Interval(ge=-1, le=_LARGEST)]
+    weights_digest: str
+    worker: str
+    origin: str
+    arrays: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _WeightsFields:
+    version: _Number
+    digest: str
+    arrays: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _JobFields:
+    job: str
+    stage: Stage
+    round: Count
+    task: Count
+    variations: Any
+    trials: Count
+    policy_version: Annotated[int, Ge(-1)]
+    seed: Count
+    payload: Any
+    tasks: Annotated[int, Ge(1)]
+    first: Count
 
 
 def encode_trajectory(trajectory: Trajectory) -> bytes:
-    """The trajectory as bytes.  The producer's mistakes are refused here, as the reader would refuse them."""
+    """The trajectory as bytes.  Raises WireError for a trajectory that the decoder would refuse."""
     arrays = trajectory.arrays()
     kinds = ARRAYS if arrays["actions"].ndim == 1 else VECTORS
     for name, array in arrays.items():
@@ -82,26 +122,27 @@ def encode_trajectory(trajectory: Trajectory) -> bytes:
 def decode_trajectory(data: bytes, limit: int) -> Trajectory:
     """The trajectory in ``data``, of at most ``limit`` bytes; its arrays are read-only views.
 
-    What the arrays hold (finiteness, the environment's bounds) is not the wire's to judge.
+    The arrays' values are not checked here: ingest checks that they are finite and within the
+    environment's bounds.
     """
-    fields = _fields(data, limit, "trajectory", _TRAJECTORY)
-    raw = exactly(fields["arrays"], "arrays", ARRAYS.keys())
+    fields = _decode(_TrajectoryFields, data, limit, "trajectory")
+    raw = exactly(fields.arrays, "arrays", ARRAYS.keys())
     kinds = VECTORS if as_list(raw["actions"], "actions", 3)[0] == VECTORS["actions"][0] else ARRAYS
     arrays = {name: to_array(name, raw[name], (dtype,), ndim) for name, (dtype, ndim) in kinds.items()}
     _check_lengths(arrays)
     return Trajectory(
-        identity=_to_identity(fields["identity"]),
-        variation=to_variation(fields["variation"]),
-        policy_version=integer(fields["policy_version"], "policy_version", -1, _LARGEST),
-        weights_digest=text(fields["weights_digest"], "weights_digest"),
-        worker=text(fields["worker"], "worker"),
-        origin=text(fields["origin"], "origin"),
+        identity=Identity(*fields.identity),
+        variation=to_variation(fields.variation),
+        policy_version=fields.policy_version,
+        weights_digest=fields.weights_digest,
+        worker=fields.worker,
+        origin=fields.origin,
         **arrays,
     )
 
 
 def trajectory_digest(trajectory: Trajectory) -> str:
-    """SHA-256 of all that a trajectory says, hexadecimal; the same whichever worker made it."""
+    """SHA-256 of a trajectory without its worker's name, hexadecimal; so every worker gives the same one."""
     head = [
         list(trajectory.identity),
         from_variation(trajectory.variation),
@@ -118,7 +159,7 @@ def weights_digest(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def encode_weights(weights: Weights) -> bytes:
-    """The weights as bytes; their digest must be that of their arrays."""
+    """The weights as bytes.  Raises WireError if their digest is not that of their arrays."""
     for name, array in weights.arrays.items():
         if array.dtype.str not in WEIGHT_DTYPES:
             raise WireError("dtype", f"{name} is {array.dtype.str}, expected one of {sorted(WEIGHT_DTYPES)}")
@@ -134,12 +175,11 @@ def encode_weights(weights: Weights) -> bytes:
 
 
 def decode_weights(data: bytes, limit: int) -> Weights:
-    """The weights in ``data``, of at most ``limit`` bytes, if they hash to the digest they came with."""
-    fields = _fields(data, limit, "weights", _WEIGHTS)
-    arrays = {text(n, "arrays"): to_array(n, a, WEIGHT_DTYPES, None) for n, a in as_map(fields["arrays"], "arrays").items()}
-    digest = text(fields["digest"], "digest")
-    _check_digest(digest, arrays)
-    return Weights(integer(fields["version"], "version", 0, _LARGEST), arrays, digest)
+    """The weights in ``data``, of at most ``limit`` bytes.  Raises WireError if their digest is not that of their arrays."""
+    fields = _decode(_WeightsFields, data, limit, "weights")
+    arrays = {text(n, "arrays"): to_array(n, a, WEIGHT_DTYPES, None) for n, a in as_map(fields.arrays, "arrays").items()}
+    _check_digest(fields.digest, arrays)
+    return Weights(fields.version, arrays, fields.digest)
 
 
 def encode_job(job: Job) -> bytes:
@@ -167,26 +207,25 @@ ReadPayload = Callable[[str, Any], Payload]
 
 
 def decode_job(data: bytes, read_payload: ReadPayload, limit: int = SMALL) -> Job:
-    """The job in ``data``, equal to the one encoded; ``read_payload`` decodes what its kind needs."""
-    fields = _fields(data, limit, "job", _JOB)
-    kind = text(fields["job"], "job")
-    check_plain(fields["payload"], "payload", DEPTH)
+    """The job in ``data``, equal to the encoded one; ``read_payload`` decodes what its kind needs."""
+    fields = _decode(_JobFields, data, limit, "job")
+    check_plain(fields.payload, "payload", DEPTH)
     try:
-        payload = read_payload(kind, fields["payload"])
+        payload = read_payload(fields.job, fields.payload)
     except ValueError as error:
         raise WireError("schema", str(error)) from None
     return Job(
-        kind=kind,
-        stage=_stage(fields["stage"]),
-        round=integer(fields["round"], "round", 0),
-        task=integer(fields["task"], "task", 0),
-        variations=tuple(to_variation(v) for v in as_list(fields["variations"], "variations")),
-        trials=integer(fields["trials"], "trials", 0),
-        policy_version=integer(fields["policy_version"], "policy_version", -1),
-        seed=integer(fields["seed"], "seed", 0),
+        kind=fields.job,
+        stage=fields.stage,
+        round=fields.round,
+        task=fields.task,
+        variations=tuple(to_variation(v) for v in as_list(fields.variations, "variations")),
+        trials=fields.trials,
+        policy_version=fields.policy_version,
+        seed=fields.seed,
         payload=payload,
-        tasks=integer(fields["tasks"], "tasks", 1),
-        first=integer(fields["first"], "first", 0),
+        tasks=fields.tasks,
+        first=fields.first,
     )
 
 
@@ -194,7 +233,7 @@ def encode_message(kind: str, **fields: object) -> bytes:
     """A small message: None, bool, int, float, str, bytes, and lists and maps of them, at most 8 deep."""
     for name in ("v", "kind"):
         if name in fields:
-            raise WireError("schema", f"{name!r} names the message itself and cannot be a field")
+            raise WireError("schema", f"{name!r} is a key of every message: name the field otherwise")
     check_plain({"kind": kind, **fields}, "message", DEPTH)
     return pack(kind, fields)
 
@@ -207,40 +246,12 @@ def decode_message(data: bytes, limit: int = SMALL) -> tuple[str, dict[str, Any]
     return text(message.pop("kind", None), "kind"), message
 
 
-_ALWAYS = {"v", "kind"}
-_TRAJECTORY = _ALWAYS | {"identity", "variation", "policy_version", "weights_digest", "worker", "origin", "arrays"}
-_WEIGHTS = _ALWAYS | {"version", "digest", "arrays"}
-_JOB = _ALWAYS | {
-    "job",
-    "stage",
-    "round",
-    "task",
-    "variations",
-    "trials",
-    "policy_version",
-    "seed",
-    "payload",
-    "tasks",
-    "first",
-}
-
-
-def _fields(data: bytes, limit: int, kind: str, names: Set[str]) -> dict[str, Any]:
+def _decode(cls: type[_T], data: bytes, limit: int, kind: str) -> _T:
     message = unpack(data, limit)
     if message.get("kind") != kind:
         raise WireError("schema", f"kind {show(message.get('kind'))}, expected {kind!r}")
-    return exactly(message, kind, names)
-
-
-def _stage(value: object) -> str:
-    if value not in STAGES:
-        raise WireError("schema", f"stage is {show(value)}, expected one of {STAGES}")
-    return text(value, "stage")
-
-
-def _to_identity(value: object) -> Identity:
-    stage, *numbers = as_list(value, "identity", 5)
-    return Identity(_stage(stage), *(integer(n, "identity", 0, _LARGEST) for n in numbers))
+    del message["v"], message["kind"]
+    return read(cls, message)
 
 
 def _from_params(params: Params) -> list[object]:
@@ -268,7 +279,7 @@ def from_variation(variation: Variation) -> list[object]:
 
 
 def to_variation(value: object) -> Variation:
-    """The inverse of ``from_variation``, checked."""
+    """The inverse of ``from_variation``.  Raises WireError for other values."""
     (task, of_task), (adversary, of_adversary) = (as_list(named, "variation", 2) for named in as_list(value, "variation", 2))
     return Variation(
         Task(text(task, "task"), _to_params(of_task, "task")),
@@ -291,19 +302,19 @@ def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
         if len(arrays[name]) != rows:
             raise WireError("shape", f"{name} has {len(arrays[name])} rows, expected {rows}")
     if len(arrays["taken"]) > len(arrays["queries"]):
-        raise WireError("shape", f"{len(arrays['taken'])} actions were taken at {len(arrays['queries'])} queries")
+        raise WireError("shape", f"taken has {len(arrays['taken'])} rows, expected at most {len(arrays['queries'])}")
     if arrays["queries"].shape[1] != arrays["observations"].shape[1]:
         shapes = arrays["queries"].shape, arrays["observations"].shape
-        raise WireError("shape", f"queries and observations have shapes {shapes}: different observation components")
+        raise WireError("shape", f"queries and observations have shapes {shapes}, expected equal numbers of components")
     if arrays["actions"].ndim == 2 and len({arrays[name].shape[1] for name in ("actions", "taken", "labels")}) != 1:
         widths = {name: arrays[name].shape[1] for name in ("actions", "taken", "labels")}
-        raise WireError("shape", f"vectors of actions have unlike components: {widths}")
+        raise WireError("shape", f"action vectors have {widths} components, expected equal numbers")
 
 
 def _check_digest(digest: str, arrays: Mapping[str, np.ndarray]) -> None:
     found = weights_digest(arrays)
     if found != digest:
-        raise WireError("digest", f"these arrays hash to {found}, not to {show(digest)}")
+        raise WireError("digest", f"the arrays have the digest {found}, expected {show(digest)}")
 
 
 def _hash(head: list[object], arrays: Iterable[tuple[str, np.ndarray]]) -> str:

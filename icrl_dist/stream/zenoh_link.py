@@ -1,7 +1,7 @@
-"""A link between machines: the one file that knows Zenoh.
+"""A link between nodes: the only file that imports Zenoh.
 
-The learner listens; workers and taps are clients of it and come back by themselves when it
-does.  No discovery, no shared memory: who talks to whom is what was configured.
+The learner listens.  Workers and taps are its clients and reconnect by themselves when it comes
+back.  Discovery and shared memory are off: only configured connections exist.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from icrl_dist.stream.link import (
 )
 
 _REFUSED = b"refused: "
-"""Before a reason of ours: Zenoh answers for itself with error replies too (``Timeout``)."""
+"""Prefix of our refusals: Zenoh sends error replies of its own too (``Timeout``)."""
 
 
 class ZenohLink(Link):
@@ -50,7 +50,7 @@ class ZenohLink(Link):
         self._lock = threading.Lock()
         self._closed = False
         self._numbers = itertools.count()
-        self._under_way: dict[int, Done] = {}
+        self._pending: dict[int, Done] = {}
         self._declaring = threading.Lock()
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
@@ -61,9 +61,9 @@ class ZenohLink(Link):
 
     @classmethod
     def listen(cls, endpoint: str, config: Mapping[str, object] | None = None) -> ZenohLink:
-        """Listen on ``endpoint``, such as ``tcp/127.0.0.1:7447``; port 0 takes a free one.
+        """Listen on ``endpoint``, such as ``tcp/127.0.0.1:7447``; with port 0 on a free port.
 
-        ``config`` sets further Zenoh keys (TLS, users).  Raises LinkError if it cannot listen there.
+        ``config`` sets further Zenoh keys (TLS, access control).  Raises LinkError if it cannot listen there.
         """
         settings = {"mode": "peer", "connect/endpoints": [], **(config or {})}
         for left in range(9, -1, -1):
@@ -77,9 +77,9 @@ class ZenohLink(Link):
 
     @classmethod
     def connect(cls, endpoint: str, timeout_s: float, config: Mapping[str, object] | None = None) -> ZenohLink:
-        """Connect to a link that listens on ``endpoint``, and again by itself whenever that is lost.
+        """Connect to a link that listens on ``endpoint``; a lost connection is opened again automatically.
 
-        ``config`` as in :meth:`listen`.  Raises LinkError if nobody answers within ``timeout_s``.
+        ``config`` as in :meth:`listen`.  Raises LinkError if there is no connection within ``timeout_s``.
         """
         settings = {
             "mode": "client",
@@ -99,11 +99,11 @@ class ZenohLink(Link):
 
     def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
         number, caller = next(self._numbers), threading.get_ident()
-        under_way = self._under_way
-        under_way[number] = done  # whoever takes it out again calls it
+        pending = self._pending
+        pending[number] = done  # the code that removes it calls it, so it is called once
 
         def settle(outcome: Outcome) -> None:
-            waiting = under_way.pop(number, None)
+            waiting = pending.pop(number, None)
             if waiting is None:
                 return
             if threading.get_ident() == caller:
@@ -115,16 +115,16 @@ class ZenohLink(Link):
             settle(_outcome(reply))
 
         def on_end() -> None:
-            if number in under_way:
-                settle(Unanswered(f"nobody answered on {key}"))
+            if number in pending:
+                settle(Unanswered(f"no process answered on {key}"))
 
         try:
             with self._errors():
                 self._querier(key, timeout_s).get(Callback(on_reply, on_end, indirect=False), payload=payload)
         except LinkError:
-            if self._closed and under_way.pop(number, None) is not None:
+            if self._closed and pending.pop(number, None) is not None:
                 raise
-            settle(Unanswered(f"{key} could not be asked"))
+            settle(Unanswered(f"the request on {key} could not be sent"))
 
     def serve(self, key: str, handler: Callable[[Query], None]) -> None:
         def answer(query: zenoh.Query) -> None:
@@ -137,21 +137,21 @@ class ZenohLink(Link):
         with self._errors():
             self._publisher(key, droppable).put(payload)
 
-    def watched(self, key: str) -> bool:
+    def has_subscribers(self, key: str) -> bool:
         with self._errors():
-            status: Any = self._publisher(key, droppable=True).matching_status  # its stub says bool, which is always true
+            status: Any = self._publisher(key, droppable=True).matching_status  # no bool: always true
             return bool(status.matching)
 
     def subscribe(self, key_expr: str, handler: Callable[[str, bytes], None]) -> None:
         mailbox = self._mailbox(handler)
 
-        def hear(sample: zenoh.Sample) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
             droppable = sample.congestion_control == CongestionControl.DROP or may_drop(key)
             mailbox.put(key, sample.payload.to_bytes(), droppable=droppable)
 
         with self._errors():
-            self._declared.append(self._session.declare_subscriber(key_expr, Callback(hear, indirect=False)))
+            self._declared.append(self._session.declare_subscriber(key_expr, Callback(on_sample, indirect=False)))
 
     def announce(self, key: str) -> None:
         with self._errors():
@@ -160,13 +160,13 @@ class ZenohLink(Link):
     def watch(self, key_expr: str, handler: Callable[[str, bool], None]) -> None:
         mailbox = self._mailbox(handler)
 
-        def hear(sample: zenoh.Sample) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
             alive = sample.kind == zenoh.SampleKind.PUT
             mailbox.put(str(sample.key_expr).rpartition("/")[2], alive, droppable=False)
 
         with self._errors():
             liveliness = self._session.liveliness()
-            self._declared.append(liveliness.declare_subscriber(key_expr, Callback(hear, indirect=False), history=True))
+            self._declared.append(liveliness.declare_subscriber(key_expr, Callback(on_sample, indirect=False), history=True))
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -179,8 +179,8 @@ class ZenohLink(Link):
             self._closed = True
         atexit.unregister(self.close)
         self._session.close()  # type: ignore[no-untyped-call]
-        for number in list(self._under_way):
-            if (done := self._under_way.pop(number, None)) is not None:
+        for number in list(self._pending):
+            if (done := self._pending.pop(number, None)) is not None:
                 self._dispatcher.post(functools.partial(done, Unanswered("the link was closed")))
         for mailbox in self._mailboxes:
             mailbox.close()
@@ -239,18 +239,18 @@ class _ZenohQuery:
         self._query: zenoh.Query | None = query
 
     def reply(self, payload: bytes) -> None:
-        query = self._take()
+        query = self._claim()
         with contextlib.suppress(zenoh.ZError):
             query.reply(self.key, payload)
         query.drop()  # type: ignore[no-untyped-call]
 
     def refuse(self, reason: str) -> None:
-        query = self._take()
+        query = self._claim()
         with contextlib.suppress(zenoh.ZError):
             query.reply_err(_REFUSED + reason.encode("utf-8", "replace"))
         query.drop()  # type: ignore[no-untyped-call]
 
-    def _take(self) -> zenoh.Query:
+    def _claim(self) -> zenoh.Query:
         with self._lock:
             query, self._query = self._query, None
         if query is None:
@@ -270,21 +270,21 @@ def _outcome(reply: zenoh.Reply) -> Outcome:
 _RUNTIME = "(rx: (worker_threads: 1), {rest}, app: (worker_threads: 1))".format(
     rest=", ".join(f"{name}: (handover: app)" for name in ("acc", "tx", "net"))
 )
-"""Zenoh's threads: one to receive, one for the rest; its default of six costs a third more CPU a message."""
+"""Zenoh's threads: one for receiving, one for the rest; the default of six takes a third more CPU time a message."""
 
 
 def _open(settings: Mapping[str, object]) -> zenoh.Session:
-    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read once, when the process opens its first session
-    everywhere: dict[str, object] = {
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # Zenoh reads it once, when the process opens its first session
+    common: dict[str, object] = {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
-        "transport/link/tx/queue/size/data": 8,  # a request of several trajectories goes out without waiting
-        "transport/link/rx/buffer_size": 1 << 18,  # and comes in with few reads
+        "transport/link/tx/queue/size/data": 8,  # a request of several trajectories is sent without waiting
+        "transport/link/rx/buffer_size": 1 << 18,  # and received with few reads
     }
     config = zenoh.Config()
     try:
-        for key, value in {**everywhere, **settings}.items():
+        for key, value in {**common, **settings}.items():
             config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -296,7 +296,7 @@ def _open(settings: Mapping[str, object]) -> zenoh.Session:
 
 
 def _with_port(endpoint: str) -> str:
-    """The endpoint with a free port in place of port 0: Zenoh does not tell which one it took."""
+    """The endpoint with a free port in place of port 0, because Zenoh does not report the port that it chose."""
     found = re.fullmatch(r"([a-z]+/)(.*):0([?#].*)?", endpoint)
     if found is None:
         return endpoint
@@ -308,9 +308,9 @@ def _with_port(endpoint: str) -> str:
             probe.bind((host.strip("[]"), 0))
             return f"{protocol}{host}:{probe.getsockname()[1]}{rest or ''}"
     except OSError as error:
-        raise LinkError(f"cannot listen on {endpoint}: {error}; name an address of this machine") from error
+        raise LinkError(f"cannot listen on {endpoint}: {error}; name an address of this node") from error
 
 
 def _brief(error: BaseException) -> str:
-    """Zenoh's message without the places in its source that it came through."""
+    """Zenoh's message without the positions in its source code."""
     return re.sub(r" at /\S+", "", str(error)).strip()

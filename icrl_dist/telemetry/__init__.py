@@ -1,1 +1,1 @@
-"""Metrics, alerts, crash reports, and the processes of a run."""
+"""Metrics, alerts, crash records, and recognition of a run's processes."""

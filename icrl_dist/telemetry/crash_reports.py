@@ -1,7 +1,7 @@
-"""Crash records: what went wrong in a worker, as files of the run folder that outlive it.
+"""Crash records: files of the run folder about errors and deaths of workers.
 
-``RUN_DIR/crashes`` holds ``WORKER-N.json``, one for each time that a worker raised or vanished,
-and ``WORKER.stacks``, where its threads stood when it was stuck or crashed.
+``RUN_DIR/crashes`` holds ``WORKER-N.json``, a file for each time that a worker raised an error or
+disappeared, and ``WORKER.stacks``, the stacks of its threads when it was stuck or crashed.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import psutil
 from icrl_dist.types import Identity, Job
 
 _LINE, _TEXT = 1_000, 20_000
-"""A record keeps so many characters of an exception, and of a traceback's end."""
+"""Characters that a record keeps of an exception, and of the end of a traceback."""
 
 
 def folder_of(run: Path) -> Path:
-    """Where a run folder keeps its crash records."""
+    """The folder of a run's crash records."""
     return run / "crashes"
 
 
 def stacks_of(run: Path, worker: str) -> Path:
-    """Where a worker's stacks go."""
+    """The file of a worker's stacks."""
     return folder_of(run) / f"{worker}.stacks"
 
 
 def sweep(run: Path) -> None:
-    """Remove the stacks files in which nothing stands, at a run's end."""
+    """Remove empty stacks files, at a run's end."""
     for path in folder_of(run).glob("*.stacks"):
-        with contextlib.suppress(FileNotFoundError):  # its worker was quicker
+        with contextlib.suppress(FileNotFoundError):  # its worker has removed it
             if not path.stat().st_size:
                 path.unlink()
 
@@ -43,12 +43,12 @@ def sweep(run: Path) -> None:
 def memory() -> dict[str, float]:
     """This process's resident memory now and at its peak, in MB."""
     now = psutil.Process().memory_info().rss / 2**20
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # which the kernel counts less often
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # the kernel updates it less often
     return {"memory_mb": round(now, 1), "peak_mb": round(max(now, peak), 1)}
 
 
 def raised(worker: str, job: Job, identity: Identity | None, error: BaseException) -> dict[str, Any]:
-    """The record of a job that raised while ``identity`` was under way."""
+    """The record of a job that raised ``error`` while it made the trajectory ``identity``."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     return {
         "what": "raised",
@@ -67,7 +67,7 @@ def raised(worker: str, job: Job, identity: Identity | None, error: BaseExceptio
 
 
 def write(run: Path, record: dict[str, Any]) -> Path:
-    """Keep a record under its worker's next free number; returns the file."""
+    """Write a record to its worker's next free file name; returns the file."""
     folder = folder_of(run)
     folder.mkdir(exist_ok=True)
     text, number = json.dumps(record, indent=1) + "\n", 1
@@ -83,13 +83,13 @@ def write(run: Path, record: dict[str, Any]) -> Path:
 
 
 def _text(text: str) -> str:
-    """What any wire and file can hold: an exception's words may be no valid text."""
+    """Text that UTF-8 can encode: an exception's text may hold lone surrogates."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def predecessor(worker: str) -> str | None:
-    """Whose place it takes: a worker's second life is named ``w0-1``, its third ``w0-2``; None for a first life."""
-    name, _, life = worker.rpartition("-")
-    if not (name and life.isascii() and life.isdigit() and 0 < int(life) < 10**6):
+    """The worker that this one replaces: ``w0-1`` replaces ``w0``, ``w0-2`` replaces ``w0-1``; None for ``w0``."""
+    name, _, number = worker.rpartition("-")
+    if not (name and number.isascii() and number.isdigit() and 0 < int(number) < 10**6):
         return None
-    return name if int(life) == 1 else f"{name}-{int(life) - 1}"
+    return name if int(number) == 1 else f"{name}-{int(number) - 1}"

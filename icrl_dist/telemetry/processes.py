@@ -1,4 +1,4 @@
-"""A training's processes, as other programs see them."""
+"""Recognize the processes of a training run by their command lines."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import psutil
 
 
 def is_learner(process: psutil.Process) -> bool:
-    """Whether this is the learner of a run."""
-    return "-m learner" in _words(process)
+    """Whether this is a run's learner process."""
+    return "-m learner" in _command_line(process)
 
 
 def is_worker(process: psutil.Process, spare: bool = False) -> bool:
-    """Whether this is a worker at work, or with ``spare`` also one that waits to replace another."""
-    return ("WorkerActor" if spare else "WorkerActor.work") in _words(process)
+    """Whether this is a busy worker process, or with ``spare`` also one that waits to replace another."""
+    return ("WorkerActor" if spare else "WorkerActor.work") in _command_line(process)
 
 
-def _words(process: psutil.Process) -> str:
-    """Its command line; empty if it is gone or not ours to look at."""
+def _command_line(process: psutil.Process) -> str:
+    """The command line; empty if the process is gone or not accessible."""
     with contextlib.suppress(psutil.Error):
         return " ".join(process.cmdline())
     return ""

@@ -16,13 +16,13 @@ from icrl_dist.methods.recipes import METHODS
 
 from actors.fleet import Fleet, FleetFailed
 from icrl_dist.stream import batching, wire
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 from tests.e2e.training import wait_for
 
-KEYS = Keys("test")
+KEYS = StreamKeys("test")
 HOSTILE = Path(__file__).parent / "hostile"
 WORKER = """  # hostile-worker
 import sys

@@ -8,11 +8,11 @@ import pytest
 from actors import publisher as publisher_module
 from actors.publisher import EpisodeSampler, TrajectoryPublisher
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.types import Identity
 from tests.monitor.messages import trajectory
 
-KEYS = Keys("test")
+KEYS = StreamKeys("test")
 
 
 class RecordingLink:

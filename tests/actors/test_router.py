@@ -7,12 +7,12 @@ import pytest
 
 from actors import router
 from icrl_dist.stream import security
-from icrl_dist.stream.link import Keys, LinkError, Unanswered
+from icrl_dist.stream.link import LinkError, StreamKeys, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
 from tests.contracts.link_battery import eventually
 
-KEYS = Keys("run")
+KEYS = StreamKeys("run")
 
 
 def free_address():

@@ -24,12 +24,12 @@ from icrl_dist.problems import splits
 from icrl_dist.problems.darkroom.posterior import Room
 from icrl_dist.problems.registry import spec
 from icrl_dist.stream import batching, monitor_messages, wire
-from icrl_dist.stream.link import Keys, Refused, Unanswered
+from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 from tests.contracts.link_battery import eventually
 
-KEYS = Keys("test")
+KEYS = StreamKeys("test")
 
 
 def weights(run, version):

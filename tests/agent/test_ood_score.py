@@ -15,7 +15,8 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.outcome_readout import RARE, WINDOWS, OutcomeModel
 from icrl_dist.problems import registry, splits
 from icrl_dist.results import evaluate, heldout
-from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.storage.files import StoreError
 from icrl_dist.types import NULL, Spec
 
 B, D = 6, 4

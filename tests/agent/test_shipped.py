@@ -15,7 +15,7 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import splits
 from icrl_dist.results import evaluate
-from icrl_dist.storage.files import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.training.fit import Optimizer
 from learner import checkpoints
 

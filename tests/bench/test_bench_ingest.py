@@ -21,8 +21,8 @@ def test_it_measures_with_and_without_fsync_and_removes_its_files(
     on_disk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = []
-    real = ingest.Store
-    monkeypatch.setattr(ingest, "Store", lambda folder, durable: opened.append(durable) or real(folder, durable=durable))
+    real = ingest.Dataset
+    monkeypatch.setattr(ingest, "Dataset", lambda folder, durable: opened.append(durable) or real(folder, durable=durable))
     result = ingest.run(tmp_path / "here", seconds=0.4, pairs=2)
     assert opened == [True, False, True, True, False]  # the warm-up, then alternating
     assert result["durable_per_s"] > 0 and result["ratio"] > 0 and result["fsync_p50_ms"] > 0

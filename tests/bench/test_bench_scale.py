@@ -33,7 +33,7 @@ def test_it_measures_every_number_of_workers_and_removes_its_files(on_disk, tmp_
 
         def counted(group):
             take(group)
-            stored.append({row.identity.task for row in store.ledger})
+            stored.append({row.identity.task for row in store.index})
 
         made.take = counted
         return made

@@ -1,4 +1,4 @@
-"""Faults on purpose: they land, the digests stay, and a fault that does not land fails the command."""
+"""Fault injection: faults land, digests do not change, and a fault that does not land fails the command."""
 
 import contextlib
 import dataclasses
@@ -42,18 +42,18 @@ def chaos(capsys, reference, out, *arguments):
     return code, answer["faults"], printed.err
 
 
-def mine():
+def child_processes():
     return [p.pid for p in psutil.Process().children(recursive=True)]
 
 
 @pytest.mark.parametrize("fault", ["kill-worker", "torn-tail"])
 def test_a_fault_lands_and_changes_no_digest(capsys, reference, tmp_path, fault):
-    before = mine()
+    before = child_processes()
     code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", fault)
     assert code == 0 and row["landed"] and row["equal"], text
     assert {"kill-worker": "worker deaths: 1", "torn-tail": "segment-"}[fault] in row["evidence"]
     assert row["struck"] and fault in text and "all 1 faults landed" in text
-    assert not list((tmp_path / "seed-0").iterdir()) and mine() == before
+    assert not list((tmp_path / "seed-0").iterdir()) and child_processes() == before
 
 
 def test_a_fault_that_does_not_land_fails_the_command(capsys, reference, tmp_path, monkeypatch):
@@ -69,7 +69,7 @@ def test_a_fault_that_does_not_land_fails_the_command(capsys, reference, tmp_pat
 def test_an_unequal_digest_fails_the_command(capsys, reference, tmp_path, monkeypatch):
     result = json.loads((reference / "result.json").read_text())
     for name, code in (("dataset_digest", 1), ("weights_digest", 1), ("seconds", 0)):
-        struck = Struck("adapt/0, 7 heard", True, "it died", result | {name: "0" * 64})
+        struck = Struck("adapt/0, 7 trajectories", True, "it died", result | {name: "0" * 64})
         monkeypatch.setitem(FAULTS, "kill-worker", lambda *_, struck=struck: struck)
         ended, (row,), text = chaos(capsys, reference, tmp_path, "--faults", "kill-worker")
         assert ended == code and row["landed"] and row["equal"] is (code == 0) and row["attempts"] == 1
@@ -77,7 +77,7 @@ def test_an_unequal_digest_fails_the_command(capsys, reference, tmp_path, monkey
 
 
 @pytest.mark.parametrize(("landed", "equal"), [(True, True), (True, False), (False, True), (False, False)])
-def test_the_verdict_needs_both(landed, equal):
+def test_the_verdict_needs_a_landed_fault_and_equal_digests(landed, equal):
     outcome = Outcome(0, "kill-tree", "adapt/0", landed, "", equal)
     assert outcome.ok is (landed and equal)
     assert ("every digest equals" in verdict([outcome])) is outcome.ok
@@ -96,23 +96,23 @@ def test_the_schedule_is_a_function_of_the_seed():
     assert {strike.fit for strike in drawn.values()} == {False, True}
 
 
-def test_a_run_without_a_sealed_segment_is_told_so():
+def test_a_fault_that_cannot_strike_the_run_is_refused():
     with pytest.raises(ConfigError, match="--faults flip-byte: dpt has one phase"):
         schedule.draw(override(load("smoke"), ["method=dpt"], "test"), 0, "flip-byte")
 
 
-def test_what_cannot_be_asked_for(capsys, reference, tmp_path):
+def test_invalid_arguments_are_refused(capsys, reference, tmp_path):
     def refused(*arguments):
         assert main.main(["chaos", "smoke", "--out", str(tmp_path / "out"), *arguments]) == 2
         return capsys.readouterr().err
 
-    assert "no such fault; there are kill-worker" in refused("--faults", "kill-all")
-    assert "run of other numbers" in refused("--reference", str(reference), "--set", "seed=1")
+    assert "unknown fault; choose from kill-worker" in refused("--faults", "kill-all")
+    assert "run with other settings" in refused("--reference", str(reference), "--set", "seed=1")
     assert "holds no result" in refused("--reference", str(tmp_path))
     assert "at least 1" in refused("--seeds", "0")
 
 
-def test_a_cut_link_is_silent_and_loses_nothing():
+def test_a_cut_proxy_holds_data_back_and_loses_none():
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         cable = stack.enter_context(proxy.Proxy(server.getsockname))
@@ -136,18 +136,18 @@ def test_a_cut_link_is_silent_and_loses_nothing():
         assert far.recv(8) == b""
 
 
-def test_a_disk_is_full_then_larger_and_what_it_held_stays(tmp_path):
+def test_a_full_disk_can_be_enlarged_and_its_files_are_kept(tmp_path):
     try:
-        held = disk.Disk(tmp_path / "disk", 8 * disk.PAGE)
+        mounted = disk.Disk(tmp_path / "disk", 8 * disk.PAGE)
     except disk.NoDisk as error:
-        pytest.skip(f"nothing can be mounted here: {error}")
-    with held:
+        pytest.skip(f"this node does not allow a mount: {error}")
+    with mounted:
         with pytest.raises(OSError) as caught:
-            (held.view / "large").write_bytes(bytes(9 * disk.PAGE))
+            (mounted.view / "large").write_bytes(bytes(9 * disk.PAGE))
         assert caught.value.errno == errno.ENOSPC
-        held.grow(16 * disk.PAGE)
-        (held.view / "large").write_bytes(bytes(9 * disk.PAGE))
-        assert disk.allocated(held.view) == 9 * disk.PAGE
+        mounted.grow(16 * disk.PAGE)
+        (mounted.view / "large").write_bytes(bytes(9 * disk.PAGE))
+        assert disk.allocated(mounted.view) == 9 * disk.PAGE
     assert not os.path.ismount(tmp_path / "disk")
     assert (tmp_path / "disk" / "large").read_bytes() == bytes(9 * disk.PAGE)
 
@@ -159,10 +159,10 @@ def test_metrics_on_a_full_disk_name_the_remedy(tmp_path):
     with pytest.raises(StoreError, match=remedy):
         metrics.write(1, "fit", loss=1.0)
     with pytest.raises(StoreError, match=remedy):
-        metrics.close()  # what it holds cannot be written either
+        metrics.close()  # its buffer cannot be written either
 
 
-def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
+def test_a_full_disk_is_reported_in_one_line_with_the_remedy(capsys, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device", "runs/smoke/report/adaptation.png")
 
@@ -172,7 +172,7 @@ def test_a_full_disk_is_told_in_one_line_with_the_remedy(capsys, monkeypatch):
     assert "adaptation.png: could not be written" in line and "free space, then use --resume" in line
 
 
-def test_a_learner_on_a_full_disk_tells_the_remedy_and_an_unforeseen_error_keeps_its_trace(capsys, monkeypatch, tmp_path):
+def test_a_learner_reports_a_full_disk_with_the_remedy_and_other_errors_with_a_traceback(capsys, monkeypatch, tmp_path):
     def fails(code):
         monkeypatch.setattr(learner, "_serve", lambda *_: (_ for _ in ()).throw(OSError(code, os.strerror(code), "endpoint")))
         return learner.main()
@@ -185,7 +185,7 @@ def test_a_learner_on_a_full_disk_tells_the_remedy_and_an_unforeseen_error_keeps
         fails(errno.EIO)
 
 
-def test_resuming_leaves_the_run_file_alone(tmp_path):
+def test_resuming_does_not_rewrite_the_run_file(tmp_path):
     run, folder = load("smoke"), tmp_path / "run"
     prepare(run, folder, resume=False, overwrite=False)
     (folder / "run.toml").chmod(0o444)

@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from icrl_dist.agent.loading import load_agent
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests.e2e.training import endpoint_of, equal, finish, result_of, start, wait_for
@@ -51,7 +51,7 @@ def test_returns_stand_beside_the_experts_and_random_ones(inline):
     assert action.shape == (1, 2) and action.dtype == np.float32 and np.abs(action).max() <= 1
     agent.observe(np.zeros((1, 6)), action, [1.0], np.zeros((1, 6)), [False])
     assert agent.surprise.shape == (1,)
-    store = Store(folder / "inline" / "dataset", readonly=True)
+    store = Dataset(folder / "inline" / "dataset", readonly=True)
     origins = {t.origin for key in store.variations("pretrain", 0) for t in store.trials(key)}
     adapted = [t for key in store.variations("adapt", 0) for t in store.trials(key)]
     store.close()

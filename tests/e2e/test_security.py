@@ -1,108 +1,91 @@
-"""Off this machine: who is let in, what each may do, and that a whole run ends as it does in the clear."""
+"""TLS streams: which clients are accepted, what each role may do, and that a whole run gives the same digests."""
 
 import contextlib
 import json
 import shutil
-import time
 
 import pytest
-import zenoh
 
 from icrl_dist.cli import main
 from icrl_dist.stream import security
-from icrl_dist.stream.link import Keys, LinkError, Refused, Unanswered
+from icrl_dist.stream.link import LinkError, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
 from tests.contracts.link_battery import eventually
+from tests.e2e.intruder import FORBIDDEN, KEYS, OPEN_S, TLS, Scene, answered, listening, read_the_monitor_key
 from tests.e2e.training import NO_RESTARTS, SMOKE, endpoint_of, equal, finish, result_of, start
 
-KEYS = Keys("run")
-TLS = "transport/link/tls/"
-OPEN_S, SHUT_S = 20.0, 0.5
-"""How long to wait for what must happen, and for what must not."""
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory):
+    return certificates.make(tmp_path_factory.mktemp("certified"))
 
 
 @pytest.fixture(scope="module")
-def ours(tmp_path_factory):
-    return certificates.make(tmp_path_factory.mktemp("ours"))
+def foreign(tmp_path_factory):
+    return certificates.make(tmp_path_factory.mktemp("foreign"))
 
 
-@pytest.fixture(scope="module")
-def theirs(tmp_path_factory):
-    return certificates.make(tmp_path_factory.mktemp("theirs"))
-
-
-@contextlib.contextmanager
-def listening(folder, rules=True, endpoint="tls/127.0.0.1:0"):
-    """A learner that answers work; without ``rules`` TLS is all that guards it."""
-    settings = security.learner(folder, KEYS.run)
-    if not rules:
-        del settings["access_control"]
-    with ZenohLink.listen(endpoint, settings) as link:
-        link.serve(KEYS.work, lambda query: query.reply(b"work"))
-        yield link
-
-
-def let_in(link, settings, patience_s=OPEN_S):
-    """Whether the learner takes a client with these settings and answers it."""
+def accepted(link, settings, timeout_s=OPEN_S):
+    """Whether the learner accepts a client with these settings and answers it."""
     try:
-        with ZenohLink.connect(link.endpoints[0], patience_s, settings) as client:
+        with ZenohLink.connect(link.endpoints[0], timeout_s, settings) as client:
             return client.request(KEYS.work, b"", timeout_s=5.0) == b"work"
     except LinkError as error:
         assert "cannot connect to tls/" in str(error)
         return False
 
 
-def shut_out(link, settings):
-    return not let_in(link, settings, 1.5)
+def is_refused(link, settings):
+    return not accepted(link, settings, 1.5)
 
 
-def test_only_a_certificate_of_the_same_authority_is_let_in(ours, theirs, tmp_path):
-    right, wrong = security.client(ours, "worker"), security.client(theirs, "worker")
-    late = security.client(certificates.make(shutil.copytree(ours, tmp_path / "late"), days=-1), "worker")
-    with listening(ours) as link:
-        assert let_in(link, right)
-        assert shut_out(link, {}), "no certificate, no authority"
-        assert shut_out(link, {TLS + "root_ca_certificate": right[TLS + "root_ca_certificate"]}), "no certificate"
-        assert shut_out(link, wrong), "another authority, both ways"
+def test_only_a_certificate_of_the_same_authority_is_accepted(certified, foreign, tmp_path):
+    right, wrong = security.client(certified, "worker"), security.client(foreign, "worker")
+    expired = security.client(certificates.make(shutil.copytree(certified, tmp_path / "expired"), days=-1), "worker")
+    with listening(certified) as link:
+        assert accepted(link, right)
+        assert is_refused(link, {}), "no certificate, no authority"
+        assert is_refused(link, {TLS + "root_ca_certificate": right[TLS + "root_ca_certificate"]}), "no certificate"
+        assert is_refused(link, wrong), "another authority on both sides"
         wrong[TLS + "root_ca_certificate"] = right[TLS + "root_ca_certificate"]
-        assert shut_out(link, wrong), "a certificate of another authority"
-        assert shut_out(link, late), "one that has expired"
-        clear = link.endpoints[0].replace("tls/", "tcp/")
+        assert is_refused(link, wrong), "a certificate of another authority"
+        assert is_refused(link, expired), "an expired certificate"
+        unencrypted = link.endpoints[0].replace("tls/", "tcp/")
         with pytest.raises(LinkError, match="cannot connect"):
-            ZenohLink.connect(clear, 1.5).close()
-        assert let_in(link, right), "and still the right one"
+            ZenohLink.connect(unencrypted, 1.5).close()
+        assert accepted(link, right), "the valid one is still accepted"
 
 
-def test_a_worker_takes_nobody_else_for_the_learner(ours, theirs, tmp_path):
-    right = security.client(ours, "worker")
-    with listening(theirs) as impostor:
-        blind = {**right, TLS + "root_ca_certificate": security.files(theirs, "worker")[0]}
-        blind |= {
-            TLS + f"connect_{k}": security.client(theirs, "worker")[TLS + f"connect_{k}"]
+def test_a_worker_accepts_only_the_learners_certificate(certified, foreign, tmp_path):
+    right = security.client(certified, "worker")
+    with listening(foreign) as impostor:
+        foreign_client = {**right, TLS + "root_ca_certificate": security.files(foreign, "worker")[0]}
+        foreign_client |= {
+            TLS + f"connect_{k}": security.client(foreign, "worker")[TLS + f"connect_{k}"]
             for k in ("certificate", "private_key")
         }
-        assert let_in(impostor, blind)
-        assert shut_out(impostor, right), "the learner of another authority"
-    settings = security.learner(ours, KEYS.run)
-    settings[TLS + "listen_certificate"], settings[TLS + "listen_private_key"] = security.files(ours, "worker")[1:]
+        assert accepted(impostor, foreign_client)
+        assert is_refused(impostor, right), "the learner of another authority"
+    settings = security.learner(certified, KEYS.run)
+    settings[TLS + "listen_certificate"], settings[TLS + "listen_private_key"] = security.files(certified, "worker")[1:]
     with ZenohLink.listen("tls/127.0.0.1:0", settings) as impostor:
-        assert shut_out(impostor, right), "another worker, with its own certificate"
-    with listening(ours, endpoint="tls/127.0.0.2:0") as elsewhere:
-        assert shut_out(elsewhere, right), "a host that the learner's certificate does not name"
-    named = certificates.make(shutil.copytree(ours, tmp_path / "named"), "127.0.0.2")
+        assert is_refused(impostor, right), "a worker's certificate on the learner's side"
+    with listening(certified, endpoint="tls/127.0.0.2:0") as elsewhere:
+        assert is_refused(elsewhere, right), "an address that the learner's certificate does not name"
+    named = certificates.make(shutil.copytree(certified, tmp_path / "named"), "127.0.0.2")
     with listening(named, endpoint="tls/127.0.0.2:0") as elsewhere:
-        assert let_in(elsewhere, right)
+        assert accepted(elsewhere, right)
 
 
-def test_a_worker_and_a_monitor_do_their_work(ours):
-    heard, alive, weights = [], [], []
+def test_each_role_may_do_what_it_needs(certified):
+    received, alive, weights = [], [], []
     with contextlib.ExitStack() as stack:
-        learner = stack.enter_context(listening(ours))
-        learner.watch(KEYS.alive_all, lambda name, there: alive.append((name, there)))
+        learner = stack.enter_context(listening(certified))
+        learner.watch(KEYS.alive_all, lambda name, present: alive.append((name, present)))
         learner.serve(KEYS.weights_latest, lambda query: query.refuse("busy: none yet"))
         connect = learner.endpoints[0], OPEN_S
-        worker = stack.enter_context(ZenohLink.connect(*connect, security.client(ours, "worker")))
+        worker = stack.enter_context(ZenohLink.connect(*connect, security.client(certified, "worker")))
         worker.announce(KEYS.alive("w0"))
         worker.subscribe(KEYS.weights, lambda _, payload: weights.append(payload))
         assert worker.request(KEYS.work, b"", timeout_s=5.0) == b"work"
@@ -113,193 +96,45 @@ def test_a_worker_and_a_monitor_do_their_work(ours):
         learner.serve(KEYS.data, lambda query: query.reply(b"stored " + query.payload))
         eventually(
             lambda: answered(worker, KEYS.data, b"trajectory") == b"stored trajectory", OPEN_S
-        )  # asked before it was served
-        worker.publish(KEYS.monitor("trajectories/w0"), b"nobody listens", droppable=True)
-        monitor = stack.enter_context(ZenohLink.connect(*connect, security.client(ours, "monitor")))
-        monitor.subscribe("icrl/*/mon/trajectories/**", lambda key, payload: heard.append((key, payload)))
+        )  # the request may precede the declaration
+        worker.publish(KEYS.monitor("trajectories/w0"), b"no subscriber", droppable=True)
+        monitor = stack.enter_context(ZenohLink.connect(*connect, security.client(certified, "monitor")))
+        monitor.subscribe("icrl/*/mon/trajectories/**", lambda key, payload: received.append((key, payload)))
         for link, topic in ((worker, "trajectories/w0"), (learner, "trajectories/learner")):
-            eventually(lambda link=link, topic=topic: published(link, KEYS.monitor(topic), b"look", heard), OPEN_S)
-        assert worker.watched(KEYS.monitor("trajectories/w0")) and not worker.watched(KEYS.monitor("belief/w0"))
+            eventually(lambda link=link, topic=topic: published(link, KEYS.monitor(topic), b"look", received), OPEN_S)
+        assert worker.has_subscribers(KEYS.monitor("trajectories/w0")) and not worker.has_subscribers(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
-        eventually(lambda: worker.watched(KEYS.monitor("belief/w0")), OPEN_S)
+        eventually(lambda: worker.has_subscribers(KEYS.monitor("belief/w0")), OPEN_S)
         eventually(lambda: published(learner, KEYS.weights, b"T^1", weights), OPEN_S)
         eventually(lambda: alive == [("w0", True)], OPEN_S)
-        assert (KEYS.monitor("trajectories/w0"), b"look") in heard and b"T^1" in weights
+        assert (KEYS.monitor("trajectories/w0"), b"look") in received and b"T^1" in weights
         worker.close()
         eventually(lambda: alive == [("w0", True), ("w0", False)], OPEN_S)
 
 
-def answered(link, key, payload=b""):
-    with contextlib.suppress(Unanswered):
-        return link.request(key, payload, timeout_s=1.0)
-
-
-def published(link, key, payload, heard):
-    """Say it again until it is heard."""
+def published(link, key, payload, received):
+    """Publish once; whether the message has been received yet."""
     link.publish(key, payload, droppable=True)
-    return any(payload == item or item == (key, payload) for item in heard)
+    return any(payload == item or item == (key, payload) for item in received)
 
 
-class Scene:
-    """A learner, an honest worker and monitor, and an intruder with a certificate of ours who asks nobody."""
-
-    def __init__(self, stack, folder, role, rules):
-        self.learner = stack.enter_context(listening(folder, rules))
-        where = self.learner.endpoints[0]
-        self.worker = stack.enter_context(ZenohLink.connect(where, OPEN_S, security.client(folder, "worker")))
-        self.monitor = stack.enter_context(ZenohLink.connect(where, OPEN_S, security.client(folder, "monitor")))
-        config = zenoh.Config()
-        plain = {"mode": "client", "connect/endpoints": [where], "scouting/multicast/enabled": False}
-        for key, value in {**plain, **security.client(folder, role)}.items():
-            config.insert_json5(key, json.dumps(value))
-        self.intruder = stack.enter_context(zenoh.open(config))
-        self.heard = []
-        self.patience_s = SHUT_S if rules else OPEN_S
-
-    def tell(self, *what):
-        self.heard.append(what)
-
-    def gained(self, attempt=lambda: None):
-        """Whether anything was heard that should not have been, trying until patience ends."""
-        end = time.monotonic() + self.patience_s
-        while not self.heard and time.monotonic() < end:
-            attempt()
-            time.sleep(0.02)
-        return bool(self.heard)
-
-    def listens(self, key_expr):
-        self.intruder.declare_subscriber(key_expr, lambda sample: self.tell(str(sample.key_expr)))
-
-    def serves(self, key):
-        def answer(query):
-            self.tell(query.payload.to_bytes())
-            query.reply(key, b"forged")
-            query.drop()
-
-        self.intruder.declare_queryable(key, answer, complete=True)
-
-    def asks(self, key):
-        for reply in self.intruder.get(key, payload=b"let me", timeout=1.0):
-            self.tell(reply)
-
-
-def forge_weights(scene):
-    scene.worker.subscribe(KEYS.weights, scene.tell)
-    return scene.gained(lambda: scene.intruder.put(KEYS.weights, b"forged"))
-
-
-def delete_weights(scene):
-    scene.worker.subscribe(KEYS.weights, scene.tell)
-    return scene.gained(lambda: scene.intruder.delete(KEYS.weights))
-
-
-def forge_the_monitor_key(scene):
-    scene.monitor.subscribe(KEYS.monitor_all, scene.tell)
-    return scene.gained(lambda: scene.intruder.put(KEYS.monitor("learner"), b"forged"))
-
-
-def speak_for_another_run(scene):
-    scene.monitor.subscribe("icrl/*/mon/**", scene.tell)
-    return scene.gained(lambda: scene.intruder.put(Keys("other").monitor("learner"), b"forged"))
-
-
-def read_the_data_of_others(scene):
-    scene.serves(KEYS.data)
-    return scene.gained(lambda: answered(scene.worker, KEYS.data, b"secret"))
-
-
-def serve_the_weights(scene):
-    scene.serves(KEYS.weights_latest)
-    return scene.gained(lambda: answered(scene.worker, KEYS.weights_latest))
-
-
-def serve_everything(scene):
-    scene.serves("**")
-    return scene.gained(lambda: answered(scene.worker, KEYS.weights_latest))
-
-
-def read_the_weights(scene):
-    scene.listens(KEYS.weights)
-    return scene.gained(lambda: scene.learner.publish(KEYS.weights, b"T^1", droppable=False))
-
-
-def read_everything(scene):
-    scene.listens("**")
-    return scene.gained(lambda: scene.learner.publish(KEYS.weights, b"T^1", droppable=False))
-
-
-def read_the_monitor_key(scene):
-    scene.listens(KEYS.monitor_all)
-    return scene.gained(lambda: scene.learner.publish(KEYS.monitor("learner"), b"look", droppable=True))
-
-
-def ask_for_work(scene):
-    return scene.gained(lambda: scene.asks(KEYS.work))
-
-
-def send_data(scene):
-    scene.learner.serve(KEYS.data, lambda query: query.reply(b"stored"))
-    return scene.gained(lambda: scene.asks(KEYS.data))
-
-
-def ask_for_the_weights(scene):
-    scene.learner.serve(KEYS.weights_latest, lambda query: query.reply(b"T^1"))
-    return scene.gained(lambda: scene.asks(KEYS.weights_latest))
-
-
-def ask_for_anything(scene):
-    return scene.gained(lambda: scene.asks("**"))
-
-
-def pose_as_a_worker(scene):
-    scene.learner.watch(KEYS.alive_all, scene.tell)
-    token = scene.intruder.liveliness().declare_token(KEYS.alive("intruder"))
-    gained = scene.gained()
-    token.undeclare()
-    return gained
-
-
-def watch_the_workers(scene):
-    scene.worker.announce(KEYS.alive("w0"))
-    scene.intruder.liveliness().declare_subscriber(
-        KEYS.alive_all, lambda sample: scene.tell(str(sample.key_expr)), history=True
-    )
-    return scene.gained()
-
-
-def list_the_workers(scene):
-    scene.worker.announce(KEYS.alive("w0"))
-
-    def look():
-        for reply in scene.intruder.liveliness().get(KEYS.alive_all, timeout=0.2):
-            scene.tell(reply)
-
-    return scene.gained(look)
-
-
-ANYONE = [forge_weights, delete_weights, read_the_data_of_others, serve_the_weights, serve_everything, read_everything]
-ANYONE += [ask_for_anything, speak_for_another_run, watch_the_workers, list_the_workers]
-MONITORS = [forge_the_monitor_key, read_the_weights, ask_for_work, send_data, ask_for_the_weights, pose_as_a_worker]
-MISDEEDS = [("worker", deed) for deed in [*ANYONE, read_the_monitor_key]] + [("monitor", deed) for deed in [*ANYONE, *MONITORS]]
-
-
-@pytest.mark.parametrize(("role", "deed"), MISDEEDS, ids=lambda value: value if isinstance(value, str) else value.__name__)
-def test_what_a_role_may_not_do_works_without_the_rules_and_not_with_them(ours, role, deed):
+@pytest.mark.parametrize(("role", "action"), FORBIDDEN, ids=lambda value: value if isinstance(value, str) else value.__name__)
+def test_a_forbidden_action_works_without_the_rules_and_fails_with_them(certified, role, action):
     for rules in (False, True):
         with contextlib.ExitStack() as stack:
-            scene = Scene(stack, ours, role, rules)
-            assert deed(scene) is not rules, f"{role}: {deed.__name__} with rules {'on' if rules else 'off'}"
-            scene.heard.clear()
-            scene.patience_s = OPEN_S
-            if role == "worker":  # it was the rules, and no broken line
-                scene.asks(KEYS.work)
+            scene = Scene(stack, certified, role, rules)
+            assert action(scene) is not rules, f"{role}: {action.__name__} with rules {'on' if rules else 'off'}"
+            scene.received.clear()
+            scene.wait_s = OPEN_S
+            if role == "worker":  # the connection still works, so the rules were the cause
+                scene.request(KEYS.work)
             else:
                 read_the_monitor_key(scene)
-            assert scene.heard
+            assert scene.received
 
 
 @pytest.mark.usefixtures("no_ray_token")
-def test_off_this_machine_in_the_clear_is_refused(capsys, tmp_path, ours):
+def test_an_unencrypted_endpoint_of_another_node_is_refused(capsys, tmp_path, certified):
     def refused(*arguments):
         assert main.main(["train", "smoke", "--actors", "1", "--out", str(tmp_path / "out"), *arguments]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
@@ -311,21 +146,21 @@ def test_off_this_machine_in_the_clear_is_refused(capsys, tmp_path, ours):
     assert "tls/HOST:PORT" in line and "stream.certificates" in line and "docs/security.md" in line
     tls = ["--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates"]
     assert "no/such/ca.pem: cannot be read" in refused(*tls, "no/such")
-    away = ["--stream.endpoint", "tls/10.0.0.1:7447", "--stream.certificates", ours, "--address", "head:6379"]
+    away = ["--stream.endpoint", "tls/10.0.0.1:7447", "--stream.certificates", certified, "--address", "head:6379"]
     assert "RAY_AUTH_MODE=token" in refused(*away)
 
 
-def test_a_tap_without_its_certificates_is_told_what_it_needs(capsys, ours):
+def test_a_tap_without_certificates_is_refused_with_the_remedy(capsys, certified):
     assert main.main(["tap", "--connect", "tls/127.0.0.1:1"]) == 2
     assert "--certificates" in capsys.readouterr().err
-    with listening(ours) as link:
-        assert main.main(["tap", "--connect", link.endpoints[0], "--certificates", ours + "/none"]) == 2
+    with listening(certified) as link:
+        assert main.main(["tap", "--connect", link.endpoints[0], "--certificates", certified + "/none"]) == 2
     assert "none/ca.pem: cannot be read" in capsys.readouterr().err
 
 
-def test_a_whole_run_of_one_worker_by_tls_ends_with_the_bytes_of_none(ours, reference, tmp_path):
+def test_a_run_with_tls_has_the_digests_of_a_run_without(certified, reference, tmp_path):
     folder = tmp_path / "secure"
-    tls = ["--actors", "1", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", ours]
+    tls = ["--actors", "1", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", certified]
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(start("train", *SMOKE, *NO_RESTARTS, *tls, "--out", folder))
         stack.callback(run.terminate)
@@ -334,8 +169,8 @@ def test_a_whole_run_of_one_worker_by_tls_ends_with_the_bytes_of_none(ours, refe
         stack.callback(tap.terminate)
         output = finish(run)
         assert run.returncode == 0, output
-        tap.terminate()  # the run is over: what it has not heard by now it never will
+        tap.terminate()  # the run is over, so no further message will come
         line = finish(tap, timeout=60)
-        assert json.loads(line)["identity"], "the tap shows the run's own certificates, those of a monitor"
+        assert json.loads(line)["identity"], "the tap has used the run's monitor certificate"
     assert equal(result_of(folder), reference)
     assert result_of(folder)["lag"].keys() == {"0"}

@@ -17,8 +17,8 @@ from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import load
 from icrl_dist.methods import recipes
 from icrl_dist.problems.darkroom.exact_agents import RULES
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import version_file
+from icrl_dist.storage.checkpoint import version_file
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream.link import Refused
 from learner import checkpoints
 from tests.e2e.training import (
@@ -70,8 +70,8 @@ def test_every_trajectory_arrived_once_with_the_policy_version_of_its_round(undi
     run = load(str(folder / "run.toml"))
     method = recipes.METHODS[run.method]
     wanted = {i for phase in method.phases(run) for job in method.ask(run, phase) for i in job.identities()}
-    store = Store(folder / "dataset")
-    trajectories = [store.read(row.identity) for row in store.ledger]
+    store = Dataset(folder / "dataset")
+    trajectories = [store.read(row.identity) for row in store.index]
     store.close()
     assert {t.identity for t in trajectories} == wanted and len(trajectories) == len(wanted)
     assert {t.worker for t in trajectories} == {"w0", "w1"}
@@ -117,8 +117,8 @@ def test_acting_with_zeroed_weights_changes_the_actions(undisturbed):
 
 def test_tap_and_the_documented_script_print_one_line_per_trajectory(undisturbed):
     folder, _, lines = undisturbed
-    store = Store(folder / "dataset")
-    stored = {str(row.identity) for row in store.ledger}
+    store = Dataset(folder / "dataset")
+    stored = {str(row.identity) for row in store.index}
     store.close()
     for name in ("tap", "documented"):
         messages = [json.loads(line) for line in lines[name]]

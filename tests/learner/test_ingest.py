@@ -10,7 +10,7 @@ from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist.collect import jobs
 from icrl_dist.problems import registry
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import batching, wire
 from icrl_dist.types import Identity, Spec
@@ -50,7 +50,7 @@ def trajectories(job):
 
 @pytest.fixture
 def ingest(tmp_path, small_run, job):
-    store = Store(tmp_path)
+    store = Dataset(tmp_path)
     wanted = set(job.identities())
     failures = []
     opened = Ingest(
@@ -193,7 +193,7 @@ def test_a_request_that_is_not_a_batch_is_refused(ingest, reason, payload):
 
 def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, trajectories):
     gate = threading.Event()
-    store = Store(tmp_path / "gated")
+    store = Dataset(tmp_path / "gated")
     ingest = Ingest(
         store,
         registry.spec(job.variations[0].task),
@@ -218,7 +218,7 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
 
 def test_the_queue_is_bounded_in_bytes_and_accepts_one_message_of_any_size(tmp_path, small_run, job, trajectories):
     gate = threading.Event()
-    store = Store(tmp_path / "gated")
+    store = Dataset(tmp_path / "gated")
     spec = registry.spec(job.variations[0].task)
     payloads = [wire.encode_trajectory(t) for t in trajectories[:4]]
     size = len(payloads[0])
@@ -269,7 +269,7 @@ def test_a_failed_ingest_can_be_closed_with_a_full_queue(tmp_path, small_run, jo
     def bug(identity):
         raise ZeroDivisionError("a bug")
 
-    store = Store(tmp_path / "bug")
+    store = Dataset(tmp_path / "bug")
     spec = registry.spec(job.variations[0].task)
     ingest = Ingest(store, spec, 1 << 20, bug, lambda v: "", lambda t: None, failures.append, capacity=2)
     payload = wire.encode_trajectory(trajectories[0])

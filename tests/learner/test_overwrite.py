@@ -12,7 +12,8 @@ from icrl_dist.config.run import ConfigError, dumps, load, override
 from icrl_dist.launch import run_folder
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout
-from icrl_dist.storage.files import Checkpoint, held, hold, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.files import held, hold
 from tests.launch.test_run_folder import files
 from tests.learner.test_service import no_tensorboard
 

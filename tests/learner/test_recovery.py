@@ -10,7 +10,7 @@ from icrl_dist.collect import jobs
 from icrl_dist.config.run import ConfigError, override
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch import train
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError, hold
 from icrl_dist.storage.fork import parse_source
 from icrl_dist.types import Identity
@@ -41,7 +41,7 @@ def test_data_with_a_changed_byte_is_reported_and_collected_again(parent, tmp_pa
     texts = [event["text"] for event in events if "text" in event]
     assert any(segments[segment].name in text and "damaged range" in text for text in texts)
     assert any("are missing: collecting them again" in text for text in texts)
-    assert Store(folder / "dataset").digest() == parent[1]["dataset_digest"]
+    assert Dataset(folder / "dataset").digest() == parent[1]["dataset_digest"]
 
 
 def test_a_missing_segment_is_collected_again_with_the_policy_version_of_its_round(parent, tmp_path):
@@ -67,7 +67,7 @@ def test_damage_during_a_run_is_found_before_training_uses_it(parent, tmp_path):
 
 def test_a_folder_has_at_most_one_learner(parent, monkeypatch):
     monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
-    with hold(parent[0]), pytest.raises(StoreError, match="another learner is at work"):
+    with hold(parent[0]), pytest.raises(StoreError, match="another learner uses this folder"):
         train.train_inline(parent[2], parent[0], print)
 
 
@@ -93,7 +93,7 @@ def test_a_fork_with_other_settings_keeps_the_data_of_its_parent(parent, tmp_pat
     (folder / "dataset" / "segment-000001.frames").unlink()
     again = run_inline(run, folder, resume=True)
     assert same(again, result), "the data of an ancestor is collected with the settings of the ancestor"
-    assert Store(parent[0] / "dataset", readonly=True).digest() == before
+    assert Dataset(parent[0] / "dataset", readonly=True).digest() == before
     grandchild = run_inline(run, tmp_path / "grandchild", source=(folder, 2))
     assert same(grandchild, result)
 
@@ -122,7 +122,7 @@ def test_the_source_of_a_fork_is_checked(parent, tmp_path):
 def test_overlapping_rounds_use_policy_versions_at_most_one_old(parent, tmp_path):
     folder = tmp_path / "async"
     result = run_inline(override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set"), folder)
-    store = Store(folder / "dataset", readonly=True)
+    store = Dataset(folder / "dataset", readonly=True)
     adapt = 7 * 3 * (parent[2].icaa.trials + 1)
     assert result["trajectories"] == 42 + 3 * adapt == len(store)
     lags = {int(lag): count for lag, count in result["lag"].items()}
@@ -131,7 +131,7 @@ def test_overlapping_rounds_use_policy_versions_at_most_one_old(parent, tmp_path
     )
     for task in range(7):
         for round_ in range(3):
-            acted = store.ledger.acted("adapt", round_, (task - task % 2, task - task % 2 + 2))
+            acted = store.index.policy_versions("adapt", round_, (task - task % 2, task - task % 2 + 2))
             assert len(acted) == 1 and round_ - 1 <= acted[0] <= round_, "the same T^j acts in all trials of a job"
     assert parent[1]["lag"] == {"0": 2 * adapt} and parent[1]["staleness"] == 0
 
@@ -150,10 +150,10 @@ def test_a_stopped_asynchronous_run_continues_its_jobs_with_the_same_policy_vers
         run_inline(run, tmp_path / "run", stop)
     result = run_inline(run, tmp_path / "run", resume=True)
     assert result["trajectories"] == 42 + 3 * 7 * 3 * (run.icaa.trials + 1)
-    store = Store(tmp_path / "run" / "dataset", readonly=True)
+    store = Dataset(tmp_path / "run" / "dataset", readonly=True)
     for round_ in range(3):
         for first in range(0, 7, 2):
-            assert len(store.ledger.acted("adapt", round_, (first, first + 2))) == 1
+            assert len(store.index.policy_versions("adapt", round_, (first, first + 2))) == 1
 
 
 def test_explain_checks_every_file_of_a_trajectory(parent):

@@ -11,8 +11,8 @@ import pytest
 from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import ConfigError
 from icrl_dist.launch import train
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import version_file
+from icrl_dist.storage.checkpoint import version_file
+from icrl_dist.storage.dataset import Dataset
 from learner import checkpoints, reporter, service
 
 
@@ -53,9 +53,9 @@ def same(result, other):
 
 def test_a_run_stores_every_trajectory_once_with_the_policy_version_of_its_round(small_run, parent):
     folder, undisturbed, _ = parent
-    store = Store(folder / "dataset", readonly=True)
+    store = Dataset(folder / "dataset", readonly=True)
     versions = [checkpoints.read_manifest(version_file(folder, v)) for v in range(3)]
-    for identity in [row.identity for row in store.ledger]:
+    for identity in [row.identity for row in store.index]:
         t = store.read(identity)
         if identity.stage == "adapt":
             assert (t.policy_version, t.weights_digest) == (identity.round, versions[identity.round]["weights_digest"])

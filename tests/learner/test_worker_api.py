@@ -12,13 +12,13 @@ import icrl_dist
 from icrl_dist import version
 from icrl_dist.config.run import parse
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Keys, Refused
+from icrl_dist.stream.link import Refused, StreamKeys
 from icrl_dist.telemetry import crash_reports
 from learner import worker_api as worker_api_module
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 
-KEYS = Keys("test")
+KEYS = StreamKeys("test")
 COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "waited_s": 0.0}
 RECORD = {"what": "raised", "job": "pretrain/0/0", "exception": "ValueError: no (room.py:3)"}
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.problems.darkroom import room
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.types import NULL, Adversary, Identity, Trajectory, Variation
 
@@ -118,7 +118,7 @@ def run_folder(folder):
     """Writes the files of a finished smoke run that a recording needs; returns ``folder``."""
     folder.mkdir(parents=True)
     shutil.copy(str(resources.files("icrl_dist.config.runs") / "smoke.toml"), folder / "run.toml")
-    store = Store(folder / "dataset")
+    store = Dataset(folder / "dataset")
     early = [episode(t, 0, trial, trial % 4, stage="pretrain") for t in range(3) for trial in range(8)]
     late = [episode(t, v, trial, (trial + t) % 6) for t in range(3) for v in range(2) for trial in range(8)]
     store.append(early)

@@ -15,7 +15,7 @@ from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
 from icrl_dist.monitor.recording import Recording
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.storage import files
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import service
@@ -82,7 +82,7 @@ def test_messages_are_in_order_of_time_and_within_the_run(finished):
     recording = Recording(folder)
     times = [now for now, _, _ in recording.messages()]
     assert times == sorted(times) and recording.begin <= times[0] and times[-1] <= recording.end
-    store = Store(folder / "dataset", readonly=True)
+    store = Dataset(folder / "dataset", readonly=True)
     assert sum("/mon/trajectories/" in key for _, key, _ in recording.messages()) == len(store)
     store.close()
     recording.close()

@@ -24,7 +24,8 @@ from icrl_dist.problems.registry import spec
 from icrl_dist.results import evaluate
 from icrl_dist.results.statistics import mean_and_error
 from icrl_dist.results.tables import returns_table
-from icrl_dist.storage.files import Checkpoint, StoreError, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Variation
 from learner import checkpoints
 

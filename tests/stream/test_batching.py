@@ -1,4 +1,4 @@
-"""Several items in one request: taken apart, answered one by one, never half answered."""
+"""Several items in one request: split, answered one by one, replied to once all are answered."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from icrl_dist.stream import batching
 from icrl_dist.stream.validation import WireError, pack
 
 
-class Asked:
+class RecordedQuery:
     key = "data"
 
     def __init__(self, payload):
@@ -16,23 +16,23 @@ class Asked:
         self.answers.append(payload)
 
 
-def test_items_come_apart_and_the_answers_together_in_their_order():
+def test_items_are_split_and_their_answers_come_back_in_order():
     items = [b"one", b"", b"\xc1" * 1000]
-    asked = Asked(batching.join(items))
-    parts = batching.split(asked, 1 << 20)
+    query = RecordedQuery(batching.join(items))
+    parts = batching.split(query, 1 << 20)
     assert [part.payload for part in parts] == items and {part.key for part in parts} == {"data"}
     parts[2].refuse("spec: no")
     parts[0].reply(b"stored")
-    assert asked.answers == []
+    assert query.answers == []
     parts[1].refuse("")
-    assert [batching.reasons(a, 3) for a in asked.answers] == [["", "refused", "spec: no"]]
+    assert [batching.reasons(a, 3) for a in query.answers] == [["", "refused", "spec: no"]]
     with pytest.raises(RuntimeError, match=r"item 2 .* answered before"):
         parts[2].reply(b"stored")
 
 
-def test_no_items_are_answered_at_once():
-    asked = Asked(batching.join([]))
-    assert batching.split(asked, 100) == [] and batching.reasons(asked.answers[0], 0) == []
+def test_a_request_without_items_is_answered_at_once():
+    query = RecordedQuery(batching.join([]))
+    assert batching.split(query, 100) == [] and batching.reasons(query.answers[0], 0) == []
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_no_items_are_answered_at_once():
         ("schema", pack("answers", {"results": [""]})),
     ],
 )
-def test_an_answer_that_is_none_is_told(reason, answer):
+def test_an_invalid_answer_is_refused(reason, answer):
     with pytest.raises(WireError) as caught:
         batching.reasons(answer, 1)
     assert caught.value.reason == reason

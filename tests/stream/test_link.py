@@ -1,4 +1,4 @@
-"""The battery over both links, and what only processes can show."""
+"""The contract tests on both links, and tests that need several processes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ import pytest
 from icrl_dist.stream import monitor_messages
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.dispatch import Dispatcher, Mailbox
-from icrl_dist.stream.link import Keys, Link, LinkError, Unanswered, matches
+from icrl_dist.stream.link import Link, LinkError, StreamKeys, Unanswered, matches
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
+from tests.contracts.credit_battery import CreditBattery
 from tests.contracts.link_battery import KEYS, LinkBattery, Links, eventually
 
 ANYWHERE = "tcp/127.0.0.1:0"
@@ -53,11 +54,11 @@ class ZenohLinks:
 
     def settle(self) -> None:
         for worker in self.made[1:]:
-            worker.request("icrl/settle", b"", 30.0)  # behind what it has declared
-        time.sleep(0.1)  # what the learner has declared
+            worker.request("icrl/settle", b"", 30.0)  # answered after the worker's declarations have arrived
+        time.sleep(0.1)  # time for the learner's declarations to arrive
 
 
-class TestMemoryLink(LinkBattery):
+class TestMemoryLink(LinkBattery, CreditBattery):
     @pytest.fixture
     def links(self) -> Iterator[Links]:
         links = MemoryLinks()
@@ -66,7 +67,7 @@ class TestMemoryLink(LinkBattery):
             link.close()
 
 
-class TestZenohLink(LinkBattery):
+class TestZenohLink(LinkBattery, CreditBattery):
     @pytest.fixture
     def links(self) -> Iterator[Links]:
         links = ZenohLinks()
@@ -97,12 +98,12 @@ def test_key_expressions(key_expr: str, key: str, expected: bool) -> None:
 def test_names_that_cannot_be_keys_are_refused() -> None:
     for name in ("", "a/b", "*", "a?", "a#", "a\nb"):
         with pytest.raises(ValueError, match="part of a key"):
-            Keys(name)
+            StreamKeys(name)
         with pytest.raises(ValueError, match="part of a key"):
             KEYS.alive(name)
 
 
-def test_a_dispatcher_outlives_what_it_runs(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_dispatcher_survives_an_action_that_raises(caplog: pytest.LogCaptureFixture) -> None:
     dispatcher, ran = Dispatcher("test"), list[str]()
     dispatcher.post(lambda: ran.append("later"), 1.0)
     dispatcher.post(lambda: 1 / 0)  # type: ignore[arg-type]
@@ -113,7 +114,7 @@ def test_a_dispatcher_outlives_what_it_runs(caplog: pytest.LogCaptureFixture) ->
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_a_port_in_use_and_an_absent_learner_are_named() -> None:
+def test_a_port_in_use_and_an_absent_learner_are_named_in_the_error() -> None:
     with ZenohLink.listen(ANYWHERE) as link:
         endpoint = link.endpoints[0]
         with pytest.raises(LinkError, match=f"(?s){endpoint}.*in use.*another"):
@@ -125,7 +126,7 @@ def test_a_port_in_use_and_an_absent_learner_are_named() -> None:
             ZenohLink.listen(bad)
 
 
-def test_a_worker_finds_a_learner_that_listens_again() -> None:
+def test_a_worker_reconnects_to_a_restarted_learner() -> None:
     first = ZenohLink.listen(ANYWHERE)
     endpoint, seen = first.endpoints[0], list[tuple[str, bool]]()
     with ZenohLink.connect(endpoint, 5.0) as worker:
@@ -142,17 +143,17 @@ def test_a_worker_finds_a_learner_that_listens_again() -> None:
 
 WORKER = """
 import sys, time
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 link = ZenohLink.connect(sys.argv[1], 10.0)
-link.announce(Keys("battery").alive("doomed"))
+link.announce(StreamKeys("battery").alive("doomed"))
 time.sleep(60)
 """
 
 LEARNER = """
 import sys, time
 from icrl_dist.stream import batching
-from icrl_dist.stream.link import Keys
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 known = set(open(sys.argv[2]).read().split())
 file = open(sys.argv[2], "a")
@@ -163,14 +164,14 @@ def store(query):
         print(name, file=file, flush=True)
     time.sleep(0.001)
     query.reply(b"stored")
-def take_apart(query):
+def split_and_store(query):
     for part in batching.split(query, 1 << 20):
         store(part)
-ZenohLink.listen(sys.argv[1]).serve(Keys("battery").data, take_apart)
+ZenohLink.listen(sys.argv[1]).serve(StreamKeys("battery").data, split_and_store)
 time.sleep(60)
 """
 
-CARELESS = """
+UNCLOSED = """
 import sys
 from icrl_dist.stream.zenoh_link import ZenohLink
 link = ZenohLink.connect(sys.argv[1], 10.0)
@@ -188,7 +189,7 @@ def kill(process: subprocess.Popen[bytes]) -> None:
     process.wait(10)
 
 
-def test_a_killed_worker_is_noticed() -> None:
+def test_the_death_of_a_worker_is_reported() -> None:
     seen: list[tuple[str, bool]] = []
     with ZenohLink.listen(ANYWHERE) as learner:
         learner.watch(KEYS.alive_all, lambda *event: seen.append(event))
@@ -223,9 +224,9 @@ def test_a_killed_and_restarted_learner_loses_nothing(tmp_path: Path) -> None:
     assert sorted(map(int, stored.read_text().split())) == list(range(800))
 
 
-def test_a_process_that_forgets_to_close_still_exits() -> None:
+def test_a_process_that_does_not_close_its_link_still_exits() -> None:
     with ZenohLink.listen(ANYWHERE) as learner:
-        assert run(CARELESS, learner.endpoints[0]).wait(15) == 0
+        assert run(UNCLOSED, learner.endpoints[0]).wait(15) == 0
 
 
 def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
@@ -280,23 +281,23 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
     }
 
 
-def test_what_waits_for_a_subscriber_is_bounded_in_bytes_too():
-    began, woken, heard = threading.Event(), threading.Event(), []
+def test_the_queue_of_a_subscriber_is_bounded_in_bytes():
+    began, released, received = threading.Event(), threading.Event(), []
 
     def slow(key, payload):
         began.set()
-        woken.wait(10)
-        heard.append(len(payload))
+        released.wait(10)
+        received.append(len(payload))
 
-    mailbox = Mailbox(slow, capacity=10, room=100)
+    mailbox = Mailbox(slow, capacity=10, max_bytes=100)
     mailbox.put("k", bytes(90), droppable=True)
-    assert began.wait(10)  # it no longer waits
+    assert began.wait(10)  # the first message has left the queue
     for size in (101, 60, 60, 40, 1):
         mailbox.put("k", bytes(size), droppable=True)
     mailbox.put("k", bytes(500), droppable=False)
-    woken.set()
-    eventually(lambda: len(heard) == 4)
+    released.set()
+    eventually(lambda: len(received) == 4)
     mailbox.put("k", bytes(100), droppable=True)
-    eventually(lambda: len(heard) == 5)
+    eventually(lambda: len(received) == 5)
     mailbox.close()
-    assert heard == [90, 60, 40, 500, 100] and mailbox.dropped == 3
+    assert received == [90, 60, 40, 500, 100] and mailbox.dropped == 3

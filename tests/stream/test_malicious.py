@@ -1,4 +1,4 @@
-"""Files from strangers: whatever is in them, nothing of it is executed, and the error is one of ours."""
+"""Untrusted files: nothing in them is executed, and every error is a StoreError or ConfigError."""
 
 import contextlib
 import dataclasses
@@ -11,21 +11,22 @@ import zipfile
 import msgpack
 import numpy as np
 import pytest
+from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist import load_agent
 from icrl_dist.collect import jobs
 from icrl_dist.config import run
 from icrl_dist.config.run import ConfigError
-from icrl_dist.methods.recipes import METHODS
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import splits
 from icrl_dist.storage import segment
-from icrl_dist.storage.dataset import Store
-from icrl_dist.storage.files import Checkpoint, StoreError, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import StoreError
 
 
 class Bomb:
-    """Unpickling one makes a folder."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, marker):
         self.marker = str(marker)
@@ -36,7 +37,7 @@ class Bomb:
 
 @pytest.fixture
 def bomb(tmp_path):
-    """A bomb that works; at the end of the test it has not gone off."""
+    """An object that executes code when unpickled; the test fails if the code has run."""
     marker = tmp_path / "executed"
     pickle.loads(pickle.dumps(Bomb(marker)))
     marker.rmdir()
@@ -46,7 +47,7 @@ def bomb(tmp_path):
 
 @pytest.fixture
 def agent(small_run):
-    """The parts of a checkpoint that load_agent takes."""
+    """The arrays and the manifest of a valid checkpoint for load_agent."""
     spec = splits.spec(small_run)
     model = PretrainedTransformer(spec, small_run.model)
     arrays = {f"model/{name}": value.detach().numpy() for name, value in model.state_dict().items()}
@@ -60,14 +61,14 @@ def as_npy(value):
 
 
 def header(shape, dtype="<f4"):
-    """An array file that claims a shape and brings sixteen bytes."""
+    """An array file with this shape in its header and sixteen bytes of content."""
     file = io.BytesIO()
     np.lib.format.write_array_header_2_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
     return file.getvalue() + bytes(16)
 
 
 def checkpoint(path, members, compression=zipfile.ZIP_STORED):
-    """A checkpoint by hand: a zip of these members, a good manifest among them unless it is given."""
+    """A checkpoint made by hand: a zip file of these members and, unless given, a valid manifest and array."""
     good = {"manifest.npy": as_npy(np.frombuffer(b'{"version": 1}', np.uint8)), "a/model/w.npy": as_npy(np.zeros(3))}
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(path, "w", compression) as file:
@@ -86,10 +87,10 @@ CHECKPOINTS = {
     "code in place of JSON": lambda bomb: {"manifest.npy": as_npy(np.frombuffer(code(bomb).encode(), np.uint8))},
     "JSON nested without end": lambda _: {"manifest.npy": as_npy(np.frombuffer(b"[" * 200_000, np.uint8))},
     "a manifest that is a list": lambda _: {"manifest.npy": as_npy(np.frombuffer(b"[1, 2]", np.uint8))},
-    "a manifest that is nothing": lambda _: {"manifest.npy": as_npy(np.frombuffer(b"null", np.uint8))},
+    "a manifest that is null": lambda _: {"manifest.npy": as_npy(np.frombuffer(b"null", np.uint8))},
     "an array that claims terabytes": lambda _: {"a/model/w.npy": header((1 << 50,))},
     "a manifest that claims terabytes": lambda _: {"manifest.npy": header((1 << 50,), "|u1")},
-    "a shape below zero": lambda _: {"a/model/w.npy": header((-1, 4))},
+    "a negative shape": lambda _: {"a/model/w.npy": header((-1, 4))},
 }
 
 
@@ -123,20 +124,20 @@ def test_a_zip_bomb(tmp_path):
         load_checkpoint(tmp_path / "bomb.npz")
 
 
-def test_the_checkpoint_that_the_malicious_ones_are_made_of_is_fine(tmp_path):
+def test_the_checkpoint_without_a_malicious_member_is_valid(tmp_path):
     checkpoint(tmp_path / "c.npz", {})
     assert load_checkpoint(tmp_path / "c.npz").manifest == {"version": 1}
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 5])
-def test_a_pickle_by_another_name(tmp_path, bomb, protocol):
+def test_a_pickle_named_as_a_checkpoint(tmp_path, bomb, protocol):
     file = tmp_path / "version-0000.npz"
     file.write_bytes(pickle.dumps(bomb, protocol))
     with pytest.raises(StoreError, match="not a checkpoint"):
         load_agent(file)
 
 
-def test_a_torch_file_by_another_name(tmp_path, bomb):
+def test_a_torch_file_named_as_a_checkpoint(tmp_path, bomb):
     import torch
 
     torch.save({"model": bomb}, tmp_path / "agent.npz")
@@ -144,7 +145,7 @@ def test_a_torch_file_by_another_name(tmp_path, bomb):
         load_agent(tmp_path / "agent.npz")
 
 
-def test_what_is_no_file_at_all(tmp_path):
+def test_missing_empty_and_garbage_files(tmp_path):
     with pytest.raises(StoreError, match="no such checkpoint"):
         load_checkpoint(tmp_path / "missing.npz")
     with pytest.raises(ConfigError, match="no such run folder or checkpoint"):
@@ -159,8 +160,8 @@ RUNS = {
     "code as a value": lambda bomb: f"seed = {code(bomb)}",
     "code as a string": lambda bomb: f"[learner]\ndevice = {json.dumps(code(bomb))}",
     "a method that is code": lambda bomb: f"method = {json.dumps(code(bomb))}",
-    "a key that Python knows": lambda _: "__class__ = 1",
-    "a section that Python knows": lambda _: "[__init__]\n__globals__ = 1",
+    "a key that is a Python attribute": lambda _: "__class__ = 1",
+    "a section that is a Python attribute": lambda _: "[__init__]\n__globals__ = 1",
     "a number of ten thousand digits": lambda _: "seed = " + "9" * 10_000,
     "lists nested without end": lambda _: "seed = " + "[" * 100_000,
     "tables in tables in tables": lambda _: "a" + ".a" * 3_000 + " = 1",
@@ -172,7 +173,7 @@ RUNS = {
 def test_a_malicious_run(tmp_path, bomb, agent, what):
     file = tmp_path / "run.toml"
     file.write_text(RUNS[what](bomb))
-    if what != "a model without end":  # a possible run, until somebody makes the model
+    if what != "a model without end":  # valid until the model is built
         with pytest.raises(ConfigError) as caught:
             run.load(str(file))
         assert str(caught.value).startswith(f"run file '{file}'") or str(caught.value).startswith(str(file))
@@ -188,12 +189,12 @@ MANIFESTS = {
     "a spec that is a string": lambda good: {**good, "spec": "low"},
     "a spec of strings": lambda good: {**good, "spec": {**good["spec"], "low": "abc"}},
     "a spec without end": lambda good: {**good, "spec": {**good["spec"], "actions": 1 << 60}},
-    "actions below zero": lambda good: {**good, "spec": {**good["spec"], "actions": -1}},
+    "negative actions": lambda good: {**good, "spec": {**good["spec"], "actions": -1}},
 }
 
 
 @pytest.mark.parametrize("what", MANIFESTS)
-def test_a_manifest_that_is_not_what_it_should_be(tmp_path, agent, what):
+def test_an_invalid_manifest(tmp_path, agent, what):
     arrays, manifest = agent
     save_checkpoint(tmp_path / "good.npz", Checkpoint(arrays, manifest))
     assert load_agent(tmp_path / "good.npz").manifest["run"] == manifest["run"]
@@ -202,10 +203,10 @@ def test_a_manifest_that_is_not_what_it_should_be(tmp_path, agent, what):
         load_agent(tmp_path / "agent.npz")
 
 
-def test_a_run_folder_with_bombs_in_every_file_but_the_checkpoint(tmp_path, bomb, agent):
+def test_a_run_folder_with_pickles_in_every_file_but_the_checkpoint(tmp_path, bomb, agent):
     folder = tmp_path / "run"
     save_checkpoint(version_file(folder, 0), Checkpoint(*agent))
-    others = ["run.toml", "env.json", "metrics.jsonl", "result.json", "endpoint", "learner.log", "ledger.db", "__init__.py"]
+    others = ["run.toml", "env.json", "metrics.jsonl", "result.json", "endpoint", "learner.log", "index.db", "__init__.py"]
     for name in [*others, "conftest.py", "dataset/segment-000000.frames", "dataset/index", "sitecustomize.py", "torch.py"]:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(code(bomb).encode() if name.endswith(".py") else pickle.dumps(bomb))
@@ -235,25 +236,25 @@ SEGMENTS = {
 
 @pytest.fixture
 def dataset(tmp_path, small_run):
-    """A good dataset, and its file."""
+    """A valid dataset: its file and its number of trajectories."""
     phase = METHODS["dpt"].phases(small_run)[0]
-    with contextlib.closing(Store(tmp_path / "dataset")) as store:
-        store.append([t for job in METHODS["dpt"].ask(small_run, phase)[:1] for t in jobs.do(job, None, "w")])
-        count = len(store)
+    with contextlib.closing(Dataset(tmp_path / "dataset")) as dataset:
+        dataset.append([t for job in METHODS["dpt"].ask(small_run, phase)[:1] for t in jobs.do(job, None, "w")])
+        count = len(dataset)
     (file,) = (f for f in (tmp_path / "dataset").iterdir() if f.stat().st_size)
     return file, count
 
 
 @pytest.mark.parametrize("what", SEGMENTS)
-@pytest.mark.parametrize("behind", [False, True], ids=["alone", "behind good ones"])
-def test_a_malicious_dataset(bomb, dataset, what, behind):
+@pytest.mark.parametrize("after_valid", [False, True], ids=["alone", "after valid frames"])
+def test_a_malicious_dataset(bomb, dataset, what, after_valid):
     file, count = dataset
-    file.write_bytes((file.read_bytes() if behind else b"") + SEGMENTS[what](bomb))
+    file.write_bytes((file.read_bytes() if after_valid else b"") + SEGMENTS[what](bomb))
     try:
-        store = Store(file.parent)
+        dataset = Dataset(file.parent)
     except StoreError as error:
         assert str(file) in str(error)
         return
-    with contextlib.closing(store):
-        assert len(store) == (count if behind else 0)
-        assert store.repaired, "it neither complained nor said what it threw away"
+    with contextlib.closing(dataset):
+        assert len(dataset) == (count if after_valid else 0)
+        assert dataset.repaired, "it neither raised an error nor reported a repair"

@@ -1,7 +1,7 @@
-"""Bytes that nobody sent in good faith: a value or a WireError, within the memory that reading may take.
+"""Hostile bytes: every reader gives a value or a refusal, within its memory limit.
 
-``corpus/`` holds what fuzzing found, and what came closest: ``refused-*`` must be refused by
-the reader that it is named after, ``accepted-*`` taken; no other reader may break on it either.
+``corpus/`` holds inputs that fuzzing found.  The reader in the name of a file must refuse
+``refused-*`` and accept ``accepted-*``; the other readers must accept or refuse it without an error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from icrl_dist.bench import fuzz
-from icrl_dist.stream import validation, wire
+from icrl_dist.stream import excerpts, validation, wire
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.bin"))
 TARGETS = fuzz.targets()
@@ -31,7 +31,7 @@ def measured() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("file", CORPUS, ids=lambda file: file.stem)
-def test_the_corpus(file: Path, measured: None) -> None:
+def test_every_file_of_the_corpus(file: Path, measured: None) -> None:
     expected, reader, _ = file.stem.split("-", 2)
     data = file.read_bytes()
     for name, target in TARGETS.items():
@@ -41,13 +41,13 @@ def test_the_corpus(file: Path, measured: None) -> None:
             assert outcome == {"refused": "rejected", "accepted": "accepted"}[expected]
 
 
-def test_there_is_a_corpus() -> None:
+def test_the_corpus_is_not_empty() -> None:
     assert len(CORPUS) >= 15
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(name=st.sampled_from(sorted(TARGETS)), seed=st.integers(0, 2**63))
-def test_changed_messages(name: str, seed: int, measured: None) -> None:
+def test_mutated_messages(name: str, seed: int, measured: None) -> None:
     target = TARGETS[name]
     outcome, _, ratio = fuzz.attempt(target, fuzz.mutate(np.random.default_rng(seed), target.valid))
     assert outcome in ("accepted", "rejected") and ratio <= 1
@@ -55,12 +55,12 @@ def test_changed_messages(name: str, seed: int, measured: None) -> None:
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(name=st.sampled_from(sorted(TARGETS)), data=st.binary(max_size=2000))
-def test_noise(name: str, data: bytes, measured: None) -> None:
+def test_random_bytes(name: str, data: bytes, measured: None) -> None:
     outcome, _, ratio = fuzz.attempt(TARGETS[name], data)
     assert outcome in ("accepted", "rejected") and ratio <= 1
 
 
-PLAIN = st.recursive(
+VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=20) | st.binary(max_size=20),
     lambda inside: st.lists(inside, max_size=4) | st.dictionaries(st.text(max_size=5), inside, max_size=4),
     max_leaves=12,
@@ -68,8 +68,8 @@ PLAIN = st.recursive(
 
 
 @settings(max_examples=100, deadline=None)
-@given(PLAIN)
-def test_whatever_can_be_sent_comes_back(value: object) -> None:
+@given(VALUES)
+def test_every_value_that_can_be_encoded_is_decoded_equal(value: object) -> None:
     try:
         data = wire.encode_message("any", value=value)
     except wire.WireError as error:
@@ -80,7 +80,7 @@ def test_whatever_can_be_sent_comes_back(value: object) -> None:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Equal, of the same types, and not-a-number equal to itself."""
+    """Whether two values are equal with equal types; NaN equals NaN."""
     if type(one) is not type(other):
         return False
     if isinstance(one, float):
@@ -93,7 +93,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def test_a_message_of_many_values_is_refused_before_it_fills_the_memory(measured: None) -> None:
-    """Three bytes of a short text take 72 of memory; lists within a list hide them from a limit on its length."""
+    """Three bytes of text take 72 bytes of memory; nested lists would evade a limit on the length of one list."""
     data = b"\xdc\x00\x40" + (b"\xdc\x40\x00" + b"\xa2ab" * (1 << 14)) * 64
     with pytest.raises(wire.WireError, match="oversized: more than 458776 values"):
         validation.parse(data)
@@ -103,5 +103,5 @@ def test_a_message_of_many_values_is_refused_before_it_fills_the_memory(measured
 @pytest.mark.parametrize("value", [b"\0" * (4 << 20), "x" * (4 << 20), [[b"\0" * (4 << 20)]], {"a": list(range(100_000))}])
 def test_an_error_message_is_short_and_cheap_however_large_the_value(value: object, measured: None) -> None:
     before = tracemalloc.get_traced_memory()[1]
-    assert len(validation.show(value)) <= 80
+    assert len(excerpts.show(value)) <= 80
     assert tracemalloc.get_traced_memory()[1] - before < 1 << 20

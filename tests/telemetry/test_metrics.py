@@ -1,4 +1,4 @@
-"""One list of names, three places where its numbers can be had."""
+"""Metrics in the file, in TensorBoard and at the Prometheus endpoint, by one list of names."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def test_a_number_goes_to_the_file_and_to_prometheus(tmp_path):
     try:
         written.write(50, "fit/3", loss=0.25)
         written.write(100, "fit/3", loss=0.125)
-        written.tell(12.0, 2, "alert", what="zero", active=True, text="stuck")
+        written.write_text(12.0, 2, "alert", what="zero", active=True, text="stuck")
         with urllib.request.urlopen(f"http://{where}/metrics", timeout=10) as page:
             served = page.read().decode()
         assert 'icrl_fit_loss{run="demo"} 0.125' in served and 'icrl_fit_step{run="demo"} 100.0' in served
@@ -54,13 +54,13 @@ def test_a_number_that_is_not_in_the_list_is_refused(tmp_path):
     assert (tmp_path / "metrics.jsonl").read_text() == ""
 
 
-def test_the_page_is_made_from_the_list():
+def test_the_page_is_generated_from_the_list():
     page = Path(__file__).parents[2] / "docs" / "metrics.md"
     assert page.read_text() == metrics.document(), "run `python -m icrl_dist.telemetry.metrics > docs/metrics.md`"
     assert STAGES.keys() == NAMES.keys()
 
 
 @pytest.mark.parametrize("where", ["9464", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:70000", ":9464"])
-def test_an_endpoint_that_is_none(where):
+def test_an_invalid_endpoint_is_refused(where):
     with pytest.raises(ConfigError, match=r"learner.prometheus = .*use HOST:PORT, such as 127.0.0.1:9464"):
         parse(f'[learner]\nprometheus = "{where}"', "x")

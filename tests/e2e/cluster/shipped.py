@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from tests.e2e import simulated_nodes
 from tests.e2e.cluster import files
 
@@ -111,9 +111,9 @@ class ShippedCluster:
 
     def workers_of(self, name):
         """Number of trajectories by each worker in the dataset of a run."""
-        store = Store(self.folder(name) / "dataset", readonly=True)
+        store = Dataset(self.folder(name) / "dataset", readonly=True)
         with contextlib.closing(store):
-            return Counter(store.read(row.identity).worker for row in store.ledger)
+            return Counter(store.read(row.identity).worker for row in store.index)
 
 
 @contextlib.contextmanager

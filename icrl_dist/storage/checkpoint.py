@@ -1,0 +1,61 @@
+"""Checkpoints: arrays by name and a manifest, in one file per weights version, without pickle."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl_dist.storage.files import StoreError, atomic_write
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Arrays by name and a manifest of JSON values."""
+
+    arrays: Mapping[str, np.ndarray]
+    manifest: Mapping[str, Any]
+
+    def part(self, prefix: str) -> dict[str, np.ndarray]:
+        """The arrays whose name begins with ``prefix/``, by the rest of the name."""
+        return {k.removeprefix(prefix + "/"): v for k, v in self.arrays.items() if k.startswith(prefix + "/")}
+
+
+def version_file(folder: Path, version: int) -> Path:
+    """The checkpoint file of T^version in a run folder."""
+    return folder / "checkpoints" / f"version-{version:04d}.npz"
+
+
+def newest_version(folder: Path) -> int:
+    """The newest version that has a checkpoint in a run folder; -1 if there is none."""
+    names = (folder / "checkpoints").glob("version-[0-9][0-9][0-9][0-9].npz")
+    return max((int(name.stem.removeprefix("version-")) for name in names), default=-1)
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint; at every moment ``path`` holds the old one or the new one, whole."""
+    manifest = np.frombuffer(json.dumps(checkpoint.manifest).encode(), dtype=np.uint8)
+    arrays: dict[str, Any] = {f"a/{name}": value for name, value in checkpoint.arrays.items()}
+    atomic_write(path, lambda file: np.savez(file, manifest=manifest, **arrays))
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint without executing anything in it.  Raises StoreError if it is missing or not a checkpoint."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            size, unpacked = path.stat().st_size, sum(member.file_size for member in file.zip.infolist())
+            if unpacked > size:
+                raise ValueError(f"{size} bytes that would unpack to {unpacked}")
+            manifest = json.loads(file["manifest"].tobytes())
+            arrays = {name.removeprefix("a/"): file[name] for name in file.files if name.startswith("a/")}
+            if not isinstance(manifest, dict) or not all(isinstance(array, np.ndarray) for array in arrays.values()):
+                raise ValueError("expected a manifest that is a table, and arrays")
+    except FileNotFoundError:
+        raise StoreError(f"{path}: no such checkpoint") from None
+    except Exception as error:
+        raise StoreError(f"{path}: not a checkpoint of this system ({error})") from None
+    return Checkpoint(arrays, manifest)
