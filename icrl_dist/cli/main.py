@@ -56,7 +56,7 @@ def _parse(name: str, words: Sequence[str]) -> Any:
 def main(words: Sequence[str] | None = None) -> int:
     """Run ``icrl-dist`` with these words (default: ``sys.argv``).  Returns the exit code."""
     words = list(sys.argv[1:] if words is None else words)
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: docs/decisions.md
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: decision 073
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)

@@ -112,7 +112,7 @@ class ModelConfig:
     """Embedding size: 32 in Dark Room, 256 elsewhere."""
     fourier: NotNegative = 0
     """Sine and cosine pairs added to each observation component; 0 gives the scaled values
-    only, which keep no gap between training and held-out goals (docs/decisions.md)."""
+    only, which keep no gap between training and held-out goals (docs/decisions/008-contexts-first.md)."""
     window: Annotated[int, Ge(1), Remedy("at least 1, which is none")] = 1
     """States of a window: T_theta also reads what was done in the window so far (zeta of eq. 6), so
     that a guess once acted on is kept.  1: none, as in the paper's experiments."""

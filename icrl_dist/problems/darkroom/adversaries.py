@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from icrl_dist.types import NULL, Adversary
 
 ALPHA_RANGE = (0.05, 2.0)
-"""Prior of each Dirichlet parameter; the paper gives none (docs/decisions.md)."""
+"""Prior of each Dirichlet parameter; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
 
 
 def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:

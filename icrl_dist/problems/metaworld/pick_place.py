@@ -12,7 +12,7 @@ HORIZON = 500
 """Steps an episode: Meta-World allows no more."""
 DISTURBANCE = 0.01
 """Metres that an adversary of strength 1 moves a component of hand, object or goal: with 1 cm the scripted
-policy still succeeds, with 2 cm it seldom does (docs/decisions.md)."""
+policy still succeeds, with 2 cm it seldom does (docs/decisions/046-meta-world.md)."""
 MOVED = 9
 """Components of an adversary's action: hand, object and goal, x, y, z of each."""
 
