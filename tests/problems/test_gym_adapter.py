@@ -14,7 +14,7 @@ from icrl_dist.problems.darkroom import room
 from icrl_dist.problems.dmc import domains
 from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.types import Adversary, Task, Variation
-from tests.contracts.game_battery import BATTERY, MakeVariation, an_unseeded_reset_goes_on
+from tests.contracts.game_battery import BATTERY, MakeVariation, an_unseeded_reset_continues_the_generator
 
 
 def disturbed_room() -> Variation:
@@ -49,7 +49,7 @@ GAMES = [disturbed_room, quiet_room, blurred_reach, *map(pushed, domains.PROBLEM
 @pytest.mark.parametrize("make_variation", GAMES, ids=lambda make: make.__name__)
 @pytest.mark.parametrize("law", BATTERY)
 def test_contract(law: Callable[[MakeVariation], None], make_variation: MakeVariation) -> None:
-    if law is an_unseeded_reset_goes_on and make_variation is blurred_reach:
+    if law is an_unseeded_reset_continues_the_generator and make_variation is blurred_reach:
         pytest.skip("a task of Meta-World begins always alike: nothing in an episode is drawn but the actions")
     law(make_variation)
 
