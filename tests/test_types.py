@@ -134,7 +134,7 @@ def test_a_job_lists_every_trajectory_that_it_delivers() -> None:
     assert job != dataclasses.replace(job, payload=Rate(0.25))
     assert (job.name, job.label) == (("adapt", 2, 5, 0), "adapt/2/5")
     with pytest.raises(dataclasses.FrozenInstanceError):
-        job.payload.rate = 1.0  # type: ignore[attr-defined]
+        job.payload.rate = 1.0  # type: ignore[misc]
 
 
 def test_a_job_of_one_variation_keeps_the_number_of_that_variation() -> None:
