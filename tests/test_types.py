@@ -1,17 +1,18 @@
-"""Names of things: parameters, identities, the seeds they key; and that shapes are checked here."""
+"""Parameters, identities, their random streams, jobs; and shapes are checked in tests."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
 from icrl_dist.problems.darkroom.solver import cell_numbers
-from icrl_dist.types import ARRAYS, NULL, STAGES, Adversary, Identity, Job, Spec, Task, Trajectory, Variation
+from icrl_dist.types import ARRAYS, NULL, STAGES, Adversary, Identity, Job, Payload, Spec, Task, Trajectory, Variation
 
 
 def trajectory(horizon: int = 3, **changes: Any) -> Trajectory:
@@ -54,7 +55,7 @@ def test_params_are_sorted_python_values() -> None:
 
 
 @pytest.mark.parametrize("value", [{"a": 1}, None, [[1, 2], [3, 4]], np.eye(2), ["a", "b"], 1j])
-def test_params_refuse_what_the_wire_cannot_carry(value: object) -> None:
+def test_params_refuse_values_that_messages_cannot_carry(value: object) -> None:
     with pytest.raises(TypeError, match="parameter odd="):
         Task.of("darkroom", odd=value)
 
@@ -72,19 +73,19 @@ def test_reading_params() -> None:
         task.vector("size")
 
 
-def test_replace_keeps_the_type_and_the_rest() -> None:
+def test_replace_keeps_the_type_and_the_other_parameters() -> None:
     task = Task.of("darkroom", size=3, goal=(1, 2))
     other = task.replace(goal=[0, 0], start=(1, 1))
     assert other == Task.of("darkroom", goal=(0, 0), size=3, start=(1, 1))
     assert type(other) is Task
     assert task["goal"] == (1, 2)
-    assert Task("null") != NULL, "a task is no adversary, whatever its name"
+    assert Task("null") != NULL, "a task equals an adversary of the same kind"
 
 
 IDENTITIES = [Identity(s, *rest) for s in STAGES for rest in itertools.product((0, 1, 2, 11), repeat=4)]
 
 
-def test_identity_parses_what_it_prints() -> None:
+def test_identity_parses_its_own_text() -> None:
     assert all(Identity.parse(str(i)) == i for i in IDENTITIES)
     assert str(Identity("adapt", 1, 2, 3, 40)) == "adapt/1/2/3/40"
     assert [type(v) for v in Identity.parse("adapt/1/2/3/40")] == [str, int, int, int, int]
@@ -98,7 +99,7 @@ def test_identity_refuses_other_text(text: str) -> None:
         Identity.parse(text)
 
 
-def test_every_identity_and_seed_has_its_own_stream() -> None:
+def test_every_identity_and_seed_has_its_own_random_stream() -> None:
     keys = {i.key() for i in IDENTITIES}
     assert len(keys) == len(IDENTITIES)
     draws = {(seed, i): i.rng(seed).integers(2**63) for i in IDENTITIES for seed in (0, 1)}
@@ -110,7 +111,7 @@ def test_keys_sort_in_canonical_order() -> None:
     assert sorted(IDENTITIES, key=Identity.key) == IDENTITIES
 
 
-def test_a_trajectorys_arrays_are_the_wires() -> None:
+def test_a_trajectory_has_the_arrays_of_the_message_format() -> None:
     one = trajectory(rewards=np.array([0, 1, 1], np.float32))
     assert list(one.arrays()) == list(ARRAYS)
     for name, array in one.arrays().items():
@@ -119,17 +120,24 @@ def test_a_trajectorys_arrays_are_the_wires() -> None:
     assert one.episode_return == 2.0
 
 
-def test_a_job_names_every_trajectory_it_will_deliver() -> None:
-    job = Job("adapt", "adapt", 2, 5, (Variation(Task.of("darkroom")),) * 3, 4, 1, 0, Task.of("", rate=0.5).params)
-    names = list(job.identities())
-    assert names == [Identity("adapt", 2, 5, v, t) for v in range(3) for t in range(4)]
-    assert job.setting("rate") == 0.5
+@dataclass(frozen=True)
+class Rate(Payload):
+    kind: ClassVar[str] = "adapt"
+    rate: float
+
+
+def test_a_job_lists_every_trajectory_that_it_delivers() -> None:
+    job = Job("adapt", "adapt", 2, 5, (Variation(Task.of("darkroom")),) * 3, 4, 1, 0, Rate(0.5))
+    identities = list(job.identities())
+    assert identities == [Identity("adapt", 2, 5, v, t) for v in range(3) for t in range(4)]
+    assert job.payload == Rate(0.5) and hash(job) == hash(dataclasses.replace(job, payload=Rate(0.5)))
+    assert job != dataclasses.replace(job, payload=Rate(0.25))
     assert (job.name, job.label) == (("adapt", 2, 5, 0), "adapt/2/5")
-    with pytest.raises(KeyError, match=r"'speed'.*rate"):
-        job.setting("speed")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        job.payload.rate = 1.0  # type: ignore[misc]
 
 
-def test_a_job_of_one_variation_keeps_that_variations_number() -> None:
+def test_a_job_of_one_variation_keeps_the_number_of_that_variation() -> None:
     tasks = tuple(
         Variation(Task.of("darkroom", goal=(g, g)), Adversary.of("uniform", p=p)) for g in range(2) for p in (0.0, 0.5)
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -50,6 +51,11 @@ class InContextAgent:
         of = self._trained
         self._policy: Any = of.method.policy(of.model, batch, of.run.context, self.deploy, watch)
         self._batch = batch
+
+    @property
+    def model(self) -> torch.nn.Module:
+        """The model that acts."""
+        return self._trained.model
 
     @property
     def surprise(self) -> Float[np.ndarray, " B"]:

@@ -1,19 +1,21 @@
-"""How unlike pretraining a context is: the readout and its calibration against slow loops, and an unseen disturbance."""
+"""Out-of-distribution score: readout and calibration against slow loops, and a disturbance that was never trained on."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 import torch
-from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist.agent import ood_score
 from icrl_dist.agent.in_context_agent import InContextAgent
-from icrl_dist.agent.loading import calibrated, load_agent, model_of, outcomes_of, shipped
+from icrl_dist.agent.loading import calibrated, load_agent, outcomes_of, shipped, trained
 from icrl_dist.agent.ood_score import Surprise
+from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, parse
-from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import RARE, WINDOWS, OutcomeModel
-from icrl_dist.problems import registry, splits
+from icrl_dist.problems import registry
 from icrl_dist.results import evaluate, heldout
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.files import StoreError
@@ -24,9 +26,9 @@ SPECS = (Spec((0.0, -1.0), (9.0, 1.0), 3, 5), Spec((0.0, -1.0), (9.0, 1.0), 2, 5
 
 
 def decisions(spec, steps, seed, noise=0.1):
-    """Steps of B environments in which what comes depends on state and action, and on chance."""
+    """Steps of B environments whose outcomes depend on state and action, with noise."""
     rng = np.random.default_rng(seed)
-    law = np.random.default_rng(99).normal(size=(D, spec.actions, spec.observation + 1)) / D
+    weights = np.random.default_rng(99).normal(size=(D, spec.actions, spec.observation + 1)) / D
     made = []
     for _ in range(steps):
         state = rng.normal(size=(B, D)).astype(np.float32)
@@ -34,7 +36,7 @@ def decisions(spec, steps, seed, noise=0.1):
             rng.integers(spec.actions, size=B) if spec.discrete else rng.uniform(-1, 1, (B, spec.actions)).astype(np.float32)
         )
         taken = np.eye(spec.actions)[action] if spec.discrete else action
-        comes = np.einsum("bd,ba,dao->bo", state, taken, law) + noise * rng.normal(size=(B, spec.observation + 1))
+        comes = np.einsum("bd,ba,dao->bo", state, taken, weights) + noise * rng.normal(size=(B, spec.observation + 1))
         before = rng.uniform(0, 1, (B, spec.observation)).astype(np.float32)
         after = before + comes[:, :-1].astype(np.float32) * np.array([4.5, 1.0], np.float32)
         made.append((state, before, action, comes[:, -1].astype(np.float32), after))
@@ -42,7 +44,7 @@ def decisions(spec, steps, seed, noise=0.1):
 
 
 def outcome_of(spec, one, row):
-    """What is to be predicted: in units of half the spec's range, and the reward."""
+    """The target: the change of the observation in units of half the spec's range, and the reward."""
     _, before, _, reward, after = one
     change = [(after[row][i] - before[row][i]) / ((spec.high[i] - spec.low[i]) / 2) for i in range(spec.observation)]
     return np.array([*change, reward[row]], np.float64)
@@ -65,7 +67,7 @@ def test_the_readout_is_ridge_regression_and_its_loss_a_gaussian_one(spec):
     np.testing.assert_allclose(model.readout, slow, atol=2e-4)
     left = np.sqrt(np.mean((y - x @ slow) ** 2, axis=0))
     np.testing.assert_allclose(model.deviation, left, rtol=1e-3)
-    assert (left < 0.6 * y.std(axis=0)).all(), "nothing is predicted: this would prove little"
+    assert (left < 0.6 * y.std(axis=0)).all(), "the readout predicts nothing, so this would prove little"
     other = decisions(spec, 1, seed=2)[0]
     for row, loss in enumerate(model.loss(spec, other)):
         error = (outcome_of(spec, other, row) - features_of(spec, other, row) @ slow) / left
@@ -88,7 +90,7 @@ def test_surprise_is_0_at_the_median_and_1_at_the_rare_quantile_of_held_out_wind
         np.testing.assert_allclose(model.surprise(losses[:, :seen]), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_running_surprise_remembers_the_longest_window_and_no_more():
+def test_the_running_surprise_keeps_the_longest_window_and_no_more():
     spec = SPECS[0]
     model = OutcomeModel.fit(spec, decisions(spec, 200, seed=0), decisions(spec, 120, seed=1))
     running = Surprise(model, spec, B)
@@ -103,7 +105,7 @@ def test_the_running_surprise_remembers_the_longest_window_and_no_more():
     assert np.median(running.now()) < 1
 
 
-def test_what_never_changes_in_training_is_told_when_it_does():
+def test_a_change_of_a_constant_of_training_gives_a_high_surprise():
     spec = SPECS[0]
     still = [(s, o, a, r * 0, o) for s, o, a, r, _ in decisions(spec, 50, seed=0)]
     model = OutcomeModel.fit(spec, still, still)
@@ -113,35 +115,37 @@ def test_what_never_changes_in_training_is_told_when_it_does():
 
 
 @pytest.fixture
-def model(small_run):
+def untrained(small_run):
+    """An untrained model of ``small_run``."""
     torch.manual_seed(0)
-    return PretrainedTransformer(splits.spec(small_run), small_run.model).eval()
+    spec, method = registry.of(small_run).spec, methods.of(small_run)
+    return TrainedModel(small_run, method, spec, method.build(spec, small_run).eval())
 
 
-def test_calibration_deploys_in_training_tasks_under_adversaries_never_met_and_repeats_itself(small_run, model):
-    heard = []
-    once, again = ood_score.calibrate(small_run, model, heard.append), ood_score.calibrate(small_run, model)
-    assert heard == list(range(1, 2 * ood_score.EPISODES + 1))
+def test_calibration_deploys_in_training_tasks_under_new_adversaries_and_repeats(small_run, untrained):
+    reported = []
+    once, again = ood_score.calibrate(untrained, reported.append), ood_score.calibrate(untrained)
+    assert reported == list(range(1, 2 * ood_score.EPISODES + 1))
     for name, array in once.arrays().items():
         np.testing.assert_array_equal(array, again.arrays()[name])
-    rows = list(ood_score._rows(small_run))
-    assert {index for index, _ in rows} == set(range(len(splits.split(small_run).train)))
-    goals = {task["goal"] for task in splits.split(small_run).train}
+    rows, train = list(ood_score._rows(untrained)), registry.of(small_run).split.train
+    assert {index for index, _ in rows} == set(range(len(train)))
+    goals = {task["goal"] for task in train}
     assert {variation.task["goal"] for _, variation in rows} == goals
-    trained = {
-        v.adversary for i, task in enumerate(splits.split(small_run).train) for v in splits.variations(small_run, i, task)
-    }
-    assert {variation.adversary for _, variation in rows} & trained <= {NULL}
+    met = {v.adversary for i, task in enumerate(train) for v in registry.training_variations(small_run, i, task)}
+    assert {variation.adversary for _, variation in rows} & met <= {NULL}
 
 
 def test_each_method_is_calibrated_under_the_disturbances_that_it_trains_on(small_run):
-    for name, method in METHODS.items():
-        met = {v.adversary.kind for v in method.variations(small_run, 0, splits.split(small_run).train[0], 5)}
+    task = registry.of(small_run).split.train[0]
+    for name in methods.names():
+        method = methods.of(dataclasses.replace(small_run, method=name))
+        met = {v.adversary.kind for v in method.training_variations(small_run, 0, task, 5)}
         assert met == ({"null"} if name == "dpt" else {"null", "dirichlet"})
 
 
 class Mirrored:
-    """Controls that nobody trained on: +x goes -x, and back, +y goes +x, and so on."""
+    """Controls that were never trained on: +x moves to -x and back, +y to +x, and so on."""
 
     def __init__(self, inner):
         self.spec, self.batch, self.reset, self._inner = inner.spec, inner.batch, inner.reset, inner
@@ -166,7 +170,7 @@ def deployed(agent, env, episodes=2):
 
 
 def test_surprise_rises_on_an_unseen_kind_of_disturbance_and_not_on_unseen_goals():
-    """The shipped agent on goals that neither it nor its calibration ever met."""
+    """The shipped agent on goals that were used neither in training nor in calibration."""
     agent = load_agent("darkroom", seed=0)
     run = parse(load_checkpoint(shipped("darkroom")).manifest["run"], "shipped")
     np.testing.assert_array_equal(agent.surprise, [0.0])
@@ -180,8 +184,8 @@ def test_surprise_rises_on_an_unseen_kind_of_disturbance_and_not_on_unseen_goals
     np.testing.assert_array_equal(agent.surprise, [0.0, 0.0])
 
 
-def test_only_what_the_agent_was_asked_for_counts(small_run, model):
-    agent = InContextAgent(model, {}, small_run.context, 0, outcomes=ood_score.calibrate(small_run, model))
+def test_only_transitions_after_an_act_count(untrained):
+    agent = InContextAgent(untrained, {}, 0, outcomes=ood_score.calibrate(untrained))
     obs = np.zeros((1, 2), np.float32)
     agent.observe(obs, [0], [1.0], obs, [False])
     np.testing.assert_array_equal(agent.surprise, [0.0])
@@ -192,20 +196,19 @@ def test_only_what_the_agent_was_asked_for_counts(small_run, model):
     np.testing.assert_array_equal(agent.surprise, first)
 
 
-def test_an_agent_that_was_not_calibrated_says_so_and_export_calibrates_it(small_run, model, tmp_path):
+def test_surprise_of_an_uncalibrated_agent_is_refused_and_export_calibrates_it(small_run, untrained, tmp_path):
     from learner import checkpoints
 
     file = tmp_path / "version-0000.npz"
-    spec = splits.spec(small_run)
-    arrays = {f"model/{name}": value.numpy() for name, value in model.state_dict().items()}
-    save_checkpoint(file, Checkpoint(arrays, checkpoints.manifest(small_run, spec, 0, 1)))
+    arrays = {f"model/{name}": value.numpy() for name, value in untrained.model.state_dict().items()}
+    save_checkpoint(file, Checkpoint(arrays, checkpoints.manifest(small_run, untrained.spec, 0, 1)))
     with pytest.raises(ConfigError, match=r"not calibrated.*icrl-dist export"):
         _ = load_agent(file).surprise
     assert main.main(["export", str(file), "--out", str(tmp_path / "agent.npz")]) == 0
     exported = load_checkpoint(tmp_path / "agent.npz")
     assert load_agent(tmp_path / "agent.npz").surprise.shape == (1,)
     assert calibrated(exported) is exported
-    expected = ood_score.calibrate(small_run, model_of(exported)[0]).arrays()
+    expected = ood_score.calibrate(trained(exported)).arrays()
     for name, array in exported.part("outcomes").items():
         np.testing.assert_array_equal(array, expected[name])
     broken = Checkpoint({**exported.arrays, "outcomes/more": np.zeros(1)}, exported.manifest)
@@ -213,5 +216,5 @@ def test_an_agent_that_was_not_calibrated_says_so_and_export_calibrates_it(small
         outcomes_of(broken)
 
 
-def test_a_spread_tells_the_median_and_the_share_above_1():
+def test_a_spread_is_the_median_and_the_share_above_1():
     assert heldout._spread(np.array([0.0, 0.5, 1.5, 3.0])) == {"median": 1.0, "above_1": 0.5}

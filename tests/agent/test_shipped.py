@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist.agent.loading import SHIPPED, load_agent, model_of, shipped
+from icrl_dist.agent.loading import SHIPPED, load_agent, shipped, trained
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, parse
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
 from icrl_dist.results import evaluate
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.training.fit import Optimizer
@@ -23,14 +23,16 @@ from learner import checkpoints
 @pytest.fixture
 def folder(small_run, tmp_path):
     """A run folder with versions 0 and 1, optimizer and list of data included."""
+    spec = registry.of(small_run).spec
     for version in (0, 1):
         torch.manual_seed(version)
-        model = PretrainedTransformer(splits.spec(small_run), small_run.model)
+        model = PretrainedTransformer(spec, small_run.model)
         opt = Optimizer(model, small_run.optim)
         sum(p.sum() for p in model.parameters()).backward()
         opt.step(1e-3)
-        about = checkpoints.manifest(small_run, splits.spec(small_run), version, 1)
-        checkpoints.save(version_file(tmp_path, version), model, opt, {**about, "dataset": ["a"], "dataset_digest": "d"})
+        about = checkpoints.manifest(small_run, spec, version, 1)
+        weights = checkpoints.weights(version, model)
+        checkpoints.save(version_file(tmp_path, version), weights, opt, {**about, "dataset": ["a"], "dataset_digest": "d"})
     return tmp_path
 
 
@@ -49,12 +51,12 @@ def test_an_exported_agent_is_the_newest_version_without_what_only_training_need
     assert load_agent(other).manifest["version"] == 0
 
 
-def test_a_folder_is_no_file_to_export_to(folder, capsys):
+def test_export_to_a_folder_is_refused(folder, capsys):
     assert main.main(["export", str(folder), "--out", str(folder)]) == 2
     assert "is a folder; name a file" in capsys.readouterr().err
 
 
-def test_shipped_agents_are_small_and_say_where_they_come_from():
+def test_shipped_agents_are_small_and_their_manifests_name_run_seed_and_digests():
     assert "darkroom" in SHIPPED
     for name in SHIPPED:
         assert shipped(name).stat().st_size < 1_000_000
@@ -80,24 +82,23 @@ def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_
     assert load_agent("darkroom").manifest["size"] == 10
 
 
-def test_what_a_shipped_agent_knows_is_in_its_weights():
-    """It knows nothing of the environment but what its weights hold: shuffled, they earn what a random policy does."""
+def test_a_shipped_agent_with_shuffled_weights_is_no_better_than_a_random_policy():
+    """All that the agent learned of the environment is in its weights."""
     checkpoint = load_checkpoint(shipped("darkroom"))
     run = parse(checkpoint.manifest["run"], "shipped")
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, episodes=3, seeds=1, p=(0.0,)))
-    model, _ = model_of(checkpoint)
-    shuffled, _ = model_of(checkpoint)
+    untouched, shuffled = trained(checkpoint), trained(checkpoint)
     torch.manual_seed(0)
     with torch.no_grad():
-        for parameter in shuffled.parameters():
+        for parameter in shuffled.model.parameters():
             parameter.copy_(parameter.flatten()[torch.randperm(parameter.numel())].view_as(parameter))
-    agents = {"trained": evaluate.in_context(run, model), "shuffled": evaluate.in_context(run, shuffled)}
-    agents["random"] = evaluate.random
-    trained, mixed, random = (result.returns.mean() for result in evaluate.online(run, agents))
-    assert trained > 40 and mixed < 5 and random < 5
+    agents = {"trained": evaluate.in_context(untouched), "shuffled": evaluate.in_context(shuffled)}
+    agents["random"] = registry.of(run).references(run)["random"]
+    whole, mixed, random = (result.returns.mean() for result in evaluate.online(run, agents))
+    assert whole > 40 and mixed < 5 and random < 5
 
 
-def test_what_is_evaluated_is_named_once(capsys, tmp_path):
+def test_evaluate_needs_exactly_one_agent(capsys, tmp_path):
     for words in (["evaluate"], ["evaluate", str(tmp_path), "--pretrained", "darkroom"]):
         assert main.main(words) == 2
         assert "name a run folder or a checkpoint file, or with --pretrained" in capsys.readouterr().err
@@ -107,7 +108,7 @@ def test_what_is_evaluated_is_named_once(capsys, tmp_path):
         shipped("nothing")
 
 
-def test_what_an_agent_was_not_trained_for_is_refused_in_one_line(folder, capsys):
+def test_a_deployment_that_an_agent_was_not_trained_for_is_refused_in_one_line(folder, capsys):
     assert main.main(["evaluate", str(folder), "--deploy", "committed"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "model.window = 1" in line and "'paper'" in line

@@ -1,6 +1,6 @@
-"""What every game must be, whatever its physics: run over all of them by ``test_envs.py``.
+"""Requirements on the environments of every problem; ``tests/problems/test_gym_adapter.py`` runs them.
 
-Each law takes ``make_variation``, which makes one variation of the game afresh.
+Each check takes ``make_variation``, which makes one variation of the problem anew.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ HARMLESS = ("Not able to test alternative render modes",)
 
 
 def _episode(env: VariationEnv, seed: int) -> list[Any]:
-    """Every observation and result of one episode of seeded random actions."""
+    """All observations and results of one episode of seeded random actions."""
     env.action_space.seed(seed)
     seen: list[Any] = [env.reset(seed=seed)[0].tobytes()]
     for _ in range(registry.spec(env.variation.task).horizon):
@@ -35,12 +35,12 @@ def _episode(env: VariationEnv, seed: int) -> list[Any]:
 
 
 def gymnasium_contract(make_variation: MakeVariation) -> None:
-    """gymnasium's own checker has nothing to say."""
+    """gymnasium's own checker gives no warning."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(registry.make(make_variation()))
-    complaints = [str(w.message) for w in caught if not any(text in str(w.message) for text in HARMLESS)]
-    assert complaints == []
+    unexpected = [str(w.message) for w in caught if not any(text in str(w.message) for text in HARMLESS)]
+    assert unexpected == []
 
 
 def spec_agrees_with_spaces(make_variation: MakeVariation) -> None:
@@ -70,7 +70,7 @@ def observations_lie_in_the_space(make_variation: MakeVariation) -> None:
 
 
 def same_seed_same_episode(make_variation: MakeVariation) -> None:
-    """In the same environment, in another one, and however many episodes came before."""
+    """In the same environment, in another one, and after any number of episodes."""
     one, other = registry.make(make_variation()), registry.make(make_variation())
     first = _episode(one, 3)
     assert _episode(one, 3) == first
@@ -83,8 +83,8 @@ def seeds_matter(make_variation: MakeVariation) -> None:
     assert len({str(_episode(env, seed)) for seed in range(5)}) == 5
 
 
-def an_unseeded_reset_goes_on(make_variation: MakeVariation) -> None:
-    """reset() without a seed continues the generator rather than repeating the episode."""
+def an_unseeded_reset_continues_the_generator(make_variation: MakeVariation) -> None:
+    """reset() without a seed continues the generator and does not repeat the episode."""
     env = registry.make(make_variation())
     actions = [env.action_space.sample() for _ in range(registry.spec(env.variation.task).horizon)]
     env.reset(seed=0)
@@ -96,7 +96,7 @@ def an_unseeded_reset_goes_on(make_variation: MakeVariation) -> None:
 
 
 def truncated_exactly_at_the_horizon(make_variation: MakeVariation) -> None:
-    """Never terminated; one step more is refused, and a reset allows the next episode."""
+    """Episodes never terminate earlier; one more step is refused, and a reset allows the next episode."""
     env = registry.make(make_variation())
     env.action_space.seed(0)
     horizon = registry.spec(env.variation.task).horizon
@@ -130,7 +130,7 @@ BATTERY: tuple[Callable[[MakeVariation], None], ...] = (
     observations_lie_in_the_space,
     same_seed_same_episode,
     seeds_matter,
-    an_unseeded_reset_goes_on,
+    an_unseeded_reset_continues_the_generator,
     truncated_exactly_at_the_horizon,
     a_step_before_reset_is_refused,
     an_action_outside_the_space_is_refused,

@@ -1,4 +1,4 @@
-"""Every game against the contract battery, and the registry of games."""
+"""Environments of every problem against the contract battery, ``registry.make`` and ``registry.batch``."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from icrl_dist.problems.darkroom import room
 from icrl_dist.problems.dmc import domains
 from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.types import Adversary, Task, Variation
-from tests.contracts.game_battery import BATTERY, MakeVariation, an_unseeded_reset_goes_on
+from tests.contracts.game_battery import BATTERY, MakeVariation, an_unseeded_reset_continues_the_generator
 
 
 def disturbed_room() -> Variation:
     return Variation(room.task((1, 2), 4, 20), Adversary.of("dirichlet", p=0.3, alpha=[0.1, 1.0, 0.5, 2.0, 0.3]))
 
 
-def quiet_room() -> Variation:
+def undisturbed_room() -> Variation:
     return Variation(room.task((3, 0), 4, 6))
 
 
 def pushed(kind: str) -> Callable[[], Variation]:
-    """A problem of DeepMind Control, in short episodes, pushed by a fixed network."""
+    """A DeepMind Control problem in short episodes; a fixed network applies forces."""
 
     def make() -> Variation:
         task = domains.grid(kind, 2)[1].replace(horizon=12)
@@ -37,24 +37,24 @@ def pushed(kind: str) -> Callable[[], Variation]:
     return make
 
 
-def blurred_reach() -> Variation:
-    """Meta-World's pick-place, seen through a fixed network."""
+def noisy_pick_place() -> Variation:
+    """Meta-World's pick-place; a fixed network disturbs its observations."""
     task = pick_place.task((0.02, 0.65, 0.02), (0.05, 0.85, 0.2), horizon=12)
     return Variation(task, network_adversary.network(1, 39, pick_place.MOVED))
 
 
-GAMES = [disturbed_room, quiet_room, blurred_reach, *map(pushed, domains.PROBLEMS)]
+ENVIRONMENTS = [disturbed_room, undisturbed_room, noisy_pick_place, *map(pushed, domains.PROBLEMS)]
 
 
-@pytest.mark.parametrize("make_variation", GAMES, ids=lambda make: make.__name__)
-@pytest.mark.parametrize("law", BATTERY)
-def test_contract(law: Callable[[MakeVariation], None], make_variation: MakeVariation) -> None:
-    if law is an_unseeded_reset_goes_on and make_variation is blurred_reach:
-        pytest.skip("a task of Meta-World begins always alike: nothing in an episode is drawn but the actions")
-    law(make_variation)
+@pytest.mark.parametrize("make_variation", ENVIRONMENTS, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("check", BATTERY)
+def test_contract(check: Callable[[MakeVariation], None], make_variation: MakeVariation) -> None:
+    if check is an_unseeded_reset_continues_the_generator and make_variation is noisy_pick_place:
+        pytest.skip("a Meta-World task always starts in the same state: only actions are drawn in an episode")
+    check(make_variation)
 
 
-def test_make_shows_the_override_in_info_only() -> None:
+def test_make_shows_the_override_in_info_alone() -> None:
     variation = Variation(room.task((0, 0), 3, 50), Adversary.of("dirichlet", p=0.5, alpha=[1.0] * 5))
     env, batch = registry.make(variation), registry.batch([variation])
     env.reset(seed=0)
@@ -74,7 +74,7 @@ def test_unknown_problem_is_refused_with_the_known_ones() -> None:
 
 def test_a_batch_of_two_problems_is_refused() -> None:
     with pytest.raises(ValueError, match=r"darkroom.*lightroom"):
-        registry.batch([quiet_room(), Variation(Task.of("lightroom", size=3))])
+        registry.batch([undisturbed_room(), Variation(Task.of("lightroom", size=3))])
     with pytest.raises(ValueError, match="one problem"):
         registry.batch([])
 
@@ -88,20 +88,20 @@ def test_a_room_is_drawn_from_above() -> None:
     green = np.argwhere((cells == (45, 164, 78)).all(axis=2)).tolist()
     blue = np.argwhere((cells == (31, 111, 235)).all(axis=2)).tolist()
     assert (green, blue) == ([[2, 2]], [[1, 0]]), "rows from above, columns from the left"
-    assert registry.make(quiet_room()).render() is None
+    assert registry.make(undisturbed_room()).render() is None
     with pytest.raises(ValueError, match=r"render_mode 'human'.*'rgb_array'"):
-        registry.make(quiet_room(), "human")
+        registry.make(undisturbed_room(), "human")
 
 
-@pytest.mark.parametrize("make_variation", [blurred_reach, pushed("dmc-hopper-hop")], ids=["metaworld", "dmc"])
+@pytest.mark.parametrize("make_variation", [noisy_pick_place, pushed("dmc-hopper-hop")], ids=["metaworld", "dmc"])
 @pytest.mark.parametrize("back_end", ["disabled", "osmesa"])
-def test_what_cannot_be_drawn_is_one_line_with_the_remedy(
+def test_a_failed_rendering_is_one_line_with_the_remedy(
     make_variation: MakeVariation, back_end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env: Any = registry.make(make_variation(), "rgb_array")
     env.reset(seed=0)
     monkeypatch.setenv("MUJOCO_GL", back_end)
-    inner = env._batch._envs[0] if make_variation is blurred_reach else env._batch.game._envs[0].physics
+    inner = env._batch._envs[0] if make_variation is noisy_pick_place else env._batch.game._envs[0].physics
 
     def broken(*arguments: Any, **options: Any) -> None:
         raise OSError("no such\nlibrary")

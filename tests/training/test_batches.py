@@ -1,4 +1,4 @@
-"""Training batches: contexts of one variation, prefixes within them, labels of their own query."""
+"""Training batches: contexts of one variation, prefixes within them, labels of their own queries."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icrl_dist.training import batches as context
-from icrl_dist.training.batches import Batch, Examples, Pool
+from icrl_dist.training.batches import Examples, Pool, TrainingBatch, draw
 from icrl_dist.types import Identity, Task, Trajectory, Variation
 
 HORIZON, QUERIES, ACTIONS = 5, 3, 4
 
 
 def examples(variation: int, episodes: int, history: bool = False) -> Examples:
-    """Numbers that tell where they came from: state 1000 v + 100 e + h, and so on."""
+    """Each number encodes its origin: the state is 1000 v + 100 e + h in variation v, episode e and step h."""
     e, h = np.mgrid[:episodes, : HORIZON + 1]
     state = 1000 * variation + 100 * e + h
     query = 1000 * variation + np.arange(QUERIES)
@@ -31,14 +30,14 @@ def examples(variation: int, episodes: int, history: bool = False) -> Examples:
     )
 
 
-def check_row(batch: Batch, row: int) -> tuple[int, list[int], int]:
-    """The (variation, episodes, length) of a row, after every number in it has been traced back."""
+def check_row(batch: TrainingBatch, row: int) -> tuple[int, list[int], int]:
+    """The (variation, episodes, length) of a row; checks the origin of every number in it."""
     state = batch.observations[row, :, 0].astype(int)
     length = int((batch.next_observations[row, :, 0] > 0).sum())
     assert length % HORIZON == 0
     assert length > 0
     for column in (batch.observations, batch.actions, batch.next_observations, batch.rewards):
-        assert not column[row, length:].any(), "padding is not zero, or lies elsewhere than at the end"
+        assert not column[row, length:].any(), "padding is not zero, or is not at the end"
     variations, episodes = set(), []
     for start in range(0, length, HORIZON):
         variations.add(state[start] // 1000)
@@ -65,24 +64,24 @@ def check_row(batch: Batch, row: int) -> tuple[int, list[int], int]:
     return variation, episodes, length
 
 
-def batches(pools: list[Pool], count: int = 40, transitions: int = 0) -> list[Batch]:
+def drawn_batches(pools: list[Pool], count: int = 40, transitions: int = 0) -> list[TrainingBatch]:
     rng = np.random.default_rng(0)
-    return [context.draw(rng, pools, 16, 6, transitions) for _ in range(count)]
+    return [draw(rng, pools, 16, 6, transitions) for _ in range(count)]
 
 
 def test_every_number_comes_from_one_variation_in_order() -> None:
     pool = Pool(1.0, [examples(1, 4), examples(2, 4), examples(3, 4)], 3)
-    rows = [(b, *check_row(b, row)) for b in batches([pool]) for row in range(16)]
+    rows = [(b, *check_row(b, row)) for b in drawn_batches([pool]) for row in range(16)]
     assert {v for _, v, _, _ in rows} == {1, 2, 3}
     assert {len(e) for _, _, e, _ in rows} == {1, 2, 3}
-    assert all(len(set(e)) == len(e) for _, _, e, _ in rows), "an episode stands twice in a context"
+    assert all(len(set(e)) == len(e) for _, _, e, _ in rows), "a context contains an episode twice"
     assert {e[0] for _, _, e, _ in rows} == {0, 1, 2, 3}
     assert any(e != sorted(e) for _, _, e, _ in rows)
 
 
-def test_prefixes_reach_from_nothing_to_everything() -> None:
+def test_prefixes_are_uniform_from_empty_to_the_whole_context() -> None:
     pool = Pool(1.0, [examples(1, 2)], 1)
-    for b in (all_batches := batches([pool])):
+    for b in (all_batches := drawn_batches([pool])):
         assert b.observations.shape == (16, HORIZON, 2)
     counts = np.bincount(np.concatenate([b.prefix.ravel() for b in all_batches]))
     assert len(counts) == HORIZON + 1
@@ -92,29 +91,29 @@ def test_prefixes_reach_from_nothing_to_everything() -> None:
 
 def test_history_contexts_are_the_first_episodes_in_order() -> None:
     pool = Pool(1.0, [examples(1, 3, history=True), examples(2, 3, history=True)], 3)
-    seen = {tuple(check_row(b, row)[1]) for b in batches([pool]) for row in range(16)}
+    seen = {tuple(check_row(b, row)[1]) for b in drawn_batches([pool]) for row in range(16)}
     assert seen == {(0,), (0, 1), (0, 1, 2)}
 
 
 def test_a_variation_with_fewer_episodes_is_padded_at_the_end() -> None:
     pool = Pool(1.0, [examples(1, 1), examples(2, 3)], 3)
-    lengths = {(b.actions.shape[1], *check_row(b, row)[::2]) for b in batches([pool]) for row in range(16)}
+    lengths = {(b.actions.shape[1], *check_row(b, row)[::2]) for b in drawn_batches([pool]) for row in range(16)}
     assert (3 * HORIZON, 1, HORIZON) in lengths
     assert (3 * HORIZON, 2, 3 * HORIZON) in lengths
     # Never longer than its longest row.
-    assert all(max(check_row(b, row)[2] for row in range(16)) == b.actions.shape[1] for b in batches([pool]))
+    assert all(max(check_row(b, row)[2] for row in range(16)) == b.actions.shape[1] for b in drawn_batches([pool]))
 
 
 def test_all_queries_are_drawn() -> None:
-    drawn = np.concatenate([b.queries[..., 0].ravel() for b in batches([Pool(1.0, [examples(1, 2)], 3)])])
+    drawn = np.concatenate([b.queries[..., 0].ravel() for b in drawn_batches([Pool(1.0, [examples(1, 2)], 3)])])
     assert set(drawn.astype(int)) == {1000, 1001, 1002}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_pools_are_drawn_by_their_share(share: float) -> None:
-    """A batch is of one pool, and as long as that pool's contexts may be."""
+    """A batch comes from one pool, and its contexts have at most that pool's number of episodes."""
     pools = [Pool(2 * share, [examples(1, 4)], 1), Pool(2 * (1 - share), [examples(2, 4), examples(3, 4)], 4)]
-    drawn = [[check_row(b, row) for row in range(16)] for b in batches(pools, 200)]
+    drawn = [[check_row(b, row) for row in range(16)] for b in drawn_batches(pools, 200)]
     kinds = [{variation for variation, _, _ in rows} for rows in drawn]
     assert all(kind == {1} or kind <= {2, 3} for kind in kinds)
     assert abs(np.mean([kind == {1} for kind in kinds]) - share) <= 4.5 * np.sqrt(share * (1 - share) / len(kinds))
@@ -124,19 +123,21 @@ def test_pools_are_drawn_by_their_share(share: float) -> None:
     assert lengths == set().union(*(those for drawn, those in possible if drawn))
 
 
-def test_of_longer_contexts_fewer_fit_into_a_step() -> None:
+def test_a_batch_has_fewer_contexts_if_they_are_longer() -> None:
     pool = Pool(1.0, [examples(1, 4), examples(2, 4)], 4)
-    sizes = {(len({*check_row(b, 0)[1]}), len(b.actions)) for b in batches([pool], transitions=6 * HORIZON)}
+    sizes = {(len({*check_row(b, 0)[1]}), len(b.actions)) for b in drawn_batches([pool], transitions=6 * HORIZON)}
     assert sizes == {(1, 6), (2, 3), (3, 2), (4, 1)}
-    assert {len(b.actions) for b in batches([pool], transitions=1)} == {1}, "one context, however long"
+    assert {len(b.actions) for b in drawn_batches([pool], transitions=1)} == {1}, "one context of any length"
     short = Pool(1.0, [examples(1, 1), examples(2, 1)], 4)
-    assert {len(b.actions) for b in batches([short], transitions=6 * HORIZON)} == {6}, "counted as drawn, not as asked for"
+    assert {len(b.actions) for b in drawn_batches([short], transitions=6 * HORIZON)} == {6}, (
+        "transitions are not counted as drawn"
+    )
 
 
 def test_a_batch_repeats_with_its_generator() -> None:
     pool = [Pool(1.0, [examples(1, 4), examples(2, 4)], 3)]
-    one, same, other = (context.draw(np.random.default_rng(seed), pool, 8, 4) for seed in (0, 0, 1))
-    fields = [*Batch.__dataclass_fields__]
+    one, same, other = (draw(np.random.default_rng(seed), pool, 8, 4) for seed in (0, 0, 1))
+    fields = [*TrainingBatch.__dataclass_fields__]
     assert all(np.array_equal(getattr(one, f), getattr(same, f)) for f in fields)
     assert not all(np.array_equal(getattr(one, f), getattr(other, f)) for f in fields)
 

@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from icrl_dist.config.sections import ModelConfig, OptimConfig
+from icrl_dist.methods.dpt_loss import batch_loss
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.models.heads import Categorical
 from icrl_dist.training import batches, fit
-from icrl_dist.training.batches import Batch, Examples, Pool
+from icrl_dist.training.batches import Examples, Pool, TrainingBatch
 from icrl_dist.types import Spec
 
 
@@ -57,7 +58,7 @@ def corridor() -> tuple[PretrainedTransformer, list[Pool]]:
     return model, [Pool(1.0, [two_cells(goal, rng) for goal in (0, 1) for _ in range(4)], 1)]
 
 
-def corridor_batch(pools: list[Pool], step: int) -> Batch:
+def corridor_batch(pools: list[Pool], step: int) -> TrainingBatch:
     return batches.draw(np.random.default_rng(step), pools, 32, 8)
 
 
@@ -72,12 +73,12 @@ def test_the_batch_loss_equals_a_slow_loop_over_rows_and_queries() -> None:
             seen = Transitions(*(c[b : b + 1, : batch.prefix[b, n]] for c in columns))
             logits = model.decide(torch.as_tensor(batch.queries[b : b + 1, n : n + 1]), model.encode(seen))
             slow -= float((torch.as_tensor(batch.labels[b, n]) * logits[0, 0].log_softmax(-1)).sum())
-    assert fit.batch_loss(model, batch).item() == pytest.approx(slow / 256, rel=1e-4)
+    assert batch_loss(model, batch).item() == pytest.approx(slow / 256, rel=1e-4)
 
 
 def test_every_parameter_gets_a_gradient() -> None:
     model, pools = corridor()
-    fit.batch_loss(model, corridor_batch(pools, 0)).backward()
+    batch_loss(model, corridor_batch(pools, 0)).backward()
     without = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
     assert without == []
 
@@ -93,7 +94,7 @@ def test_a_fit_learns_the_corridor() -> None:
         config,
         config.learning_rate,
         200,
-        lambda step: corridor_batch(pools, step),
+        lambda step: batch_loss(model, corridor_batch(pools, step)),
         lambda step, value: losses.append((step, value)),
     )
     minimum = math.log(2) / 9
@@ -110,7 +111,14 @@ def test_a_fit_stops_at_a_loss_that_is_nan() -> None:
     with torch.no_grad():
         model.head.bias.fill_(math.nan)
     with pytest.raises(FloatingPointError, match=r"nan at step 0: lower the learning rate \(0\.25\)"):
-        fit.fit(model, fit.Optimizer(model, config), config, config.learning_rate, 3, lambda step: corridor_batch(pools, step))
+        fit.fit(
+            model,
+            fit.Optimizer(model, config),
+            config,
+            config.learning_rate,
+            3,
+            lambda step: batch_loss(model, corridor_batch(pools, step)),
+        )
 
 
 def test_the_learning_rate_rises_then_falls_to_a_tenth() -> None:

@@ -1,4 +1,4 @@
-"""Examples that are read when they are drawn: what stays in memory is bounded, and the draws are the same."""
+"""Examples that are read when they are drawn: memory is bounded, and the draws are the same."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def test_a_shelf_keeps_the_last_used_within_its_budget_and_draws_the_same(kept):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
         assert shelf.nbytes <= max(budget, everything[0].nbytes)
     if kept >= 6:
-        assert sorted(reads) == list(everything), "each is read once where there is room for all"
+        assert sorted(reads) == list(everything), "an example is read twice although there is memory for all"
     else:
         assert len(reads) > 6
     reads.clear()

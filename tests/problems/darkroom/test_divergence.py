@@ -1,27 +1,29 @@
-"""T_theta beside the exact posterior: every measure against a slow loop, in a 3x3 room with two adversaries."""
+"""Divergence of a model from the exact posterior: against slow loops, in a 3x3 room with two adversaries."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
 
-from icrl_dist.config.run import ConfigError, Run
-from icrl_dist.config.sections import AdversaryConfig, EvaluateConfig
+from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.run import Run
+from icrl_dist.config.sections import AdversaryConfig
+from icrl_dist.methods import registry as methods
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import divergence
 from icrl_dist.problems.darkroom.adversaries import argmax_distribution
-from icrl_dist.problems.darkroom.divergence import KINDS, LAWS, Context, Divergence
-from icrl_dist.problems.darkroom.exact_agents import ExactAgent
+from icrl_dist.problems.darkroom.divergence import KINDS, LAWS, Divergence, RoomContext
 from icrl_dist.problems.darkroom.room import ACTIONS
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, soft_labels
 from icrl_dist.results import evaluate
-from icrl_dist.results.evaluate import Result
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import NULL, Adversary, Variation
 from tests.problems.darkroom.test_exact_agents import Transition, likelihood
@@ -40,7 +42,7 @@ def run(small_run: Run) -> Run:
 @pytest.fixture
 def model(run: Run) -> PretrainedTransformer:
     torch.manual_seed(0)
-    return PretrainedTransformer(splits.spec(run), run.model).eval()
+    return PretrainedTransformer(registry.of(run).spec, run.model).eval()
 
 
 def own(room: Room) -> list[Variation]:
@@ -62,18 +64,29 @@ def slow_labels(variations: list[Variation]) -> list[list[list[float]]]:
     return found
 
 
-def history(context: Context, b: int) -> list[Transition]:
+def history(context: RoomContext, b: int) -> list[Transition]:
     columns = (context.observations[b], context.actions[b], context.rewards[b], context.next_observations[b])
     return [((int(s[0]), int(s[1])), int(a), float(r), (int(t[0]), int(t[1]))) for s, a, r, t in zip(*columns, strict=True)]
 
 
-def walks(rows: list[Variation], seed: int = 0, kind: str = "random walk") -> Context:
-    return divergence.contexts(kind, rows, evaluate.random, np.random.default_rng(seed).spawn(len(rows)))
+def walks(rows: list[Variation], seed: int = 0, kind: str = "random walk") -> RoomContext:
+    return divergence.contexts(kind, rows, lambda _, env: RandomPolicy(ACTIONS), np.random.default_rng(seed).spawn(len(rows)))
 
 
-@pytest.mark.parametrize("law", [own, independent])
-def test_exact_decisions_equal_enumeration(room: Room, law: object) -> None:
-    variations = law(room)  # type: ignore[operator]
+def decide_of(run: Run, model: PretrainedTransformer) -> divergence.Decide:
+    return functools.partial(methods.of(run).distributions, model)
+
+
+def measured(run: Run, model: PretrainedTransformer, heldout: bool) -> Iterator[tuple[Divergence, Divergence]]:
+    """The divergences of a model that is deployed by Algorithm 1."""
+    problem = registry.of(run)
+    act = evaluate.in_context(TrainedModel(run, methods.of(run), problem.spec, model), "paper")
+    return problem.posterior.divergences(run, decide_of(run, model), act, heldout)
+
+
+@pytest.mark.parametrize("prior", [own, independent])
+def test_exact_decisions_equal_enumeration(room: Room, prior: object) -> None:
+    variations = prior(room)  # type: ignore[operator]
     rows = [variations[m] for m in (3, 8, 17)]
     context = walks(rows)
     query = np.random.default_rng(1).integers(0, SIZE**2, size=(3, 2 * HORIZON + 1))
@@ -87,28 +100,31 @@ def test_exact_decisions_equal_enumeration(room: Room, law: object) -> None:
             belief = normalised([math.prod(likelihood(v, one) for one in steps[:t]) for v in variations])
             slow = [sum(w * labels[m][query[b, t]][a] for m, w in enumerate(belief)) for a in range(ACTIONS)]
             np.testing.assert_allclose(decided[b, t], slow, atol=1e-6)
-    assert np.abs(decided[:, 0] - decided[:, -1]).max() > 0.2, "nothing was learned from the contexts"
+    assert np.abs(decided[:, 0] - decided[:, -1]).max() > 0.2, "the contexts changed nothing"
 
 
 def test_model_decisions_are_the_models_one_prefix_at_a_time(run: Run, model: PretrainedTransformer, monkeypatch) -> None:
     monkeypatch.setattr(divergence, "_CHUNK", 2)
-    context = walks([group[1] for group in divergence.variations(run, heldout=False)[:3]])
+    context = walks([group[1] for group in divergence.training_variations(run, heldout=False)[:3]])
     length = context.actions.shape[1]
     query = np.random.default_rng(1).integers(0, 9, size=(3, length + 1))
-    decided = divergence.model_decisions(model, context, query, size=3)
+    decided = divergence.model_decisions(decide_of(run, model), context, query, size=3)
     for b, t in itertools.product(range(3), range(length + 1)):
         seen = Transitions(*(torch.from_numpy(a[b : b + 1, :t].copy()) for a in context))
         state = torch.tensor([[divmod(int(query[b, t]), 3)]], dtype=torch.float32)
         with torch.inference_mode():
-            law = model.decide(state, model.encode(seen))[0, 0].double().softmax(dim=0)
-        np.testing.assert_allclose(decided[b, t], law.numpy(), atol=1e-5)
+            expected = model.decide(state, model.encode(seen))[0, 0].double().softmax(dim=0)
+        np.testing.assert_allclose(decided[b, t], expected.numpy(), atol=1e-5)
 
 
-def test_the_first_law_is_the_one_trained_on(run: Run) -> None:
+def test_the_first_prior_is_the_one_trained_on(run: Run) -> None:
     """Every training goal has its own adversaries; held-out goals are added with theirs, numbered after."""
-    split = splits.split(run)
-    groups = [splits.variations(run, i, task) for i, task in enumerate((*split.train, *split.test))]
-    assert divergence.variations(run, heldout=False) == groups[:7] and divergence.variations(run, heldout=True) == groups[7:]
+    split = registry.of(run).split
+    groups = [registry.training_variations(run, i, task) for i, task in enumerate((*split.train, *split.test))]
+    assert (
+        divergence.training_variations(run, heldout=False) == groups[:7]
+        and divergence.training_variations(run, heldout=True) == groups[7:]
+    )
     for heldout, known in ((False, groups[:7]), (True, groups)):
         h, _ = divergence.hypotheses(run, heldout)
         flat = [v for group in known for v in group]
@@ -118,7 +134,7 @@ def test_the_first_law_is_the_one_trained_on(run: Run) -> None:
         np.testing.assert_allclose(h.q, q)
 
 
-def test_by_the_second_law_goals_and_adversaries_are_independent(run: Run) -> None:
+def test_by_the_second_prior_goals_and_adversaries_are_independent(run: Run) -> None:
     for heldout, goals in ((False, 7), (True, 9)):
         first, second = divergence.hypotheses(run, heldout)
         p, q = second.p.reshape(goals, -1), second.q.reshape(goals, -1, ACTIONS)
@@ -136,13 +152,13 @@ def test_by_the_second_law_goals_and_adversaries_are_independent(run: Run) -> No
 def test_without_disturbance_in_training_there_is_none_in_the_contexts(run, model, monkeypatch, change) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 2)
     run = dataclasses.replace(run, **change)
-    found = [pair for heldout in (False, True) for pair in divergence.divergences(run, model, heldout)]
+    found = [pair for heldout in (False, True) for pair in measured(run, model, heldout)]
     assert [(one.kind, one.p) for pair in found for one in pair] == [(kind, 0.0) for kind in (*KINDS, *KINDS) for _ in LAWS]
     assert all((h.p == 0).all() for h in divergence.hypotheses(run, heldout=True))
 
 
-class Diary(RandomPolicy):
-    """Notes the end of every step that it is shown."""
+class RecordsEnds(RandomPolicy):
+    """Records the ``done`` of every step that it observes."""
 
     def __init__(self) -> None:
         super().__init__(ACTIONS)
@@ -153,17 +169,19 @@ class Diary(RandomPolicy):
 
 
 def test_walks_start_anywhere_and_deployments_in_the_origin(run: Run) -> None:
-    rows = [group[1] for group in divergence.variations(run, heldout=False)] * 6
+    rows = [group[1] for group in divergence.training_variations(run, heldout=False)] * 6
     again = {}
     for kind in KINDS:
-        agent = Diary()
-        context = divergence.contexts(kind, rows, lambda _, agent=agent: agent, np.random.default_rng(0).spawn(len(rows)))
-        starts = context.observations[:, :: run.darkroom.horizon]
+        agent = RecordsEnds()
+        context = divergence.contexts(
+            kind, rows, lambda rows, env, agent=agent: agent, np.random.default_rng(0).spawn(len(rows))
+        )
+        starts = context.observations[:, :: run.section("darkroom").horizon]
         assert context.actions.shape == (42, 16) and starts.shape == (42, 2, 2)
         np.testing.assert_array_equal(context.observations[:, 1:8], context.next_observations[:, :7])
         if kind == "on policy":
             assert (starts == 0).all()
-            assert agent.done == [*[False] * 7, True] * 2, "the second episode is not the same agent's"
+            assert agent.done == [*[False] * 7, True] * 2, "another agent acted in the second episode"
         else:
             assert agent.done == []
             assert all(len({tuple(cell) for cell in starts[:, n].tolist()}) == 9 for n in (0, 1))
@@ -173,9 +191,9 @@ def test_walks_start_anywhere_and_deployments_in_the_origin(run: Run) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_disturbs_a_context_is_its_own_adversary(run: Run, kind: str) -> None:
+def test_each_context_is_disturbed_by_its_own_adversary(run: Run, kind: str) -> None:
     down = Adversary.of("dirichlet", p=0.5, alpha=(0.1, 0.1, 0.1, 2.0, 0.1))
-    rows = [Variation(group[0].task, a) for group in divergence.variations(run, heldout=False) for a in (NULL, down)]
+    rows = [Variation(group[0].task, a) for group in divergence.training_variations(run, heldout=False) for a in (NULL, down)]
     context = walks(rows, kind=kind)
     overridden = []
     for b, variation in enumerate(rows):
@@ -186,15 +204,15 @@ def test_what_disturbs_a_context_is_its_own_adversary(run: Run, kind: str) -> No
 
 
 @pytest.mark.parametrize("heldout", [False, True])
-def test_contexts_share_out_the_goals_each_under_one_of_its_adversaries(run, model, monkeypatch, heldout) -> None:
+def test_contexts_take_the_goals_in_turn_each_under_one_of_its_adversaries(run, model, monkeypatch, heldout) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 14)
     run = dataclasses.replace(run, adversary=AdversaryConfig(count=3))
     asked = []
     real = divergence.contexts
     monkeypatch.setattr(divergence, "contexts", lambda kind, rows, *rest: asked.append((kind, rows)) or real(kind, rows, *rest))
-    found = [(one.kind, one.p) for one, _ in divergence.divergences(run, model, heldout)]
+    found = [(one.kind, one.p) for one, _ in measured(run, model, heldout)]
     assert [kind for kind, _ in asked] == [kind for kind, _ in found] and found == [(k, p) for p in (0.0, 0.2) for k in KINDS]
-    groups = divergence.variations(run, heldout)
+    groups = divergence.training_variations(run, heldout)
     for (_, p), (_, rows) in zip(found, asked, strict=True):
         assert [v.task for v in rows] == [groups[i % len(groups)][0].task for i in range(14)]
         if p == 0:
@@ -207,45 +225,45 @@ def test_contexts_share_out_the_goals_each_under_one_of_its_adversaries(run, mod
 
 
 class Exact(PretrainedTransformer):
-    """Acts as an untrained model, but decides in given contexts as the exact posterior by one law."""
+    """Acts as an untrained model; in given contexts its decisions are those of the exact posterior under one prior."""
 
-    def know(self, run: Run, h: Hypotheses) -> None:
-        soft = run.darkroom.labels == "soft"
+    def set_hypotheses(self, run: Run, h: Hypotheses) -> None:
+        soft = run.section("darkroom").labels == "soft"
         self.h, self.labels = h, soft_labels(h, GAMMA, SLACK) if soft else heuristic_labels(h)
 
     def forward(self, context: Transitions, queries: torch.Tensor, prefix: torch.Tensor) -> torch.Tensor:
         assert (prefix == torch.arange(prefix.shape[1])).all()
         query = cell_numbers(queries.numpy(), self.h.size)
         return torch.from_numpy(
-            divergence.exact_decisions(self.h, self.labels, Context(*(a.numpy() for a in context)), query)
+            divergence.exact_decisions(self.h, self.labels, RoomContext(*(a.numpy() for a in context)), query)
         ).log()
 
 
 class Uniform(PretrainedTransformer):
-    """Decides nothing."""
+    """Every action has the same probability."""
 
     def forward(self, context: Transitions, queries: torch.Tensor, prefix: torch.Tensor) -> torch.Tensor:
         return torch.zeros(*prefix.shape, ACTIONS)
 
 
 @pytest.mark.parametrize(("heldout", "labels"), [(False, "soft"), (True, "soft"), (True, "heuristic")])
-@pytest.mark.parametrize("law", range(len(LAWS)))
-def test_a_model_that_is_the_exact_posterior_diverges_by_nothing(run, monkeypatch, heldout, labels, law) -> None:
+@pytest.mark.parametrize("prior", range(len(LAWS)))
+def test_a_model_that_is_the_exact_posterior_has_no_divergence(run, monkeypatch, heldout, labels, prior) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 9)
-    run = dataclasses.replace(run, darkroom=dataclasses.replace(run.darkroom, labels=labels))
-    model = Exact(splits.spec(run), run.model).eval()
-    model.know(run, divergence.hypotheses(run, heldout)[law])
-    found = list(zip(*divergence.divergences(run, model, heldout), strict=True))
-    assert all(np.abs(one.kl).max() < 1e-6 for one in found[law])
-    assert any(one.kl.mean() > 1e-3 for one in found[1 - law]), "the two laws are one"
+    run = dataclasses.replace(run, darkroom=dataclasses.replace(run.section("darkroom"), labels=labels))
+    model = Exact(registry.of(run).spec, run.model).eval()
+    model.set_hypotheses(run, divergence.hypotheses(run, heldout)[prior])
+    found = list(zip(*measured(run, model, heldout), strict=True))
+    assert all(np.abs(one.kl).max() < 1e-6 for one in found[prior])
+    assert any(one.kl.mean() > 1e-3 for one in found[1 - prior]), "the two priors are equal"
 
 
-def test_the_divergence_of_a_uniform_model_is_what_a_loop_says(run: Run, monkeypatch) -> None:
+def test_the_divergence_of_a_uniform_model_equals_a_slow_loop(run: Run, monkeypatch) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 5)
-    asked: list[Context] = []
+    asked: list[RoomContext] = []
     real = divergence.contexts
     monkeypatch.setattr(divergence, "contexts", lambda *given: asked.append(real(*given)) or asked[-1])
-    found = list(divergence.divergences(run, Uniform(splits.spec(run), run.model).eval(), heldout=False))
+    found = list(measured(run, Uniform(registry.of(run).spec, run.model).eval(), heldout=False))
     for (one, other), context in zip(found, asked, strict=True):
         assert one.kl.shape == one.met.shape == (5, 17)
         for b, t in itertools.product(range(5), range(17)):
@@ -289,65 +307,3 @@ def test_curves_are_means_by_prefix_and_by_the_exact_probability() -> None:
     np.testing.assert_allclose(curve["kl"], one.kl.mean(axis=0))
     np.testing.assert_allclose(found["agreement"]["exact"], [0.0, 0.265, 0.735, 1.0])
     np.testing.assert_allclose(found["agreement"]["model"], [0.2, 0.3, 0.7, 0.8])
-
-
-def result(returns: np.ndarray, p: float = 0.0) -> Result:
-    """Returns of two episodes with these means, by goal and seed."""
-    return Result("x", p, returns[:, :, None] * [0.5, 1.5], np.ones(len(returns)))
-
-
-def test_a_gap_is_a_ratio_of_means_of_pairs() -> None:
-    rng = np.random.default_rng(0)
-    exact = rng.uniform(1, 100, size=(6, 2))
-    scaled = divergence.gap(result(0.8 * exact), result(exact), seed=0)
-    assert [scaled[k] for k in ("gap", "low", "high")] == pytest.approx([-0.2] * 3), "the pairs came apart"
-    assert [scaled["model"], scaled["exact"]] == pytest.approx([0.8 * exact.mean(), exact.mean()])
-    noisy = 0.8 * exact + rng.normal(0, 3, size=exact.shape) + [8, -8]
-    found = divergence.gap(result(noisy), result(exact), seed=0)
-    assert found["gap"] == pytest.approx(noisy.sum() / exact.sum() - 1)
-    slow = []
-    for _ in range(4000):
-        above = below = 0.0
-        for goal in rng.integers(0, 6, size=6):
-            for seed in rng.integers(0, 2, size=2):
-                above, below = above + noisy[goal, seed], below + exact[goal, seed]
-        slow.append(above / below - 1)
-    low, high = np.percentile(slow, (2.5, 97.5))
-    assert [found["low"], found["high"]] == pytest.approx([low, high], abs=0.1 * (high - low))
-
-
-def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch) -> None:
-    monkeypatch.setattr(divergence, "RESAMPLES", 300)
-    rng, covered, widths, gaps = np.random.default_rng(0), 0, [], []
-    for _ in range(200):
-        exact = rng.uniform(20, 100, size=(20, 1)) + rng.normal(0, 5, size=(20, 2))
-        found = divergence.gap(result(0.9 * exact + rng.normal(0, 5, size=(20, 2))), result(exact), seed=0)
-        covered += found["low"] <= -0.1 <= found["high"]
-        widths.append(found["high"] - found["low"])
-        gaps.append(found["gap"])
-    assert 0.88 < covered / 200 <= 1
-    assert np.mean(widths) < 2 * 2 * 1.96 * np.std(gaps)
-
-
-def test_there_is_no_ratio_to_nothing() -> None:
-    with pytest.raises(ConfigError, match=r"return is 0 at p = 0\.4: no ratio to it; try more --episodes"):
-        divergence.gap(result(np.ones((2, 2)), 0.4), result(np.zeros((2, 2)), 0.4), seed=0)
-
-
-def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) -> None:
-    run = dataclasses.replace(run, evaluate=EvaluateConfig(episodes=4, seeds=5, p=(0.0, 0.4), prior="uniform"))
-    for goals in (splits.split(run).test, splits.split(run).train[:3]):
-        met: list[tuple[Variation, ...]] = []
-
-        def act(rows, met=met) -> ExactAgent:
-            met.append(tuple(rows))
-            return evaluate.exact(run, "paper")(rows)
-
-        same = divergence.gaps(run, act, goals)
-        assert list(same) == ["0", "0.4"]
-        assert all(row["gap"] == row["low"] == row["high"] == 0 and row["exact"] > 0 for row in same.values())
-        for p, rows in zip((0.0, 0.4), met, strict=True):
-            adversary = Adversary.of("uniform", p=p) if p else NULL
-            assert rows == tuple(Variation(splits.deployed(t), adversary) for t in goals for _ in range(5))
-    worse = divergence.gaps(run, evaluate.random, splits.split(run).test)
-    assert all(row["high"] < 0 for row in worse.values())

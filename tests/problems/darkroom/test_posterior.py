@@ -1,4 +1,4 @@
-"""The posterior that a model's actions imply, against a slow obvious search, and that asking for it changes nothing."""
+"""The posterior that a model's distributions imply, against a slow search; reading it changes nothing."""
 
 import time
 
@@ -28,35 +28,35 @@ def policies(size, adversaries):
     return h, soft_labels(h, 0.99, 0.1)
 
 
-def slow(law, policies, rounds=3000):
-    """Expectation maximisation cell by cell, action by action, from the middle."""
+def slow(target, policies, rounds=3000):
+    """Expectation maximization cell by cell and action by action, from uniform weights."""
     count = len(policies)
     weight = [1 / count] * count
     for _ in range(rounds):
         new = [0.0] * count
-        for s in range(len(law)):
-            for a in range(law.shape[1]):
+        for s in range(len(target)):
+            for a in range(target.shape[1]):
                 mix = sum(weight[m] * policies[m, s, a] for m in range(count))
                 for m in range(count):
                     if mix > 0:
-                        new[m] += law[s, a] * weight[m] * policies[m, s, a] / mix
+                        new[m] += target[s, a] * weight[m] * policies[m, s, a] / mix
         weight = [w / sum(new) for w in new]
     return weight
 
 
-def divergence(law, mix):
-    return sum(t * np.log(t / m) for t, m in zip(law.ravel(), mix.ravel(), strict=True) if t > 0 and m > 0) / len(law)
+def divergence(target, mix):
+    return sum(t * np.log(t / m) for t, m in zip(target.ravel(), mix.ravel(), strict=True) if t > 0 and m > 0) / len(target)
 
 
-def test_it_is_the_nearest_mixture_as_a_slow_search_finds_it():
+def test_the_implied_mixture_is_the_nearest_one_of_a_slow_search():
     _, basis = policies(3, [UNIFORM])
     rng = np.random.default_rng(0)
     basis = basis[[0, 4, 8, 5]].astype(np.float64)
-    laws = 0.7 * np.einsum("bm,mca->bca", rng.dirichlet(np.ones(4), 2), basis) + 0.3 * rng.dirichlet(np.ones(5), (2, 9))
-    found = implied(laws, basis)
-    for law, weight, distance, gap in zip(laws, *found, strict=True):
-        best = slow(law, basis, 60)
-        supported = np.where(basis.any(axis=0), law, 0)
+    targets = 0.7 * np.einsum("bm,mca->bca", rng.dirichlet(np.ones(4), 2), basis) + 0.3 * rng.dirichlet(np.ones(5), (2, 9))
+    found = implied(targets, basis)
+    for target, weight, distance, gap in zip(targets, *found, strict=True):
+        best = slow(target, basis, 60)
+        supported = np.where(basis.any(axis=0), target, 0)
         least = divergence(supported, np.einsum("m,mca->ca", best, basis))
         assert distance == pytest.approx(divergence(supported, np.einsum("m,mca->ca", weight, basis)), abs=1e-9)
         assert least - 1e-4 <= distance <= least + gap + 1e-9 and gap < posterior.TOLERANCE
@@ -79,35 +79,35 @@ def test_a_known_mixture_is_found_again(adversary, kind):
     assert found.divergence[0] < 1e-3
 
 
-def test_rows_of_a_batch_do_not_touch_each_other():
+def test_rows_of_a_batch_are_independent():
     _, basis = policies(4, [UNIFORM])
-    laws = np.random.default_rng(1).dirichlet(np.ones(5), (3, 16))
-    together = implied(laws, basis)
-    for row, law in enumerate(laws):
-        alone = implied(law[None], basis)
+    targets = np.random.default_rng(1).dirichlet(np.ones(5), (3, 16))
+    together = implied(targets, basis)
+    for row, target in enumerate(targets):
+        alone = implied(target[None], basis)
         assert np.abs(together.weight[row] - alone.weight[0]).sum() < 0.05
         assert together.divergence[row] == pytest.approx(alone.divergence[0], abs=posterior.TOLERANCE)
 
 
-def test_of_a_hundred_goals_it_takes_milliseconds():
+def test_a_hundred_goals_take_milliseconds():
     _, basis = policies(10, [NULL])
     rng = np.random.default_rng(0)
-    law = 0.9 * np.einsum("m,mca->ca", rng.dirichlet(np.full(100, 0.1)), basis) + 0.1 * rng.dirichlet(np.ones(5), 100)
+    target = 0.9 * np.einsum("m,mca->ca", rng.dirichlet(np.full(100, 0.1)), basis) + 0.1 * rng.dirichlet(np.ones(5), 100)
     times = []
     for _ in range(5):
         began = time.process_time()
-        implied(law[None], basis)
+        implied(target[None], basis)
         times.append(time.process_time() - began)
-    assert min(times) < 0.05  # some 3 ms where nothing else runs
+    assert min(times) < 0.05  # about 3 ms on an idle machine
 
 
 class Seen:
-    """An exact agent as one that can be asked for its law anywhere."""
+    """An exact agent with ``distribution`` at any state and ``context``."""
 
     def __init__(self, agent, columns):
         self._agent, self._columns = agent, columns
 
-    def law(self, states, row=0):
+    def distribution(self, states, row=0):
         return np.concatenate([self._agent.probabilities(state[None]) for state in states])
 
     def context(self, row=0):
@@ -115,8 +115,8 @@ class Seen:
 
 
 @pytest.mark.parametrize("adversary", [NULL, UNIFORM])
-def test_the_exact_agents_law_implies_the_exact_posterior(adversary, room):
-    """For its law is the mixture by the exact posterior (Theorem E.3)."""
+def test_the_exact_agents_distribution_implies_the_exact_posterior(adversary, room):
+    """Its distribution is the mixture by the exact posterior (Theorem E.3)."""
     size, horizon = 6, 30
     goal = room(size, horizon)[22].replace(start=(0, 0))
     h, labels = policies(size, [adversary])
@@ -139,8 +139,8 @@ def test_adversaries_are_summed_over():
     h, labels = policies(5, [NULL, UNIFORM])
     weight = np.random.default_rng(0).dirichlet(np.ones(50))
     assert by_goal(h, weight) == pytest.approx(weight.reshape(25, 2).sum(axis=1))
-    law = np.einsum("m,mca->ca", weight, labels.astype(np.float64))
-    assert by_goal(h, implied(law[None], labels).weight[0]) == pytest.approx(weight.reshape(25, 2).sum(axis=1), abs=0.02)
+    target = np.einsum("m,mca->ca", weight, labels.astype(np.float64))
+    assert by_goal(h, implied(target[None], labels).weight[0]) == pytest.approx(weight.reshape(25, 2).sum(axis=1), abs=0.02)
 
 
 def test_a_context_that_no_goal_explains_is_refused():
@@ -153,7 +153,7 @@ def test_a_context_that_no_goal_explains_is_refused():
 
 
 def build(window, heads=2):
-    """A model whose every parameter matters."""
+    """A model in which every parameter has an effect."""
     torch.manual_seed(0)
     spec = Spec(low=(0.0, 0.0), high=(4.0, 4.0), actions=5, horizon=7)
     model = PretrainedTransformer(spec, ModelConfig(3, heads, 16, window=window)).eval()
@@ -164,7 +164,7 @@ def build(window, heads=2):
 
 
 def deployed(deploy, ask, keep="all", length=3):
-    """Everything that a policy did in some episodes; ``ask`` is called between all of its calls."""
+    """Everything that a policy did in some episodes; ``ask`` is called between its calls."""
     model = build(4)
     policy = in_context(model, 2, ContextConfig(max=16, keep=keep), deploy)
     rng, acted, states = np.random.default_rng(0), [], np.zeros((2, 2), np.float32)
@@ -181,28 +181,28 @@ def deployed(deploy, ask, keep="all", length=3):
 
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
 @pytest.mark.parametrize("keep", ["all", "last"])
-def test_the_law_anywhere_is_the_models_given_the_context_and_asking_for_it_changes_nothing(deploy, keep):
+def test_the_distribution_at_any_state_is_the_models_given_the_context_and_reading_it_changes_nothing(deploy, keep):
     asked, lengths = [], []
     grid = cells(5)
 
     @torch.inference_mode()
     def ask(policy, model):
         row = len(asked) // 2 % 2
-        law, columns = policy.law(grid, row), policy.context(row)
+        found, columns = policy.distribution(grid, row), policy.context(row)
         context = Transitions(*(torch.from_numpy(column)[None] for column in columns))
         logits = model.decide(torch.from_numpy(grid)[None], model.encode(context))
-        np.testing.assert_allclose(law, logits[0].softmax(-1).numpy(), atol=2e-5)
-        asked.append(law)
+        np.testing.assert_allclose(found, logits[0].softmax(-1).numpy(), atol=2e-5)
+        asked.append(found)
         lengths.append(len(columns[1]))
 
     quiet = deployed(deploy, lambda policy, model: None, keep)
     assert deployed(deploy, ask, keep) == quiet
-    assert np.ptp(np.stack(asked), axis=(0, 1)).min() > 1e-3, "the laws are all alike: this would prove nothing"
+    assert np.ptp(np.stack(asked), axis=(0, 1)).min() > 1e-3, "all distributions are alike, so this would prove nothing"
     assert max(lengths) == {"all": {"paper": 14, "committed": 20}, "last": {"paper": 7, "committed": 13}}[keep][deploy]
 
 
-def test_the_shipped_agent_is_asked_without_a_trace():
-    """Its own draws included."""
+def test_reading_the_shipped_agents_distribution_changes_nothing():
+    """Not even its later draws."""
 
     def play(ask):
         agent, rng = load_agent("darkroom", seed=3), np.random.default_rng(1)
@@ -216,4 +216,4 @@ def test_the_shipped_agent_is_asked_without_a_trace():
             acted.append(int(action))
         return acted, agent.surprise.tobytes()
 
-    assert play(lambda agent: agent.law(cells(10))) == play(lambda agent: None)
+    assert play(lambda agent: agent.distribution(cells(10))) == play(lambda agent: None)

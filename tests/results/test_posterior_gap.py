@@ -1,0 +1,90 @@
+"""The return of an agent beside that of the exact agent (``results.posterior``)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from icrl_dist.config.run import ConfigError, Run
+from icrl_dist.config.sections import AdversaryConfig, EvaluateConfig
+from icrl_dist.interfaces import Batch, Policy
+from icrl_dist.problems import registry
+from icrl_dist.results import posterior
+from icrl_dist.results.evaluate import Result
+from icrl_dist.types import NULL, Adversary, Variation
+
+
+@pytest.fixture
+def run(small_run: Run) -> Run:
+    """ICAG with two adversaries a goal: 7 goals to train on, 2 held out."""
+    return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=2))
+
+
+def result(returns: np.ndarray, p: float = 0.0) -> Result:
+    """Returns of two episodes with these means, by goal and seed."""
+    return Result("x", p, returns[:, :, None] * [0.5, 1.5], np.ones(len(returns)))
+
+
+def test_a_gap_is_a_ratio_of_means_of_pairs() -> None:
+    rng = np.random.default_rng(0)
+    exact = rng.uniform(1, 100, size=(6, 2))
+    scaled = posterior.gap(result(0.8 * exact), result(exact), seed=0)
+    assert [scaled[k] for k in ("gap", "low", "high")] == pytest.approx([-0.2] * 3), (
+        "goals and seeds were not resampled in pairs"
+    )
+    assert [scaled["model"], scaled["exact"]] == pytest.approx([0.8 * exact.mean(), exact.mean()])
+    noisy = 0.8 * exact + rng.normal(0, 3, size=exact.shape) + [8, -8]
+    found = posterior.gap(result(noisy), result(exact), seed=0)
+    assert found["gap"] == pytest.approx(noisy.sum() / exact.sum() - 1)
+    slow = []
+    for _ in range(4000):
+        above = below = 0.0
+        for goal in rng.integers(0, 6, size=6):
+            for seed in rng.integers(0, 2, size=2):
+                above, below = above + noisy[goal, seed], below + exact[goal, seed]
+        slow.append(above / below - 1)
+    low, high = np.percentile(slow, (2.5, 97.5))
+    assert [found["low"], found["high"]] == pytest.approx([low, high], abs=0.1 * (high - low))
+
+
+def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posterior, "RESAMPLES", 300)
+    rng, covered, widths, gaps = np.random.default_rng(0), 0, [], []
+    for _ in range(200):
+        exact = rng.uniform(20, 100, size=(20, 1)) + rng.normal(0, 5, size=(20, 2))
+        found = posterior.gap(result(0.9 * exact + rng.normal(0, 5, size=(20, 2))), result(exact), seed=0)
+        covered += found["low"] <= -0.1 <= found["high"]
+        widths.append(found["high"] - found["low"])
+        gaps.append(found["gap"])
+    assert 0.88 < covered / 200 <= 1
+    assert np.mean(widths) < 2 * 2 * 1.96 * np.std(gaps)
+
+
+def test_a_return_of_0_of_the_exact_agent_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"return is 0 at p = 0\.4: no ratio to it; try more --episodes"):
+        posterior.gap(result(np.ones((2, 2)), 0.4), result(np.zeros((2, 2)), 0.4), seed=0)
+
+
+def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) -> None:
+    run = dataclasses.replace(run, evaluate=EvaluateConfig(episodes=4, seeds=5, p=(0.0, 0.4), prior="uniform"))
+    problem = registry.of(run)
+    assert problem.exact is not None
+    exact = problem.exact.agent(run, "paper")
+    for goals in (problem.split.test, problem.split.train[:3]):
+        met: list[tuple[Variation, ...]] = []
+
+        def act(rows: Sequence[Variation], env: Batch, met: list[tuple[Variation, ...]] = met) -> Policy:
+            met.append(tuple(rows))
+            return exact(rows, env)
+
+        same = posterior.gaps(run, act, goals)
+        assert list(same) == ["0", "0.4"]
+        assert all(row["gap"] == row["low"] == row["high"] == 0 and row["exact"] > 0 for row in same.values())
+        for p, rows in zip((0.0, 0.4), met, strict=True):
+            adversary = Adversary.of("uniform", p=p) if p else NULL
+            assert rows == tuple(Variation(problem.at_test_start(t), adversary) for t in goals for _ in range(5))
+    worse = posterior.gaps(run, problem.references(run)["random"].make, problem.split.test)
+    assert all(row["high"] < 0 for row in worse.values())
