@@ -15,7 +15,7 @@ import pytest
 
 from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import load
-from icrl_dist.methods import recipes
+from icrl_dist.methods import registry as methods
 from icrl_dist.problems.darkroom.exact_agents import RULES
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
@@ -68,7 +68,7 @@ def undisturbed(tmp_path_factory):
 def test_every_trajectory_arrived_once_with_the_policy_version_of_its_round(undisturbed):
     folder, _, _ = undisturbed
     run = load(str(folder / "run.toml"))
-    method = recipes.METHODS[run.method]
+    method = methods.of(run)
     wanted = {i for phase in method.phases(run) for job in method.ask(run, phase) for i in job.identities()}
     store = Dataset(folder / "dataset")
     trajectories = [store.read(row.identity) for row in store.index]

@@ -6,9 +6,7 @@ import os
 
 import numpy as np
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
-from icrl_dist.collect import jobs
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Damaged
 from icrl_dist.storage.dataset import Dataset as RealDataset
@@ -17,12 +15,12 @@ from icrl_dist.storage.segment import HEADER_BYTES, NAME, SEAL_BYTES, TRAJECTORY
 from icrl_dist.storage.sharing import adopt
 from icrl_dist.stream import wire
 from icrl_dist.types import Identity
+from tests.collecting import collected
 
 
 @pytest.fixture
 def trajectories(small_run):
-    phase = METHODS["dpt"].phases(small_run)[0]
-    return [t for job in METHODS["dpt"].ask(small_run, phase)[:2] for t in jobs.do(job, None, "w")]
+    return collected(small_run, 2)
 
 
 @pytest.fixture
@@ -106,8 +104,7 @@ def test_the_index_has_the_place_and_the_origin_of_each_trajectory(Dataset, tmp_
 def test_the_digest_depends_on_the_bytes_and_not_on_order_or_worker(Dataset, tmp_path, trajectories, small_run):
     one, two, three = (Dataset(tmp_path / name) for name in "abc")
     one.append(trajectories)
-    job = METHODS["dpt"].ask(small_run, METHODS["dpt"].phases(small_run)[0])
-    others = [t for j in job[:2] for t in jobs.do(j, None, "another worker")]
+    others = collected(small_run, 2, "another worker")
     two.append(others[::-1])
     assert one.digest() == two.digest()
     changed = others[0].rewards.copy()

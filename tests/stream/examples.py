@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from icrl_dist.stream import wire
-from icrl_dist.types import NULL, Adversary, Identity, Job, Task, Trajectory, Variation, Weights
+from icrl_dist.stream import schema, wire
+from icrl_dist.types import NULL, Adversary, Identity, Job, Payload, Task, Trajectory, Variation, Weights
 
 LIMIT = 1 << 20
 
@@ -58,11 +59,22 @@ def weights() -> Weights:
     return Weights(3, arrays, wire.weights_digest(arrays))
 
 
-JOB = Job("adapt", "adapt", 1, 2, VARIATIONS, 4, 0, 2**40, (("beta", 1.0), ("count", 1), ("name", "x")), tasks=1, first=3)
+@dataclass(frozen=True)
+class ExamplePayload(Payload):
+    beta: float
+    count: int
+    name: str
+
+
+def read_payload(kind: str, data: object) -> Payload:
+    return schema.read(ExamplePayload, data, "payload")
+
+
+JOB = Job("adapt", "adapt", 1, 2, VARIATIONS, 4, 0, 2**40, ExamplePayload(1.0, 1, "x"), tasks=1, first=3)
 
 ENCODED: dict[str, tuple[bytes, Callable[[bytes], object]]] = {
     "weights": (wire.encode_weights(weights()), lambda data: wire.decode_weights(data, LIMIT)),
-    "job": (wire.encode_job(JOB), lambda data: wire.decode_job(data, LIMIT)),
+    "job": (wire.encode_job(JOB), lambda data: wire.decode_job(data, read_payload, LIMIT)),
     "message": (wire.encode_message("hello", a=[1, {"b": None}], c=b"x"), lambda data: wire.decode_message(data, LIMIT)),
 }
 

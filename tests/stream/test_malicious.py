@@ -11,18 +11,17 @@ import zipfile
 import msgpack
 import numpy as np
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
 from icrl_dist import load_agent
-from icrl_dist.collect import jobs
 from icrl_dist.config import run
 from icrl_dist.config.run import ConfigError
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
 from icrl_dist.storage import segment
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
+from tests.collecting import collected
 
 
 class Bomb:
@@ -48,7 +47,7 @@ def bomb(tmp_path):
 @pytest.fixture
 def agent(small_run):
     """The arrays and the manifest of a valid checkpoint for load_agent."""
-    spec = splits.spec(small_run)
+    spec = registry.of(small_run).spec
     model = PretrainedTransformer(spec, small_run.model)
     arrays = {f"model/{name}": value.detach().numpy() for name, value in model.state_dict().items()}
     return arrays, {"run": run.dumps(small_run), "spec": dataclasses.asdict(spec)}
@@ -237,9 +236,8 @@ SEGMENTS = {
 @pytest.fixture
 def dataset(tmp_path, small_run):
     """A valid dataset: its file and its number of trajectories."""
-    phase = METHODS["dpt"].phases(small_run)[0]
     with contextlib.closing(Dataset(tmp_path / "dataset")) as dataset:
-        dataset.append([t for job in METHODS["dpt"].ask(small_run, phase)[:1] for t in jobs.do(job, None, "w")])
+        dataset.append(collected(small_run, 1))
         count = len(dataset)
     (file,) = (f for f in (tmp_path / "dataset").iterdir() if f.stat().st_size)
     return file, count

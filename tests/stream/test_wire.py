@@ -14,7 +14,19 @@ from hypothesis import strategies as st
 from icrl_dist.stream import wire
 from icrl_dist.stream.wire import WireError
 from icrl_dist.types import ARRAYS, Trajectory
-from tests.stream.examples import ALL, ENCODED, JOB, LIMIT, VARIATIONS, decode, trajectory, vectors, weights
+from tests.stream.examples import (
+    ALL,
+    ENCODED,
+    JOB,
+    LIMIT,
+    VARIATIONS,
+    ExamplePayload,
+    decode,
+    read_payload,
+    trajectory,
+    vectors,
+    weights,
+)
 
 
 def test_a_decoded_trajectory_equals_the_encoded_one() -> None:
@@ -65,9 +77,10 @@ def test_decoded_weights_equal_the_encoded_ones() -> None:
 
 
 def test_a_decoded_job_equals_the_encoded_one_with_its_types() -> None:
-    got = wire.decode_job(wire.encode_job(JOB))
+    got = wire.decode_job(wire.encode_job(JOB), read_payload)
     assert got == JOB
-    assert [type(v) for _, v in got.settings] == [float, int, str]
+    assert isinstance(got.payload, ExamplePayload)
+    assert [type(v) for v in vars(got.payload).values()] == [float, int, str]
     assert [type(got.variations[1].task[name]) for name in ("mass", "scale")] == [float, int]
 
 
