@@ -1,4 +1,4 @@
-"""The evaluation and the agent, held against what is known exactly."""
+"""Evaluation and the agent against exact answers."""
 
 import dataclasses
 import itertools
@@ -11,17 +11,20 @@ import torch
 
 from icrl_dist import InContextAgent, make
 from icrl_dist.agent.loading import load_agent
+from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, EvaluateConfig
+from icrl_dist.methods import registry as methods
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
+from icrl_dist.problems.continuous.problem import EXPERT
 from icrl_dist.problems.darkroom import divergence, room
 from icrl_dist.problems.darkroom.exact_agents import RULES, ExactAgent
+from icrl_dist.problems.darkroom.problem import ORACLE
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft_labels
-from icrl_dist.problems.registry import spec
-from icrl_dist.results import evaluate
+from icrl_dist.results import evaluate, posterior
 from icrl_dist.results.statistics import mean_and_error
 from icrl_dist.results.tables import returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_file
@@ -31,32 +34,40 @@ from learner import checkpoints
 
 
 @pytest.fixture
-def model(small_run):
+def untrained(small_run):
+    """An untrained model of ``small_run``."""
     torch.manual_seed(0)
-    return PretrainedTransformer(spec(splits.split(small_run).train[0]), small_run.model).eval()
+    spec = registry.of(small_run).spec
+    return TrainedModel(small_run, methods.of(small_run), spec, PretrainedTransformer(spec, small_run.model).eval())
 
 
-def test_the_oracle_reaches_the_exact_optimum_and_nobody_passes_it(small_run, model):
+def references(run):
+    return registry.of(run).references(run)
+
+
+def test_the_oracle_reaches_the_exact_optimum_and_other_agents_stay_below_it(small_run, untrained):
     run = dataclasses.replace(small_run, evaluate=dataclasses.replace(small_run.evaluate, seeds=60, p=(0.0, 0.4)))
-    agents = {"model": evaluate.in_context(run, model), "random": evaluate.random, evaluate.ORACLE: evaluate.optimal(run)}
+    found = references(run)
+    agents = {"model": evaluate.in_context(untrained), "random": found["random"], ORACLE: found[ORACLE]}
     for result in evaluate.online(run, agents):
-        assert result.returns.shape == (len(splits.split(run).test), 60, 3)
+        assert result.ceiling == (result.agent == ORACLE)
+        assert result.returns.shape == (len(registry.of(run).split.test), 60, 3)
         error = result.returns.mean(axis=(0, 2)).std() / np.sqrt(60)
-        if result.agent == evaluate.ORACLE:
+        if result.agent == ORACLE:
             assert abs(result.returns.mean() - result.optimum.mean()) < 4 * error + 0.05
         else:
             assert result.returns.mean() < result.optimum.mean() - 4 * error
 
 
-def test_all_agents_meet_the_same_chance(small_run, model):
-    agents = {"one": evaluate.in_context(small_run, model), "two": evaluate.in_context(small_run, model)}
+def test_all_agents_have_the_same_draws(small_run, untrained):
+    agents = {"one": evaluate.in_context(untrained), "two": evaluate.in_context(untrained)}
     one, two, *_ = evaluate.online(small_run, agents)
     np.testing.assert_array_equal(one.returns, two.returns)
 
 
-def test_held_out_variations_start_in_the_origin_and_never_trained(small_run):
+def test_held_out_variations_start_in_the_origin(small_run):
     chosen = evaluate.variations(small_run, 0.2)
-    assert [v.task.vector("goal") for v in chosen] == [t.vector("goal") for t in splits.split(small_run).test]
+    assert [v.task.vector("goal") for v in chosen] == [t.vector("goal") for t in registry.of(small_run).split.test]
     assert all(v.task.vector("start") == (0, 0) and v.adversary.number("p") == 0.2 for v in chosen)
 
 
@@ -70,7 +81,7 @@ def test_rows_are_tidy(small_run):
     np.testing.assert_allclose(mean, [4.5, 5.5, 6.5])
 
 
-def test_adaptation_is_measured_beside_the_oracle():
+def test_adaptation_is_measured_relative_to_the_oracle():
     def result(*episodes):
         return evaluate.Result("x", 0.0, np.array(episodes, float).reshape(1, 1, -1), np.array([9.0]))
 
@@ -80,11 +91,11 @@ def test_adaptation_is_measured_beside_the_oracle():
     assert [result(1, 8, 9, 10).episode_of(oracle, share) for share in (0.05, 0.9, 0.95)] == [1, 3, 4]
     assert result(1, 8, 9, 10).episode_of(oracle, 1.01) is None
     several = evaluate.Result("x", 0.0, np.array([[[0.0, 12.0]], [[6.0, 6.0]]]), np.array([9.0, 9.0]))
-    assert several.episode_of(oracle, 0.9) == 2, "of all tasks and seeds together"
+    assert several.episode_of(oracle, 0.9) == 2, "not of all tasks and seeds together"
 
 
-def test_offline_rows_hold_random_and_expert_data(small_run, model):
-    rows = evaluate.offline(small_run, {"T": model})
+def test_offline_rows_have_random_and_expert_data(small_run, untrained):
+    rows = evaluate.offline(small_run, {"T": untrained})
     agents = ["T", *RULES.values()]
     count = 1 + len(agents)
     for rows_at, source in ((rows[:count], "random data"), (rows[count : 2 * count], "expert data")):
@@ -97,28 +108,31 @@ def test_offline_rows_hold_random_and_expert_data(small_run, model):
 
 def test_exact_agents_find_the_goal_and_know_the_adversary_of_their_row(small_run):
     run = dataclasses.replace(small_run, evaluate=EvaluateConfig(episodes=6, seeds=20, p=(0.0, 0.4), prior="unseen"))
-    agents = {name: evaluate.exact(run, rule) for rule, name in RULES.items()} | {evaluate.ORACLE: evaluate.optimal(run)}
+    agents = {name: reference for name, reference in references(run).items() if name != "random"}
+    assert list(agents) == [*RULES.values(), ORACLE]
     results = {(r.agent, r.p): r.returns for r in evaluate.online(run, agents)}
     for name in RULES.values():
-        np.testing.assert_array_equal(results[name, 0.0][:, :, -1], results[evaluate.ORACLE, 0.0][:, :, -1])
+        np.testing.assert_array_equal(results[name, 0.0][:, :, -1], results[ORACLE, 0.0][:, :, -1])
         error = results[name, 0.4].mean(axis=(0, 2)).std() / np.sqrt(20)
-        assert abs(results[name, 0.4][:, :, -2:].mean() - results[evaluate.ORACLE, 0.4].mean()) < 5 * error
+        assert abs(results[name, 0.4][:, :, -2:].mean() - results[ORACLE, 0.4].mean()) < 5 * error
     early = {rule: results[name, 0.0][:, :, :2].mean() for rule, name in RULES.items()}
     assert early["paper"] < early["every step"] < early["committed"]
     rows = evaluate.variations(run, 0.4)
     goals = [room.task(divmod(cell, 3), 3, 8) for cell in range(9)]
     families = [Hypotheses.of([Variation(goal, row.adversary) for goal in goals]) for row in rows]
-    labels = [soft_labels(h, run.darkroom.gamma, run.darkroom.label_slack) for h in families]
+    labels = [soft_labels(h, run.section("darkroom").gamma, run.section("darkroom").label_slack) for h in families]
     assert not np.array_equal(labels[0], labels[1])
-    own, made = ExactAgent(families, labels, np.arange(2), "every step"), evaluate.exact(run, "every step")(rows)
+    own = ExactAgent(families, labels, np.arange(2), "every step")
+    made = registry.of(run).exact.agent(run, "every step")(rows, registry.batch(rows))
     for cell in range(9):
         observation = np.array([divmod(cell, 3)] * 2, np.float32)
         np.testing.assert_array_equal(made.probabilities(observation), own.probabilities(observation))
 
 
-def test_the_agent_acts_as_the_policy_under_it_and_forgets_on_reset(small_run, model):
-    env = make(evaluate.variations(small_run, 0.0)[0])
-    agent = InContextAgent(model, {}, ContextConfig(max=100), seed=3)
+def test_the_agent_repeats_its_actions_after_a_reset_of_context_and_draws(untrained):
+    run = dataclasses.replace(untrained.run, context=ContextConfig(max=100))
+    env = make(evaluate.variations(run, 0.0)[0])
+    agent = InContextAgent(dataclasses.replace(untrained, run=run), {}, seed=3)
 
     def play(episodes):
         actions = []
@@ -142,8 +156,8 @@ def test_the_agent_acts_as_the_policy_under_it_and_forgets_on_reset(small_run, m
     assert grown.shape == (1,)
 
 
-def test_the_agent_names_wrong_shapes(model):
-    agent = InContextAgent(model, {}, ContextConfig(max=100))
+def test_the_agent_names_wrong_shapes(untrained):
+    agent = InContextAgent(untrained, {})
     agent.reset_context(batch=3)
     with pytest.raises(ValueError, match=r"obs has shape \(2, 2\), expected \(3, 2\)"):
         agent.act(np.zeros((2, 2), np.float32))
@@ -154,7 +168,7 @@ def test_the_agent_names_wrong_shapes(model):
         agent.observe(*good[:2], np.zeros(2), good[3], np.zeros(3, bool))
 
 
-def test_loading_nothing_and_garbage_is_told_in_one_line(tmp_path):
+def test_a_missing_or_damaged_checkpoint_is_refused_in_one_line(tmp_path):
     with pytest.raises(ConfigError, match="no such run folder or checkpoint"):
         load_agent(tmp_path / "nothing")
     (tmp_path / "checkpoints").mkdir()
@@ -165,21 +179,22 @@ def test_loading_nothing_and_garbage_is_told_in_one_line(tmp_path):
         load_agent(tmp_path)
 
 
-def test_the_exact_optimum_beside_a_result_is_the_variations_own(small_run):
-    (result, *_) = evaluate.online(small_run, {"random": evaluate.random})
+def test_a_result_has_the_exact_optimum_of_its_variations(small_run):
+    (result, *_) = evaluate.online(small_run, {"random": references(small_run)["random"]})
     np.testing.assert_allclose(result.optimum, optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
 
 
 @pytest.fixture
 def folder(small_run, tmp_path, monkeypatch):
-    """A run folder with the untrained T^0 of an ICAG run, and few contexts to measure it in."""
+    """A run folder with the untrained T^0 of an ICAG run; the suite has few contexts and resamples."""
     run = dataclasses.replace(small_run, method="icag")
     torch.manual_seed(0)
-    model = PretrainedTransformer(splits.spec(run), run.model)
+    spec = registry.of(run).spec
+    model = PretrainedTransformer(spec, run.model)
     monkeypatch.setattr(divergence, "CONTEXTS", 4)
-    monkeypatch.setattr(divergence, "RESAMPLES", 100)
+    monkeypatch.setattr(posterior, "RESAMPLES", 100)
     arrays = {f"model/{name}": value for name, value in weights_of(model).items()}
-    manifest = checkpoints.manifest(run, splits.spec(run), 0, 1)
+    manifest = checkpoints.manifest(run, spec, 0, 1)
     save_checkpoint(version_file(tmp_path, 0), Checkpoint(arrays, manifest))
     return tmp_path
 
@@ -188,11 +203,11 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
     assert main.main(["evaluate", str(folder), "--suite", "posterior", "--seeds", "2", "--episodes", "6", "--json"]) == 0
     printed = capsys.readouterr()
     answer = json.loads(printed.out.splitlines()[-1])
-    for name, law in itertools.product(("kl_nats", "kl_heldout"), divergence.LAWS):
-        rows = answer[f"{name}{law}_cells"]
+    for name, prior in itertools.product(("kl_nats", "kl_heldout"), divergence.LAWS):
+        rows = answer[f"{name}{prior}_cells"]
         assert [(row["kind"], row["p"]) for row in rows] == [(kind, p) for p in (0.0, 0.2) for kind in divergence.KINDS]
-        assert answer[f"{name}{law}"] == pytest.approx(np.mean([row["kl"] for row in rows]))
-        assert all(answer[f"{name}{law}{part}"] > 0 for part in ("", "_standard_error", "_goal_met", "_goal_unmet"))
+        assert answer[f"{name}{prior}"] == pytest.approx(np.mean([row["kl"] for row in rows]))
+        assert all(answer[f"{name}{prior}{part}"] > 0 for part in ("", "_standard_error", "_goal_met", "_goal_unmet"))
     for name in ("paper_gap", "paper_gap_train"):
         assert list(answer[name]) == ["0", "0.2", "0.4", "0.6"]
         assert all(row["low"] <= row["gap"] <= row["high"] for row in answer[name].values())
@@ -214,7 +229,7 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
         (("--seeds", "0"), "evaluate.seeds = 0: must be above 0"),
     ],
 )
-def test_what_cannot_be_measured_is_told_in_one_line(folder, capsys, arguments, expected):
+def test_an_impossible_setting_of_the_suite_is_refused_in_one_line(folder, capsys, arguments, expected):
     words = ["evaluate", str(folder), "--suite", "posterior", *arguments]
     assert main.main(words) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
@@ -222,7 +237,8 @@ def test_what_cannot_be_measured_is_told_in_one_line(folder, capsys, arguments, 
 
 
 @pytest.mark.parametrize(("best", "share"), [([4.0, 8.0], "50%"), ([0.0, 0.0], "-")])
-def test_returns_stand_beside_the_best_that_an_expert_does_be_it_nothing(best, share):
-    rows = {"T^1": [2.0, 4.0], evaluate.EXPERT: best}
-    table = returns_table([evaluate.Result(name, 0.0, np.array([[row]]), None) for name, row in rows.items()], "")
+def test_the_table_shows_returns_as_a_share_of_the_experts_even_if_that_is_0(best, share):
+    rows = {"T^1": [2.0, 4.0], EXPERT: best}
+    results = [evaluate.Result(name, 0.0, np.array([[row]]), None, ceiling=name == EXPERT) for name, row in rows.items()]
+    table = returns_table(results, "")
     assert table.columns[-1].header == "of SAC expert" and next(iter(table.columns[-1].cells)) == share

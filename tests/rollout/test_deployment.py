@@ -1,4 +1,4 @@
-"""Algorithm 1 against a slow obvious loop, and what may enter the context when."""
+"""Algorithm 1 against a slow loop, and when transitions enter the context."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def rngs(trial, count=3):
 
 
 def logits_of(model, history, state):
-    """T_theta at one state given a list of (s, a, s', r), encoded from nothing."""
+    """T_theta at one state given a list of (s, a, s', r), which is encoded anew."""
     columns = list(zip(*history, strict=True)) if history else [np.zeros((0, 2))] * 4
     s, a, n, r = (np.array(c) for c in columns)
     context = Transitions(
@@ -52,7 +52,7 @@ def logits_of(model, history, state):
 
 
 def algorithm_1(model, variation, row, trials, keep, most):
-    """Lines 9 to 17, one environment, one step at a time; episodes kept as the config says."""
+    """Lines 9 to 17 in one environment, step by step; ``keep`` and ``most`` as in the section ``[context]``."""
     env = registry.batch([variation])
     kept, returns = [], []
     for trial in range(trials):
@@ -75,7 +75,7 @@ def algorithm_1(model, variation, row, trials, keep, most):
 
 
 @pytest.mark.parametrize(("keep", "most"), [("all", 1000), ("last", 1000), ("all", 2 * HORIZON + 1)])
-def test_online_deployment_is_algorithm_1(model, variations, keep, most):
+def test_online_deployment_equals_algorithm_1(model, variations, keep, most):
     policy = InContextPolicy(model, 3, ContextConfig(max=most, keep=keep))
     ran = list(deploy_online(registry.batch(variations), policy, (rngs(n) for n in range(5))))
     for row, variation in enumerate(variations):
@@ -114,7 +114,7 @@ def test_the_context_is_frozen_within_an_episode(model, variations):
     assert policy.length == 2
 
 
-def test_offline_deployment_sees_the_data_and_only_the_data(model, variations):
+def test_offline_deployment_has_the_given_data_and_nothing_else_in_its_context(model, variations):
     env = registry.batch(variations)
     data = episode(env, RandomPolicy(5), rngs(8))
     policy = InContextPolicy(model, 3, ContextConfig(max=100))
