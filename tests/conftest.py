@@ -1,4 +1,4 @@
-"""What every test shares: shapes checked at every call, one torch thread, small rooms."""
+"""Shared by all tests: shape checks at every call, one torch thread, small runs."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # for programs that tests start; two threads wait for each other beside others
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for programs that tests start: several programs share the cores
 
 import pytest
 import torch
 
 import tests.typecheck
 
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # begun by a shell's "&": what tests start would ignore Ctrl-C too
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # started by a shell's "&": child processes would ignore Ctrl-C too
     signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.disable()  # until everything is imported
 pytest.register_assert_rewrite("tests.contracts")
 
 imported = [name for name in sys.modules if name.split(".")[0] == "icrl_dist"]
-assert not imported, f"{imported} were imported before the import hook: their shapes would go unchecked"
+assert not imported, f"{imported} were imported before the import hook, so their shapes would not be checked"
 tests.typecheck.install("icrl_dist")
 torch.set_num_threads(1)
 
-from icrl_dist.config.run import Run
+from icrl_dist.config.run import Run, make_run
 from icrl_dist.config.sections import (
     AdversaryConfig,
     ContextConfig,
@@ -44,21 +44,21 @@ from icrl_dist.stream.memory_link import MemoryHub, MemoryLink
 from icrl_dist.types import Task
 
 FIRST = ("e2e", "learner", "actors")
-"""Folders whose tests wait and run long: begun first, they leave no processor idle at the end."""
+"""Folders with slow tests, which run first so that no core is idle at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
 
-    def turn(item: pytest.Item) -> int:
+    def position(item: pytest.Item) -> int:
         folder = item.path.relative_to(here).parts[0]
         return FIRST.index(folder) if folder in FIRST else len(FIRST)
 
-    items.sort(key=turn)
+    items.sort(key=position)
 
 
 def pytest_collection_finish() -> None:
-    """What is imported stays: nobody looks through it for garbage again."""
+    """Exclude imported objects from garbage collection: they stay until the end."""
     gc.collect()
     gc.freeze()
     gc.enable()
@@ -66,7 +66,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture
 def no_ray_token(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A home and an environment in which Ray has left no token, as it does where it once started a cluster."""
+    """A home folder and an environment without a Ray token; Ray leaves one after it has started a cluster."""
     monkeypatch.setenv("HOME", str(tmp_path))
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
         monkeypatch.delenv(name, raising=False)
@@ -84,14 +84,14 @@ def room() -> Callable[[int, int], tuple[Task, ...]]:
 
 @pytest.fixture
 def small_run(module_run: Run) -> Run:
-    """A whole run in a 3x3 room, every part of it small enough for a test."""
+    """A complete run in a 3x3 room, small enough for a test."""
     return module_run
 
 
 @pytest.fixture(scope="session")
 def module_run() -> Run:
-    """The same for fixtures that live longer than a test."""
-    return Run(
+    """``small_run`` for fixtures of a wider scope than one test."""
+    return make_run(
         method="icaa",
         darkroom=DarkRoomConfig(size=3, horizon=8),
         adversary=AdversaryConfig(count=3),
@@ -108,7 +108,7 @@ def module_run() -> Run:
 
 @pytest.fixture
 def hub() -> Iterator[Callable[[], MemoryLink]]:
-    """``hub()``: another link to one network within this process."""
+    """``hub()`` returns a new link to one network within this process."""
     network, links = MemoryHub(), []
 
     def link() -> MemoryLink:
