@@ -171,7 +171,7 @@ _RENAMED = {
 
 
 def _known(tables: dict[str, Any], kind: type[Run], source: str) -> dict[str, Any]:
-    """The tables as they are.  Raises ConfigError for a former name, with the present one, and for another problem's section."""
+    """The tables as they are.  Raises ConfigError for a former name, with the present one, or another problem's section."""
     for old, new in _RENAMED.items():
         section, _, key = old.partition(".")
         table = tables.get(section)
