@@ -150,7 +150,7 @@ def _from_tables(tables: dict[str, Any], source: str) -> Run:
         kind = run_type(problem) if isinstance(problem, str) else Run
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    run = cast(Run, build(kind, _renamed(tables, source), source))
+    run = cast(Run, build(kind, _known(tables, kind, source), source))
     validate(run, source)
     try:
         owner = plugins.find("problems", run.problem)
@@ -170,13 +170,18 @@ _RENAMED = {
 """Former names of sections and keys."""
 
 
-def _renamed(tables: dict[str, Any], source: str) -> dict[str, Any]:
-    """The tables as they are.  Raises ConfigError for a former name, with the present one."""
+def _known(tables: dict[str, Any], kind: type[Run], source: str) -> dict[str, Any]:
+    """The tables as they are.  Raises ConfigError for a former name, with the present one, or another problem's section."""
     for old, new in _RENAMED.items():
         section, _, key = old.partition(".")
         table = tables.get(section)
         if (not key and section in tables) or (isinstance(table, dict) and key in table):
             raise ConfigError(f"{source}: {old} is now called {new}: rename it")
+    known = {item.name for item in dataclasses.fields(kind)}
+    for name in tables:
+        if name not in known and name in plugins.sections(None):
+            problem = tables.get("problem", Run.problem)
+            raise ConfigError(f"{source}: section [{name}]: problem = {problem!r} has no such section; leave it out")
     return tables
 
 

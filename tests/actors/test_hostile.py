@@ -12,7 +12,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
 from actors.fleet import Fleet, FleetFailed
 from icrl_dist.stream import batching, wire
@@ -21,6 +20,7 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 from tests.e2e.training import wait_for
+from tests.jobs import asked
 
 KEYS = StreamKeys("test")
 HOSTILE = Path(__file__).parent / "hostile"
@@ -42,7 +42,7 @@ class LearnerSide:
 
     def __init__(self, run, folder, lease_s):
         self.run, self.folder, self.stored, self.events, self.failures = run, folder, {}, [], []
-        self.jobs = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])[:2]
+        self.jobs = asked(run, "icag")[:2]
         self.everything = {i for job in self.jobs for i in job.identities()}
         self.lock = threading.Lock()
         self.scheduler = LeaseScheduler(lease_s, floor_s=lease_s)
@@ -108,7 +108,7 @@ def hostile(small_run, monkeypatch):
     """``hostile(failure)``: in processes started later, the second variation of the second task fails in this way."""
 
     def begin(failure):
-        job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
+        job = asked(small_run, "icag")[0]
         monkeypatch.setenv("HOSTILE", failure)
         monkeypatch.setenv("HOSTILE_VARIATION", repr(job.variations[4]))
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HOSTILE), str(HOSTILE.parents[2])]))
@@ -163,7 +163,7 @@ def test_a_stuck_worker_writes_its_stacks_and_ends_and_another_does_its_job(
     _, log = process.communicate(timeout=150)
     assert process.returncode == 1, log
     stacks = (learner.folder / "crashes" / "w0.stacks").read_text()
-    assert stacks.startswith("Timeout (0:00:0") and f" in {function}" in stacks and " in random_context" in stacks
+    assert stacks.startswith("Timeout (0:00:0") and f" in {function}" in stacks and " in behavior_contexts" in stacks
     assert (" in _dump_and_exit" in stacks) is (failure == "sleep"), "the Python thread writes them whenever it can run"
     wait_for(lambda: learner.events_of("crash"), "the record")
     (record,) = learner.records()
@@ -190,7 +190,7 @@ def test_a_crash_in_c_writes_the_stacks(learner, hostile, worker):
     wait_for(lambda: learner.events_of("crash"), "the record")
     (record,) = learner.records()
     assert record["stacks"][0] == "Fatal Python error: Segmentation fault"
-    assert any("random_context" in line for line in record["stacks"])
+    assert any("behavior_contexts" in line for line in record["stacks"])
 
 
 @pytest.fixture

@@ -7,34 +7,37 @@ import threading
 import numpy as np
 import pytest
 import torch
-from icrl_dist.methods.recipes import METHODS
 
 import icrl_dist
 from actors import beliefs
 from actors import worker as worker_module
-from actors.beliefs import Beliefs
+from actors.beliefs import BeliefPublisher
 from actors.watchdog import Watchdog
-from actors.weight_cache import LivePolicy
+from actors.weight_cache import WeightCache
 from actors.worker import Worker
-from icrl_dist.collect import jobs
+from icrl_dist.collect import kinds
 from icrl_dist.config.run import dumps
-from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom.posterior import Room
-from icrl_dist.problems.registry import spec
 from icrl_dist.stream import batching, monitor_messages, wire
 from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 from tests.contracts.link_battery import eventually
+from tests.jobs import asked
 
 KEYS = StreamKeys("test")
 
 
+def untrained(run):
+    return methods.of(run).build(registry.of(run).spec, run)
+
+
 def weights(run, version):
     torch.manual_seed(version)
-    arrays = weights_of(PretrainedTransformer(spec(splits.split(run).train[0]), run.model))
+    arrays = weights_of(untrained(run))
     return Weights(version, arrays, wire.weights_digest(arrays))
 
 
@@ -75,7 +78,7 @@ STOP = wire.encode_message("stop")
 
 
 def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
-    job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[2]
+    job = asked(small_run, "icag")[2]
     learner = ScriptedLearner(hub(), small_run, [wire.encode_message("wait", seconds=0.01), job_message(job), STOP])
     seen = []
     watching = hub()
@@ -92,34 +95,33 @@ def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
 
 
 def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
-    phase = METHODS["icag"].phases(small_run)[0]
-    good, other = METHODS["icag"].ask(small_run, phase)[:2]
-    bad = dataclasses.replace(other, settings=())
+    good, other = asked(small_run, "icag")[:2]
+    bad = dataclasses.replace(other, payload=dataclasses.replace(other.payload, behaviors=()))
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     Worker(hub(), "test", "w0").run()
     (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
     assert report["job"] == list(bad.name) and report["file"] == ""
     record = report["record"]
-    assert "KeyError" in record["exception"] and ".py:" in record["exception"]
+    assert "ZeroDivisionError" in record["exception"] and ".py:" in record["exception"]
     first = next(iter(bad.identities()))
     assert (record["identity"], record["seed"], record["spawn_key"]) == (str(first), bad.seed, list(first.key()))
     assert record["job"] == bad.label and record["worker"] == "w0" and record["variations"] == len(bad.variations)
     assert 10 < record["memory_mb"] <= record["peak_mb"]
-    assert "Traceback" in record["traceback"] and "jobs.py" in record["traceback"]
+    assert "Traceback" in record["traceback"] and "behavior.py" in record["traceback"]
     assert len(learner.stored) == len(list(good.identities()))
 
 
 def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, small_run, monkeypatch, tmp_path):
-    job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
-    real = jobs.do
+    job = asked(small_run, "icag")[0]
+    real = kinds.do
 
-    def breaks_at_the_third(job, policies, worker, *_):
-        work = real(job, policies, worker)
+    def breaks_at_the_third(*given):
+        work = real(*given)
         yield next(work)
         yield next(work)
         raise ZeroDivisionError("\udcff the room broke")
 
-    monkeypatch.setattr(jobs, "do", breaks_at_the_third)
+    monkeypatch.setattr(kinds, "do", breaks_at_the_third)
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     monkeypatch.setattr(worker_module, "Watchdog", lambda run, name: Watchdog(None, name))  # pytest's process has one
     monkeypatch.setattr(worker_module._log, "exception", lambda *texts: None)  # a log file may not accept this text
@@ -132,7 +134,7 @@ def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, smal
 
 
 def test_a_refused_trajectory_fails_its_own_job_only(hub, small_run):
-    bad, good = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[:2]
+    bad, good = asked(small_run, "icag")[:2]
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     learner.refused = set(list(bad.identities())[:5])
     Worker(hub(), "test", "w0").run()
@@ -144,7 +146,7 @@ def test_a_refused_trajectory_fails_its_own_job_only(hub, small_run):
 
 def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, small_run, monkeypatch):
     monkeypatch.setattr(worker_module, "HEARTBEAT_S", 0.01)
-    job = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
+    job = asked(small_run, "icag")[0]
     heartbeats = []
     beaten = threading.Event()
     watching = hub()
@@ -155,13 +157,13 @@ def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, sm
             beaten.set()
 
     watching.subscribe(KEYS.heartbeats, receive)
-    real = jobs.do
+    real = kinds.do
 
-    def stuck_for_three_beats(job, policies, worker, *_):
+    def stuck_for_three_beats(*given):
         assert beaten.wait(30)
-        return real(job, policies, worker)
+        return real(*given)
 
-    monkeypatch.setattr(jobs, "do", stuck_for_three_beats)
+    monkeypatch.setattr(kinds, "do", stuck_for_three_beats)
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     Worker(hub(), "test", "w0").run()
     asks = [fields for kind, fields in learner.requests if kind == "ask"]
@@ -200,10 +202,8 @@ def always(monkeypatch):
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
 def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monkeypatch):
     always(monkeypatch)
-    round_0 = METHODS["icaa"].phases(committed_run)[1]
-    job = METHODS["icaa"].ask(committed_run, round_0)[0]
-    settings = {**dict(job.settings), "deploy": deploy, "context_max": 20}
-    job = dataclasses.replace(job, settings=tuple(sorted(settings.items())))
+    job = asked(committed_run, phase=1)[0]
+    job = dataclasses.replace(job, payload=dataclasses.replace(job.payload, deploy=deploy, context_max=20))
 
     def work(topic):
         network = MemoryHub().link
@@ -242,7 +242,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
     watching.subscribe(KEYS.monitor("belief/w0"), lambda key, payload: None)
     monkeypatch.setattr(beliefs.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(beliefs.time, "thread_time", lambda: clock[1])
-    publish_belief = Beliefs(link, KEYS.monitor("belief/w0"), "w0", small_run)
+    publish_belief = BeliefPublisher(link, KEYS.monitor("belief/w0"), "w0", registry.of(small_run))
     read = []
 
     def message(*arguments):
@@ -251,7 +251,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
         return b""
 
     monkeypatch.setattr(publish_belief, "_message", message)
-    job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
+    job = asked(small_run, phase=1)[0]
     identity = next(iter(job.identities()))
 
     def published_in(seconds):
@@ -270,7 +270,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
 def test_an_error_in_a_belief_does_not_fail_the_job(hub, small_run, monkeypatch, caplog):
     always(monkeypatch)
     monkeypatch.setattr(Room, "read", lambda *arguments: 1 / 0)
-    job = METHODS["icaa"].ask(small_run, METHODS["icaa"].phases(small_run)[1])[0]
+    job = asked(small_run, phase=1)[0]
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     hub().serve(KEYS.weights_latest, lambda query: query.reply(wire.encode_weights(weights(small_run, 0))))
     hub().subscribe(KEYS.monitor_all, lambda key, payload: None)
@@ -283,7 +283,7 @@ def test_the_policy_waits_for_exactly_the_requested_version(hub, small_run):
     learner = hub()
     latest = [b""]
     learner.serve(KEYS.weights_latest, lambda q: q.reply(latest[0]) if latest[0] else q.refuse("busy"))
-    policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=5.0)
+    policy = WeightCache(hub(), KEYS, untrained(small_run), 1 << 20, timeout_s=5.0)
     zero, one = weights(small_run, 0), weights(small_run, 1)
     threading.Timer(0.3, lambda: learner.publish(KEYS.weights, wire.encode_weights(zero), droppable=False)).start()
     model, digest = policy.at(0)
@@ -295,7 +295,7 @@ def test_the_policy_waits_for_exactly_the_requested_version(hub, small_run):
     np.testing.assert_array_equal(weights_of(model)["head.weight"], one.arrays["head.weight"])
     assert policy.at(0)[1] == zero.digest, "a repeated job of an earlier round"
     with pytest.raises(Unanswered, match="version 0 is gone; the learner is at 1"):
-        LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20).at(0)
+        WeightCache(hub(), KEYS, untrained(small_run), 1 << 20).at(0)
 
 
 def test_the_policy_requests_an_older_version_by_number_and_drops_the_oldest(hub, small_run):
@@ -308,13 +308,13 @@ def test_the_policy_requests_an_older_version_by_number_and_drops_the_oldest(hub
         query.reply(wire.encode_weights(versions[requested[-1]]))
 
     learner.serve(KEYS.weights_latest, answer)
-    policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20)
+    policy = WeightCache(hub(), KEYS, untrained(small_run), 1 << 20)
     for version in (6, 2, 6, 0, 1, 3, 2, 6):
         assert policy.at(version)[1] == versions[version].digest
     assert requested == [6, 2, 0, 1, 3, 6]
 
 
 def test_the_policy_waits_a_limited_time(hub, small_run):
-    policy = LivePolicy(hub(), KEYS, spec(splits.split(small_run).train[0]), small_run.model, 1 << 20, timeout_s=0.3)
+    policy = WeightCache(hub(), KEYS, untrained(small_run), 1 << 20, timeout_s=0.3)
     with pytest.raises(Unanswered, match=r"version 3 did not come within 0.3 s"):
         policy.at(3)

@@ -13,7 +13,6 @@ from importlib import metadata
 
 import pytest
 
-from icrl_dist.agent import in_context_agent
 from icrl_dist.cli import main
 from icrl_dist.cli.train import _resume_command
 from icrl_dist.launch import train
@@ -38,7 +37,7 @@ def refused(capsys, *arguments):
         ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has at least 2 cells"),
         ("[adversary]\np_max = 1.5", r"adversary.p_max = 1.5: a probability lies in \[0, 1\]"),
         ("[evaluate]\np = [0.0, -0.1]", r"evaluate.p = -0.1: a probability lies in \[0, 1\]"),
-        ('method = "ppo"', r"method = 'ppo': choose one of 'dpt', 'icag', 'icaa'"),
+        ('method = "ppo"', r"method = 'ppo': choose one of dpt, experts, icaa, icag"),
         ("[icaa]\ntrials = 5\ncontext_trials = 5", r"icaa.context_trials = 5: must be below icaa.trials"),
         ("darkroom = [", r"not valid TOML"),
     ],
@@ -195,8 +194,7 @@ def test_a_stopped_evaluation_prints_the_command_that_resumes(monkeypatch, tmp_p
         pytest.fail("the signal was ignored")
 
     monkeypatch.setattr(train, "train_inline", lambda *_: {})
-    monkeypatch.setattr(in_context_agent, "checkpoint_file", lambda folder: folder / "none")
-    monkeypatch.setattr(heldout, "calibrate", stopped)
+    monkeypatch.setattr(heldout, "keep_calibrated", stopped)
     assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
     assert (

@@ -6,6 +6,7 @@ import pytest
 import stable_baselines3
 import torch
 
+from icrl_dist.config.run import ConfigError, make_run, validate
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.sb3_expert import Expert, expert
 
@@ -84,5 +85,5 @@ def test_the_time_limit_is_stored_as_not_terminal_with_the_observation_at_it():
     "wrong", [{"batch": 0}, {"hidden": (64, 0)}, {"tau": 1.5}, {"gamma": 1.0}, {"warmup": 0}, {"replay": -1}]
 )
 def test_settings_out_of_range_are_refused_by_name(wrong):
-    with pytest.raises(ValueError, match=rf"{next(iter(wrong))} = .*must be"):
-        SACConfig(**wrong)
+    with pytest.raises(ConfigError, match=rf"x: sac\.{next(iter(wrong))} = .*must be"):
+        validate(make_run(sac=SACConfig(**wrong)), "x")

@@ -7,13 +7,13 @@ import pytest
 import stable_baselines3
 import torch
 
-from icrl_dist.collect import jobs
 from icrl_dist.experts import train as experts
 from icrl_dist.experts.sac.batched import SACBatch, train
 from icrl_dist.experts.sac.sb3_expert import Expert
 from icrl_dist.experts.sac.sb3_files import load
+from tests.experts.histories import KilledError, digests, run  # noqa: F401
 from tests.experts.sac_cases import LINE, SMALL, SPEC, Line, random_updates, updated_by_sb3
-from tests.experts.test_train import KilledError, asked, digests, run  # noqa: F401
+from tests.jobs import asked, done
 
 BACKEND = "stable-baselines3"
 
@@ -60,9 +60,9 @@ def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_byte
     whole = asked(run)[0]
     none = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=""))
     pair = dataclasses.replace(asked(none)[0], variations=whole.variations[:2], tasks=1)
-    list(jobs.do(pair, None, "w"))
+    done(run, pair)
     assert not trained
-    undisturbed = digests(jobs.do(dataclasses.replace(pair, variations=whole.variations[:1]), None, "w"))
+    undisturbed = digests(done(run, dataclasses.replace(pair, variations=whole.variations[:1])))
     updates = len(trained)
     assert updates == (run.sac.steps - run.sac.warmup) // run.sac.update_every and set(trained) == {Expert}
     one, begun = dataclasses.replace(whole, variations=whole.variations[:1], tasks=1), []
@@ -77,6 +77,6 @@ def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_byte
     monkeypatch.setattr(experts, "CHECKPOINT_S", 0.0)
     monkeypatch.setattr(experts, "save_checkpoint", killed)
     with pytest.raises(KilledError):
-        list(jobs.do(one, None, "w"))
-    assert digests(jobs.do(one, None, "w")) == undisturbed
+        done(run, one)
+    assert digests(done(run, one)) == undisturbed
     assert len(trained) == 2 * updates, "an episode was trained twice"

@@ -44,10 +44,10 @@ def test_a_learner_receives_the_workers_lost_with_a_node_and_a_restarted_one_rec
 
 
 def test_workers_lost_with_nodes_reach_the_worker_api():
-    heard, (read, write) = [], os.pipe()
+    received, (read, write) = [], os.pipe()
     os.write(write, b'["w0"]\n["w1", "w2"]\n')
     os.close(write)
-    _read_lost_workers(SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=heard.append)), read)
+    _read_lost_workers(SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=received.append)), read)
     os.close(read)
     assert received == [["w0"], ["w1", "w2"]]
 

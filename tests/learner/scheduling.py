@@ -3,9 +3,9 @@
 import dataclasses
 
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
 from learner.scheduler import LeaseScheduler
+from tests.jobs import asked
 
 LEASE = 10.0
 PHASE = ("pretrain", 0)
@@ -14,7 +14,7 @@ PHASE = ("pretrain", 0)
 @pytest.fixture
 def jobs(small_run):
     """Three jobs of two tasks with three variations each, two trials."""
-    first_jobs = METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[:3]
+    first_jobs = asked(small_run, "icag")[:3]
     assert [(len(job.variations), job.tasks, job.trials) for job in first_jobs] == [(6, 2, 2)] * 3
     return first_jobs
 

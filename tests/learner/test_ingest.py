@@ -6,15 +6,14 @@ import threading
 import msgpack
 import numpy as np
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
-from icrl_dist.collect import jobs
 from icrl_dist.problems import registry
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import batching, wire
 from icrl_dist.types import Identity, Spec
 from learner.ingest import REASONS, Ingest, Rejected, check
+from tests.jobs import asked, done
 
 
 class FakeQuery:
@@ -40,12 +39,12 @@ class FakeQuery:
 
 @pytest.fixture
 def job(small_run):
-    return METHODS["icag"].ask(small_run, METHODS["icag"].phases(small_run)[0])[0]
+    return asked(small_run, "icag")[0]
 
 
 @pytest.fixture
-def trajectories(job):
-    return list(jobs.do(job, None, "w"))
+def trajectories(small_run, job):
+    return done(small_run, job)
 
 
 @pytest.fixture

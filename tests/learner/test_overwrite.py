@@ -93,7 +93,8 @@ def test_without_a_cluster_the_earlier_run_is_restored(run, capsys, monkeypatch)
 def test_a_refused_fork_changes_nothing(run, finished, capsys):
     before = files(run.parent)
     given = ("--from", f"{finished}@0", "--engine", "inline", "--out", run, "--overwrite", "--set", "model.width=32")
-    assert "a fork has its parent's model" in refused(capsys, 2, *given)
+    line = refused(capsys, 2, *given)
+    assert "model.width = 32 (parent: 16): a fork has its parent's problem, split, method and model" in line
     assert files(run.parent) == before
 
 

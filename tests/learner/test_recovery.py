@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from icrl_dist.collect import jobs
+from icrl_dist.collect import kinds
 from icrl_dist.config.run import ConfigError, override
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch import train
@@ -50,19 +50,34 @@ def test_a_missing_segment_is_collected_again_with_the_policy_version_of_its_rou
     assert same(run_inline(parent[2], folder, resume=True), parent[1])
 
 
-def test_damage_during_a_run_is_found_before_training_uses_it(parent, tmp_path):
-    folder, damaged = tmp_path / "run", []
+def damaging(folder):
+    """A report that damages the pretraining data in the first round of ICAA; returns it and the list of what happened."""
+    happened = []
 
     def damage(event):
-        if event.get("stage") == "collect" and event.get("phase") == "adapt" and not damaged:
-            damaged.append(folder / "dataset" / "segment-000000.frames")
-            flip(damaged[0], damaged[0].stat().st_size // 2)
+        if event.get("stage") == "collect" and event.get("phase") == "adapt" and not happened:
+            happened.append(folder / "dataset" / "segment-000000.frames")
+            flip(happened[0], happened[0].stat().st_size // 2)
         if event["event"] == "repaired":
-            damaged.append(event["text"])
+            happened.append(event["text"])
 
-    result = run_inline(parent[2], folder, damage)
-    assert len(damaged) == 2 and "segment-000000.frames: took out a damaged range" in damaged[1]
+    return damage, happened
+
+
+def test_damage_during_a_run_is_found_before_training_uses_it(parent, tmp_path):
+    folder, run = tmp_path / "run", override(parent[2], ["learner.cache_mb=0"], "--set")  # every example is read when drawn
+    damage, happened = damaging(folder)
+    result = run_inline(run, folder, damage)
+    assert len(happened) == 2 and "segment-000000.frames: took out a damaged range" in happened[1]
     assert same(result, parent[1])
+
+
+def test_damage_of_data_in_memory_changes_no_result_and_is_found_when_the_run_is_opened_again(parent, tmp_path):
+    folder = tmp_path / "run"
+    damage, happened = damaging(folder)
+    assert same(run_inline(parent[2], folder, damage), parent[1]) and len(happened) == 1
+    assert same(run_inline(parent[2], folder, damage, resume=True), parent[1])
+    assert len(happened) == 2 and "segment-000000.frames: took out a damaged range" in happened[1]
 
 
 def test_a_folder_has_at_most_one_learner(parent, monkeypatch):
@@ -99,7 +114,11 @@ def test_a_fork_with_other_settings_keeps_the_data_of_its_parent(parent, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"), [(["model.width=32"], "its parent's model"), (["darkroom.horizon=9"], "its parent's darkroom")]
+    ("settings", "message"),
+    [
+        (["model.width=32"], r"model\.width = 32 \(parent: 16\): a fork has its parent's problem, split, method and model"),
+        (["darkroom.horizon=9"], r"darkroom\.horizon = 9 \(parent: 8\): a fork has its parent's problem, split, method"),
+    ],
 )
 def test_an_incompatible_fork_is_refused(parent, tmp_path, settings, message):
     with pytest.raises(ConfigError, match=message):
@@ -172,29 +191,29 @@ def test_explain_checks_every_file_of_a_trajectory(parent):
 
 
 def test_a_rerun_with_other_bytes_is_reported(parent, monkeypatch):
-    real = jobs.adapt
+    real = kinds.rollouts
 
-    def other(job, policies, worker, tell=None):
-        for trajectory in real(job, policies, worker):
+    def other(*given):
+        for trajectory in real(*given):
             yield dataclasses.replace(trajectory, rewards=trajectory.rewards + 1)
 
-    monkeypatch.setattr(jobs, "adapt", other)
+    monkeypatch.setattr(kinds, "rollouts", other)
     answer = explain.explain(parent[0], Identity("adapt", 1, 3, 2, 1), rerun=True)
     assert answer["rerun_equal"] is False and "DIFFERENT bytes" in explain.describe(answer)
 
 
 def test_a_variation_that_always_fails_is_quarantined_and_listed(parent, tmp_path, monkeypatch):
-    run, real, broken = parent[2], jobs.adapt, []
+    run, real, broken = parent[2], kinds.rollouts, []
 
-    def failing(job, policies, worker, *_):
+    def failing(job, *rest):
         if not broken:
             broken.append(job.variations[4])  # in the first job: the second variation of the second task
-        for trajectory in real(job, policies, worker):
+        for trajectory in real(job, *rest):
             if broken[0] in job.variations and trajectory.identity.trial == 1:
                 raise ZeroDivisionError("this variation fails")
             yield trajectory
 
-    monkeypatch.setattr(jobs, "adapt", failing)
+    monkeypatch.setattr(kinds, "rollouts", failing)
     folder, events = tmp_path / "run", []
     result = run_inline(run, folder, events.append)
     ((quarantined,)) = result["quarantined"]

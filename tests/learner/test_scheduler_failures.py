@@ -4,6 +4,8 @@ import dataclasses
 
 import pytest
 
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.experts.payloads import ExpertHistories, ExpertLabelling
 from icrl_dist.types import Identity
 from learner.scheduler import LeaseScheduler
 from tests.learner.scheduling import LEASE, PHASE, finish, jobs, kill, later, leased, nothing_stored, scheduler, split_first_job
@@ -217,7 +219,8 @@ def test_causes_are_listed_in_canonical_order(jobs, later):
 
 @pytest.fixture
 def training(jobs):
-    return [dataclasses.replace(job, kind="train_expert") for job in jobs]
+    payload = ExpertHistories(SACConfig(), ExpertLabelling(queries=4, window=1, windows=0, decoy_fraction=0.0))
+    return [dataclasses.replace(job, kind=payload.kind, payload=payload) for job in jobs]
 
 
 def test_an_expert_from_a_cache_does_not_shorten_the_lease_of_a_training(training):

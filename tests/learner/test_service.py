@@ -11,6 +11,7 @@ import pytest
 from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import ConfigError
 from icrl_dist.launch import train
+from icrl_dist.problems.darkroom.problem import DarkRoomProblem
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
 from learner import checkpoints, reporter, service
@@ -115,7 +116,7 @@ def test_an_existing_folder_and_changed_settings_are_refused(small_run, tmp_path
     folder = shutil.copytree(parent[0], tmp_path / "undisturbed")
     with pytest.raises(ConfigError, match="exists: use --resume"):
         train.prepare(small_run, folder, resume=False, overwrite=False)
-    with pytest.raises(ConfigError, match="other numbers"):
+    with pytest.raises(ConfigError, match="has other settings"):
         train.prepare(dataclasses.replace(small_run, seed=5), folder, resume=True, overwrite=False)
     with pytest.raises(ConfigError, match="holds no run"):
         train.prepare(small_run, tmp_path / "nothing", resume=True, overwrite=False)
@@ -130,11 +131,9 @@ def test_an_existing_folder_and_changed_settings_are_refused(small_run, tmp_path
 
 
 def test_a_job_that_always_fails_ends_the_run_with_the_cause(small_run, tmp_path, monkeypatch):
-    from icrl_dist.collect import jobs
-
-    def broken(job, worker):
+    def broken(problem, variations):
         raise ZeroDivisionError("the environment broke")
 
-    monkeypatch.setattr(jobs, "random_context", broken)
+    monkeypatch.setattr(DarkRoomProblem, "batch", broken)
     with pytest.raises(train.TrainFailed, match=r"no trajectory was stored, and .* ZeroDivisionError: the environment broke"):
         run_inline(small_run, tmp_path / "broken")

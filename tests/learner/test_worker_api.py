@@ -6,7 +6,6 @@ import threading
 import time
 
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
 import icrl_dist
 from icrl_dist import version
@@ -17,6 +16,7 @@ from icrl_dist.telemetry import crash_reports
 from learner import worker_api as worker_api_module
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
+from tests.jobs import asked, decoded
 
 KEYS = StreamKeys("test")
 COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "waited_s": 0.0}
@@ -29,7 +29,7 @@ class Server:
     def __init__(self, run, folder, hub, monkeypatch):
         monkeypatch.setattr(worker_api_module, "_STACKS_DELAY_S", 0.0)
         self.run, self.folder, self.events, self.failures = run, folder, [], []
-        self.jobs = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])[:3]
+        self.jobs = asked(run, "icag")[:3]
         self.scheduler = LeaseScheduler(60.0)
         self.scheduler.open(self.jobs, lambda job: ())
         self.policy_version = None
@@ -107,7 +107,7 @@ def test_invalid_requests_are_refused_and_the_next_is_answered(server):
 def test_requests_are_answered_with_jobs_then_wait_then_stop(server):
     for i, job in enumerate(server.jobs):
         kind, fields = server.ask(f"w{i}")
-        assert (kind, wire.decode_job(fields["job"]), fields["deadline_s"]) == ("job", job, 60.0)
+        assert (kind, decoded(server.run, fields["job"]), fields["deadline_s"]) == ("job", job, 60.0)
     assert server.ask("w3") == ("wait", {"seconds": 0.1})
     server.worker_api.finish()
     assert server.ask("w3") == ("stop", {})
@@ -115,7 +115,7 @@ def test_requests_are_answered_with_jobs_then_wait_then_stop(server):
 
 def test_a_job_gets_the_policy_version_of_the_service(server):
     server.policy_version = 5
-    assert wire.decode_job(server.ask("w0")[1]["job"]).policy_version == 5
+    assert decoded(server.run, server.ask("w0")[1]["job"]).policy_version == 5
     assert server.scheduler.pending_job(next(iter(server.jobs[0].identities()))).policy_version == 5
 
 
@@ -156,7 +156,7 @@ def test_a_worker_that_ends_without_a_report_gets_a_crash_record(server, worker)
     assert record["last_said"]["episodes"] == 7 and record["stacks"] == []
     joined, ended = (event["text"] for event in server.wait("worker", 2))
     assert joined == "worker w0 joined" and ended == "worker w0 is gone; its job will be leased again: pretrain/0/0"
-    assert wire.decode_job(server.ask("w1")[1]["job"]) == server.jobs[0]
+    assert decoded(server.run, server.ask("w1")[1]["job"]) == server.jobs[0]
 
 
 def test_the_record_of_a_stuck_worker_contains_its_stacks(server, worker):
@@ -195,7 +195,7 @@ def test_a_disconnected_worker_that_is_back_keeps_its_job(server, worker):
         server.wait("worker", 2 * times + 2)
     worker("w0")
     assert server.wait("worker")[-1]["text"] == "worker w0 is back"
-    assert wire.decode_job(server.ask("w1")[1]["job"]) == server.jobs[1], "w0 holds the first job"
+    assert decoded(server.run, server.ask("w1")[1]["job"]) == server.jobs[1], "w0 holds the first job"
 
 
 def test_the_learner_records_a_failed_job_if_the_worker_could_not(server):
@@ -220,7 +220,7 @@ def test_a_record_of_the_worker_is_named_and_not_written_again(server):
 def test_a_quarantine_is_reported_once_and_the_run_continues(server):
     failing = server.jobs[0].variations[4]
     while (answer := server.ask("w0"))[0] == "job":
-        job = wire.decode_job(answer[1]["job"])
+        job = decoded(server.run, answer[1]["job"])
         if failing in job.variations:
             server.fail("w0", job)
         else:
@@ -256,20 +256,20 @@ def test_a_quarantine_is_released_when_workers_were_lost_with_their_nodes(server
     server.worker_api.lost_with_node(["w0"])
     for life in range(4):
         link = worker(f"w{life}")
-        assert wire.decode_job(server.ask(f"w{life}")[1]["job"]) == alone
+        assert decoded(server.run, server.ask(f"w{life}")[1]["job"]) == alone
         link.close()
         server.wait("crash", life + 1)
     server.wait("quarantine")
     server.worker_api.lost_with_node(["w1", "w2", "w3"])
     assert server.wait("released")[0]["text"].startswith("variation pretrain/0/0/0 is leased again")
-    assert wire.decode_job(server.ask("w4")[1]["job"]) == alone and not server.scheduler.quarantined
+    assert decoded(server.run, server.ask("w4")[1]["job"]) == alone and not server.scheduler.quarantined
 
 
 def test_a_run_in_which_every_job_fails_ends_with_the_cause(server):
     while not server.failures:
         kind, fields = server.ask("w0")
         assert kind == "job"
-        server.fail("w0", wire.decode_job(fields["job"]))
+        server.fail("w0", decoded(server.run, fields["job"]))
     (line,) = server.failures
     assert line.startswith("pretrain/0: no trajectory was stored, and 8 of its variations are quarantined")
     assert line.endswith("first: ValueError: no (room.py:3)")

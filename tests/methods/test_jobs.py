@@ -14,7 +14,7 @@ from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.icaa import ICAA
 from icrl_dist.problems import registry as problems
-from icrl_dist.storage.dataset import Store
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.types import Identity, Job
 from learner.phases import PhasePlan
@@ -41,7 +41,7 @@ def test_the_plan_of_phases_asks_the_method_once_a_phase(small_run: Run, tmp_pat
             return super().ask(run, phase)
 
     method = Counting()
-    store = Store(tmp_path / "dataset")
+    store = Dataset(tmp_path / "dataset")
     plan = PhasePlan(small_run, Lineage(small_run), store, method, {})
     for _ in range(3):
         for phase in plan.phases:

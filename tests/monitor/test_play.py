@@ -1,259 +1,36 @@
-"""The game of ``icrl-dist play`` without a server: commands of a viewer, the steps of the game, and its JSON."""
+"""The player of ``icrl-dist play``: its thread, its viewers, and refused command lines."""
 
 import json
 from threading import Event, Thread
 
-import numpy as np
 import pytest
 
-from icrl_dist.agent.in_context_agent import InContextAgent
-from icrl_dist.agent.loading import load_agent
 from icrl_dist.cli.main import main
-from icrl_dist.config.run import dumps, load, parse
+from icrl_dist.config.run import dumps, load
 from icrl_dist.monitor import player
-from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.player import Player
-from icrl_dist.problems.darkroom.game import HELD_S, PlayGame
-from icrl_dist.problems.darkroom.room import MOVES, cells
-from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
-
-RIGHT, LEFT, UP, DOWN, STAY = range(5)
+from icrl_dist.monitor.serve import EventStream
+from tests.problems.darkroom.fixed_agent import Agent, game
 
 
-class Clock:
-    now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
-class Agent(InContextAgent):
-    """Selects one fixed action and records its transitions."""
-
-    def __init__(self, action=UP, deploy="committed"):
-        self.outcomes, self.action, self.deploy = None, action, deploy
-        self.manifest, self.observed, self.resets = {"test_goals": [[2, 1]]}, [], 0
-
-    def reset_context(self):
-        self.observed.clear()
-        self.resets += 1
-
-    def act(self, observation):
-        return np.array([self.action])
-
-    def observe(self, *transition):
-        self.observed.append(tuple(np.asarray(column)[0] for column in transition))
-
-    def law(self, states, row=0):
-        return np.full((len(states), 5), 0.2)
-
-    def context(self, row=0):
-        ended = [i for i, t in enumerate(self.observed) if t[4]]
-        visible = self.observed if self.deploy == "committed" else self.observed[: ended[-1] + 1 if ended else 0]
-        before, action, reward, after = (np.array([t[i] for t in visible]) for i in range(4))
-        return before.reshape(-1, 2), action.astype(np.int64), after.reshape(-1, 2), reward
-
-
-@pytest.fixture
-def run(small_run):
-    return small_run  # 3 x 3, 8 steps
-
-
-def game(run, agent=None, seed=0, clock=None):
-    return PlayGame(agent or Agent(), run, seed, clock or Clock())
-
-
-def play(g, steps):
-    for _ in range(steps):
-        g.step()
-
-
-def test_the_agent_observes_its_own_action_and_the_outcome_only(run):
-    g = game(run)
-    g.command({"do": "goal", "value": [1, 0]})
-    g.command({"do": "push", "value": RIGHT})
-    play(g, 2)
-    (before, action, reward, after, done), (_, _, second, end, _) = g.agent.observed
-    assert (before.tolist(), action, reward, after.tolist(), done) == ([0, 0], UP, 1, [1, 0], False)
-    assert (second, end.tolist()) == (0, [1, 1])
-    assert g.path == [(3, "hand"), (4, "agent")] and g.total == 1
-
-
-def test_every_step_is_a_legal_move(run):
-    g = game(run)
-    g.command({"do": "p", "value": 0.7})
-    at = np.zeros(2)
-    play(g, 7)
-    for cell, _ in g.path:
-        moved = [np.clip(at + move, 0, 2).tolist() for move in MOVES]
-        at = cells(3)[cell]
-        assert at.tolist() in moved
-
-
-def test_random_overrides_have_the_chosen_probability_and_action(run):
-    g = game(run)
-    g.command({"do": "p", "value": 0.4})
-    g.command({"do": "law", "value": RIGHT})
-    play(g, 8 * 200)
-    share = sum(e.overridden for e in g.episodes) / (8 * len(g.episodes))
-    assert abs(share - 0.4) < 0.05 and not any(e.by_hand for e in g.episodes)
-    g.command({"do": "p", "value": 1})
-    play(g, 8)
-    assert [cell for cell, _ in g.path] == [3] + [6] * 7 and {cause for _, cause in g.path} == {"law"}
-
-
-def test_a_held_override_lasts_until_release_or_timeout(run):
-    clock = Clock()
-    g = game(run, clock=clock)
-    g.command({"do": "hold", "value": STAY})
-    play(g, 3)
-    g.command({"do": "hold", "value": None})
-    play(g, 1)
-    g.command({"do": "hold", "value": STAY})
-    clock.now += HELD_S / 2
-    g.command({"do": "hold", "value": STAY})
-    clock.now += HELD_S - 0.01
-    play(g, 1)
-    clock.now += 0.02
-    play(g, 1)
-    assert [cause for _, cause in g.path] == ["hand"] * 3 + ["agent", "hand", "agent"]
-
-
-def test_a_hold_between_two_steps_overrides_one_step(run):
-    g = game(run)
-    g.command({"do": "hold", "value": RIGHT})
-    g.command({"do": "hold", "value": None})
-    play(g, 2)
-    assert [cause for _, cause in g.path] == ["hand", "agent"]
-
-
-def test_the_optimum_is_the_exact_return_for_goal_and_overrides(run):
-    g = game(run)
-    for p, law, q in ((0.0, None, [0.2] * 5), (0.5, None, [0.2] * 5), (0.5, LEFT, [0, 1, 0, 0, 0])):
-        g.command({"do": "p", "value": p})
-        g.command({"do": "law", "value": law})
-        h = Hypotheses(3, 8, np.array([7]), np.array([p]), np.array([q], np.float64))
-        assert g.optimum == pytest.approx(optimal_returns(h)[0])
-    assert g.snapshot()["law"] == LEFT
-
-
-def test_an_episode_in_which_the_task_changed_has_no_optimum(run):
-    g = game(run)
-    play(g, 3)
-    g.command({"do": "p", "value": 0.5})
-    play(g, 13)
-    assert [e.optimum is None for e in g.episodes] == [True, False]
-    g.command({"do": "goal", "value": [0, 0]})  # between two episodes
-    play(g, 8)
-    assert g.episodes[2].optimum == pytest.approx(g.optimum)
-
-
-@pytest.mark.parametrize("keep", [False, True])
-def test_a_moved_goal_clears_the_context_unless_it_is_kept(run, keep):
-    g = game(run, Agent(STAY))
-    g.command({"do": "keep", "value": keep})
-    resets = g.agent.resets
-    play(g, 5)
-    g.command({"do": "goal", "value": [0, 0]})
-    assert g.agent.resets == resets + (not keep)
-    play(g, 2)
-    read = g.belief()
-    assert read.transitions == (7 if keep else 2)
-    assert read.exact[0] == pytest.approx(1), "the exact posterior starts again when the goal moves"
-    g.command({"do": "goal", "value": [0, 1]})
-    assert g.belief().exact == pytest.approx(np.full(9, 1 / 9))
-
-
-@pytest.mark.parametrize("deploy", ["paper", "committed"])
-def test_the_exact_posterior_uses_the_transitions_in_the_context(run, deploy):
-    g = game(run, Agent(STAY, deploy))
-    g.command({"do": "keep", "value": True})
-    play(g, 12)
-    g.command({"do": "goal", "value": [2, 2]})
-    play(g, 2)
-    known = {"paper": 0, "committed": 1}[deploy]
-    assert (g.belief().exact > 0).sum() == 9 - known
-    play(g, 2)
-    assert (g.belief().exact > 0).sum() == 8 and g.belief().exact[0] == 0
-
-
-def test_the_same_commands_between_the_same_steps_give_the_same_game():
-    def played(seed):
-        agent = load_agent("darkroom", seed=seed)
-        g = PlayGame(agent, parse(agent.manifest["run"], "agent"), seed, Clock())
-        g.command({"do": "p", "value": 0.3})
-        play(g, 15)
-        g.command({"do": "new"})
-        play(g, 5)
-        return g.path, g.snapshot()
-
-    first, again, other = played(1), played(1), played(2)
-    assert first == again and first[0] != other[0]
-    assert len(first[0]) == 5 and first[1]["surprise"] is not None
-
-
-def test_snapshots_are_json_and_bounded(run):
-    g = game(run, Agent(STAY))
-    play(g, 8 * 405)
-    history = g.history()
-    assert history["first"] == 6 and len(history["total"]) == 400 and history["total"][-1] == 0
-    assert len(json.dumps(history, allow_nan=False)) < 20_000
-    room = g.snapshot()
-    assert len(json.dumps(room, allow_nan=False)) < 2_000
-    assert room["path"][0] == [0, "start"] and len(room["path"]) == 9 and room["optimum"] == pytest.approx(6)
-    play(g, 1)
-    assert g.history()["first"] == 6 and g.snapshot()["episode"] == 406
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({}, "do='None': expected one of goal, p, law"),
-        ({"do": "reset"}, "do='reset'"),
-        ({"do": ["p"]}, "do="),
-        ({"do": "p"}, "p: expected the fields do, value"),
-        ({"do": "step", "value": 1}, "step: expected the fields do"),
-        ({"do": "p", "value": 0.5, "more": 1}, "p: expected the fields"),
-        *(({"do": "p", "value": v}, "a number from 0 to 1") for v in (-0.1, 1.1, "0.5", True, None, [0.5], 10**400)),
-        *(
-            ({"do": "goal", "value": v}, "expected [x, y], each 0 to 2")
-            for v in ([3, 0], [0, -1], [0], "00", [0, 1.0], [True, 0], {})
-        ),
-        *(({"do": "push", "value": v}, "expected 0 to 4") for v in (-1, 5, 1.0, True, None, "up")),
-        *(({"do": "hold", "value": v}, "expected 0 to 4") for v in (-1, 5, False)),
-        *(({"do": "law", "value": v}, "expected 0 to 4") for v in (7, "uniform")),
-        *(({"do": "speed", "value": v}, "a number from 0.5 to 100") for v in (0, 1000, None)),
-        *(({"do": "pause", "value": v}, "expected true or false") for v in (0, 1, "true", None)),
-        ({"do": "x" * 5000}, "do='xxxx"),
-    ],
-)
-def test_invalid_commands_are_refused_in_one_short_line_and_change_nothing(run, fields, message):
-    g = game(run)
-    before = g.snapshot()
-    with pytest.raises(ValueError) as error:
-        g.command(fields)
-    assert message in str(error.value) and len(str(error.value).splitlines()) == 1 and len(str(error.value)) < 200
-    assert g.snapshot() == before
-
-
-class RecordingStream(EventStream):
-    """A stream with one viewer that records all events."""
+class Recorded(EventStream):
+    """A stream with one viewer; it records what is published."""
 
     viewers = 1
 
     def __init__(self):
         super().__init__()
-        self.published = []
+        self.events = []
 
     def publish(self, event, data, state=False):
         super().publish(event, data, state)
-        self.published.append((event, json.loads(json.dumps(data))))
+        self.events.append((event, json.loads(json.dumps(data))))
 
 
-def test_commands_run_in_the_thread_of_the_game_and_wait_for_it(run, monkeypatch):
+def test_commands_of_viewers_are_carried_out_and_answered_by_the_thread_of_the_game(small_run, monkeypatch):
     monkeypatch.setattr(player, "FRAME_S", 0.0)
     monkeypatch.setattr(player, "BELIEF_S", 0.0)
-    g, stream, over = game(run), RecordingStream(), Event()
+    g, stream, over = game(small_run), Recorded(), Event()
     g.paused = True
     p = Player(g, stream)
     thread = Thread(target=p.run, args=(over,))
@@ -268,15 +45,15 @@ def test_commands_run_in_the_thread_of_the_game_and_wait_for_it(run, monkeypatch
     finally:
         over.set()
         thread.join()
-    events = [event for event, _ in stream.published]
+    events = [event for event, _ in stream.events]
     assert {"room", "belief", "episodes"} <= set(events)
-    assert [data["p"] for event, data in stream.published if event == "room"][-1] == 0.25
-    (belief, *_) = (data for event, data in stream.published if event == "belief")
+    assert [data["p"] for event, data in stream.events if event == "room"][-1] == 0.25
+    (belief, *_) = (data for event, data in stream.events if event == "belief")
     assert len(belief["implied"]) == len(belief["exact"]) == 9 and 0 <= belief["apart"] <= 1
 
 
-def test_the_game_pauses_without_viewers(run):
-    g, stream, over = game(run), EventStream(), Event()
+def test_the_game_is_paused_without_viewers(small_run):
+    g, stream, over = game(small_run), EventStream(), Event()
     p = Player(g, stream)
     thread = Thread(target=p.run, args=(over,))
     thread.start()
@@ -294,19 +71,22 @@ def test_the_game_pauses_without_viewers(run):
         (["here", "--pretrained", "darkroom"], "play: name a run folder"),
         (["--pretrained", "lightroom"], "no agent of that name is shipped; there are darkroom"),
         (["nowhere"], "nowhere: no such run folder or checkpoint"),
-        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port must be 0 (any free port) to 65535"),
+        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port is 0 (any free one) to 65535"),
         (["--pretrained", "darkroom", "--host", "nowhere.invalid"], "name an address of this machine"),
     ],
 )
-def test_wrong_arguments_of_play_give_one_line(words, message, capsys):
+def test_arguments_that_cannot_be_played_are_refused_in_one_line(words, message, capsys):
     assert main(["play", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
 
 
-def test_play_refuses_agents_of_other_problems(monkeypatch, capsys):
+def test_a_problem_without_a_game_is_refused(monkeypatch, capsys):
     agent = Agent()
     agent.manifest = {"run": dumps(load("dmc-cheetah-run"))}
     monkeypatch.setattr(player, "load_agent", lambda *_: agent)
     assert main(["play", "runs/cheetah"]) == 2
-    assert "play runs/cheetah: its agent is for dmc-cheetah-run; play needs an agent for Dark Room" in capsys.readouterr().err
+    assert (
+        "play runs/cheetah: its agent was trained in dmc-cheetah-run, which cannot be played; use an agent of darkroom"
+        in capsys.readouterr().err
+    )

@@ -12,7 +12,7 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
     import signal
     import time
 
-    from icrl_dist.problems import registry
+    from icrl_dist.problems.darkroom.problem import DarkRoomProblem
 
     def raise_an_error():
         raise ZeroDivisionError("the room broke")
@@ -49,11 +49,11 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
                 FAILURES[os.environ["HOSTILE"]]()
             return self._batch.step(action)
 
-    real = registry.batch
+    real = DarkRoomProblem.batch
 
-    def batch(variations):
+    def batch(problem, variations):
         """The real environments; they fail if the hostile variation is among them."""
-        made = real(variations)
+        made = real(problem, variations)
         return Hostile(made) if any(repr(v) == os.environ["HOSTILE_VARIATION"] for v in variations) else made
 
-    registry.batch = batch
+    DarkRoomProblem.batch = batch

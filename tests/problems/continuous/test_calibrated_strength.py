@@ -1,4 +1,4 @@
-"""Strengths given by what they take: the solver against functions that are known, and where its answers are kept."""
+"""Strengths given as a drop of the return: the solver on known functions, and the tables that store its results."""
 
 import functools
 import json
@@ -11,7 +11,7 @@ from icrl_dist.bench import disturbance, drop
 from icrl_dist.bench.disturbance import DisturbanceSizes, Setting
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps, load, override, parse
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import calibrated_strength
 from icrl_dist.problems.dmc import domains
 from tests.bench.test_bench_disturbance import Balances
@@ -47,7 +47,7 @@ def test_a_straight_line_is_solved_to_the_tolerance_from_above(slope):
     assert list(found.tried) == sorted(found.tried) and (found.strength, found.lost) in found.tried
 
 
-def test_of_a_loss_that_rises_and_falls_the_smallest_strength_is_found_as_a_slow_search_finds_it():
+def test_the_smallest_strength_is_found_for_a_loss_that_rises_and_falls():
     def bump(s):
         """Passes 0.25 three times."""
         return 0.5 * math.exp(-((math.log(s) - math.log(3.0)) ** 2)) + 0.01 * s
@@ -56,20 +56,20 @@ def test_of_a_loss_that_rises_and_falls_the_smallest_strength_is_found_as_a_slow
     slow = next(s for s in fine if bump(s) >= 0.25)
     found = drop.solve(bump, 0.25)
     assert slow * 0.999 <= found.strength <= slow * 1.022
-    assert any(bump(s) < 0.25 for s in fine if s > found.strength), "or this test would be of a monotone loss"
+    assert any(bump(s) < 0.25 for s in fine if s > found.strength), "the loss is not monotone"
 
 
-def test_a_bite_that_nothing_reaches_is_said_at_the_largest_strength():
+def test_a_drop_that_no_strength_reaches_is_reported_at_the_largest_strength():
     found = drop.solve(lambda strength: 0.2, 0.25, first=1.0, most=6.0)
     assert not found.reached and found.strength == 6.0 and [s for s, _ in found.tried] == [1, 2, 4, 6]
 
 
-def test_a_run_has_the_strength_that_was_measured_and_keeps_it_whatever_the_table_says_later(own):
+def test_a_run_has_the_measured_strength_and_keeps_it_when_the_table_changes(own):
     own(row(7.5), row(9.0, forces=("qarl",)), row(1.0, share=0.25), row(2.0, problem="dmc-cheetah-run"))
     run = parse(RUN, "file")
     assert run.control.strength == "drop:0.3" and calibrated_strength.strength(run.control, run.problem) == 7.5
-    pushes = {v.adversary["strength"] for v in splits.variations(run, 0, splits.split(run).train[0])[1:]}
-    assert pushes == {7.5} and splits.test_adversary(run, 0, 2.0, "unseen")["strength"] == 15.0
+    pushes = {v.adversary["strength"] for v in registry.training_variations(run, 0, registry.of(run).split.train[0])[1:]}
+    assert pushes == {7.5} and registry.test_adversary(run, 0, 2.0, "unseen")["strength"] == 15.0
     own(row(8.0), row(9.0, forces=("qarl",)))
     again = parse(dumps(run), "run.toml")
     assert again == run and 'strength = "drop:0.3"' in dumps(run) and "=7.5" in dumps(run)
@@ -79,7 +79,7 @@ def test_a_run_has_the_strength_that_was_measured_and_keeps_it_whatever_the_tabl
     assert parse(RUN, "file").control.solved.endswith("=8.0")
 
 
-def test_metres_are_what_a_bite_in_meta_world_is_of(own):
+def test_a_drop_in_meta_world_is_measured_in_metres(own):
     own(row(0.6, problem="metaworld-pick-place", forces=(), metres=0.01))
     text = 'problem = "metaworld-pick-place"\n[control]\nstrength = "drop:0.3"\ndisturbance = {}\n'
     assert calibrated_strength.strength(parse(text.format("0.01"), "file").control, "metaworld-pick-place") == 0.6
@@ -91,12 +91,12 @@ def test_metres_are_what_a_bite_in_meta_world_is_of(own):
 
 
 @pytest.mark.parametrize("given", ["bit:0.25", "drop:0", "drop:1", "drop:25%", "drop:-0.1", "drop:nan", "strong", "2"])
-def test_what_is_neither_a_number_nor_a_bite_is_refused_with_the_form(given):
+def test_a_strength_that_is_neither_a_number_nor_a_drop_is_refused_with_the_form(given):
     with pytest.raises(ConfigError, match=rf"file: control\.strength = '{given}': write a number, or drop:SHARE"):
         parse(RUN.replace("drop:0.3", given), "file")
 
 
-def test_a_bite_that_nobody_solved_is_refused_with_the_command_that_solves_it(own, capsys):
+def test_an_unsolved_drop_is_refused_with_the_command_that_solves_it(own, capsys):
     file = own(row(7.5, share=0.5))
     assert main.main(["train", f"{KIND}-laptop", "--control.strength", "drop:0.25", "--out", str(file.parent / "r")]) == 2
     said = capsys.readouterr().err
@@ -104,24 +104,24 @@ def test_a_bite_that_nobody_solved_is_refused_with_the_command_that_solves_it(ow
     assert "solved: drop:0.5" in said
     with pytest.raises(ConfigError, match=r"not solved for dmc-hopper-hop .*solved: none"):
         override(load("dmc-hopper-hop"), ["control.strength=drop:0.5"], "--set")
-    with pytest.raises(ConfigError, match=r"adversary\.p_max"):
+    with pytest.raises(ConfigError, match=r"section \[control\]: problem = 'darkroom' has no such section"):
         parse('[control]\nstrength = "drop:0.25"', "file")
     file.write_text("[{}]")
     with pytest.raises(ConfigError, match=r"not a table of calibrated strengths.*delete it"):
         parse(RUN, "file")
 
 
-def test_the_packaged_table_has_what_it_was_solved_from():
+def test_the_packaged_table_contains_the_measurements_of_each_strength():
     for one in calibrated_strength.packaged():
         assert one["problem"] in (*domains.PROBLEMS, "metaworld-pick-place") and one["reached"]
         assert one["lost_mean"] >= one["drop"] == calibrated_strength.share(f"drop:{one['drop']:g}")
         below = [share for strength, share in one["tried"] if strength < one["strength"]]
-        assert below and max(below) < one["drop"], "the smallest that was tried"
+        assert below and max(below) < one["drop"], "no smaller strength that was tried reaches the drop"
         assert f"--problem {one['problem']} --drop" in one["command"] and one["versions"] and one["date"]
         assert one["undisturbed"] >= drop.COMPETENT * (5000 if one["metres"] else 200)
 
 
-def test_solving_keeps_the_strength_for_runs_that_ask_for_it(own, monkeypatch, capsys):
+def test_a_solved_strength_is_stored_for_later_runs(own, monkeypatch, capsys):
     settings = [Setting("qarl", domains.task(KIND, forces="qarl", horizon=20), 2)]
     monkeypatch.setattr(disturbance, "settings", lambda kind: settings)
     monkeypatch.setattr(drop, "settings", lambda kind: settings)
@@ -139,10 +139,10 @@ def test_solving_keeps_the_strength_for_runs_that_ask_for_it(own, monkeypatch, c
     measured = disturbance.measure([drop.Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
     assert disturbance.lost(measured.returns)["lost_mean"] == pytest.approx(solved["lost_mean"])
     drop._store(solved)
-    assert calibrated_strength.own() == kept, "in its own place"
+    assert calibrated_strength.own() == kept, "it replaces its own row"
 
 
-def test_an_incompetent_expert_is_not_asked_what_bites_it(own, monkeypatch):
+def test_no_drop_is_measured_with_an_incompetent_expert(own, monkeypatch):
     class Idle(Balances):
         def act(self, observation, u):
             return np.full((len(observation), 1), np.float32(1))

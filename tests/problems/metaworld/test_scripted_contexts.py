@@ -1,22 +1,21 @@
-"""Contexts of Meta-World's scripted policy: who is told what, what disturbs it, and whose labels they carry."""
+"""Contexts of Meta-World's scripted policy: the goals it is given, its noise, and the labels."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from icrl_dist.methods.recipes import METHODS
 
-from icrl_dist.collect import jobs
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import delivery
+from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.metaworld import environment, pick_place, scripted_contexts
 from icrl_dist.problems.metaworld.scripted_contexts import Lead
 from icrl_dist.stream import wire
-from icrl_dist.training.batches import Examples
-from tests.methods.test_recipes import Kept
+from icrl_dist.training.batches import TrainingBatch
+from tests.jobs import Kept, asked, decoded, done, in_problem
 
 HORIZON, TRIALS = 10, 2
 
@@ -32,27 +31,26 @@ def run(small_run, monkeypatch):
     monkeypatch.setattr(environment, "ml1_tasks", lambda count, seed: chosen[:count])  # theirs take seconds to make
     control = ControlConfig(train_tasks=2, test_tasks=1, horizon=HORIZON, histories="scripted")
     pretrain = dataclasses.replace(small_run.pretrain, contexts=4 * TRIALS, queries=HORIZON)
-    return dataclasses.replace(
-        small_run, problem="metaworld-pick-place", control=control, adversary=AdversaryConfig(count=2), pretrain=pretrain
-    )
+    more = {"method": "icag", "control": control, "adversary": AdversaryConfig(count=2), "pretrain": pretrain}
+    return in_problem(small_run, "metaworld-pick-place", **more)
 
 
-def asked(run):
-    (job,) = METHODS["icag"].ask(run, METHODS["icag"].phases(run)[0])
+def job_of(run):
+    (job,) = asked(run)
     return job
 
 
-def test_half_of_the_episodes_are_told_the_goal_and_the_rest_places_where_goals_lie(spec):
+def test_half_of_the_episodes_lead_to_the_goal_and_the_rest_to_other_places_in_its_box(spec):
     goal = np.array([0.05, 0.85, 0.2])
     rngs = [np.random.default_rng(seed) for seed in range(200)]
     right = [Lead.drawn(rng, goal, True, spec) for rng in rngs]
     wrong = [Lead.drawn(rng, goal, False, spec) for rng in rngs]
     assert all((one.goals == goal).all() for one in right)
-    told = np.stack([one.goals for one in wrong])
+    given = np.stack([one.goals for one in wrong])
     low, high = pick_place.GOALS
-    assert (told >= low).all() and (told <= high).all() and np.abs(told - goal).sum(-1).min() > 1e-3
-    changes = (np.diff(told, axis=1) != 0).any(axis=2).sum(axis=1)
-    assert set(changes.tolist()) == {0, 1} and told.std(axis=(0, 1)).min() > 0.02
+    assert (given >= low).all() and (given <= high).all() and np.abs(given - goal).sum(-1).min() > 1e-3
+    changes = (np.diff(given, axis=1) != 0).any(axis=2).sum(axis=1)
+    assert set(changes.tolist()) == {0, 1} and given.std(axis=(0, 1)).min() > 0.02
     deviations = np.array([one.noise.std() for one in right])
     assert 0 <= deviations.min() < 0.1 and 0.5 < deviations.max() < 1.1 * scripted_contexts.NOISE
     lapsed = np.stack([one.lapsed for one in right])
@@ -60,21 +58,21 @@ def test_half_of_the_episodes_are_told_the_goal_and_the_rest_places_where_goals_
     assert all((np.abs(one.instead[one.lapsed]).max(axis=1) > 0).all() for one in right if one.lapsed.any())
 
 
-def test_actions_are_the_leaders_with_its_noise_and_labels_the_true_goals(run, monkeypatch):
+def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_goal(run, monkeypatch):
     monkeypatch.setattr(scripted_contexts, "LAPSES", 0.2)
-    job, told = asked(run), []
-    assert job.kind == "scripted_context" and wire.decode_job(wire.encode_job(job)) == job
+    job, given = job_of(run), []
+    assert job.kind == "scripted_context" and decoded(run, wire.encode_job(job)) == job
     drawn = Lead.drawn.__func__
-    keep = lambda cls, *given: told.append(drawn(cls, *given)) or told[-1]  # noqa: E731
+    keep = lambda cls, *args: given.append(drawn(cls, *args)) or given[-1]  # noqa: E731
     monkeypatch.setattr(Lead, "drawn", classmethod(keep))
-    sent = list(jobs.do(job, None, "w"))
+    sent = done(run, job)
     assert [t.identity for t in sent] == list(job.identities()) and {t.origin for t in sent} == {"expert"}
     states = {}
     for trial in range(TRIALS):
         env = registry.batch(job.variations)  # once more, one step after the other, from the actions that were sent
         seen = env.reset([np.random.default_rng(0)] * 4)
         rows = [next(t for t in sent if t.variation == v and t.identity.trial == trial) for v in job.variations]
-        leads = told[4 * trial : 4 * trial + 4]
+        leads = given[4 * trial : 4 * trial + 4]
         for step in range(HORIZON):
             for row, (one, lead) in enumerate(zip(rows, leads, strict=True)):
                 truth = env.truth[row].copy()
@@ -85,27 +83,30 @@ def test_actions_are_the_leaders_with_its_noise_and_labels_the_true_goals(run, m
                 np.testing.assert_allclose(one.actions[step], wanted, atol=1e-6)
             seen = env.step(np.stack([one.actions[step] for one in rows])).observation
         assert all(np.allclose(one.observations[-1], seen[row]) for row, one in enumerate(rows))
-    assert any(lead.lapsed[:HORIZON].any() for lead in told)
+    assert any(lead.lapsed[:HORIZON].any() for lead in given)
     for t in sent:
         assert not t.observations[:, 36:].any() and len(t.queries) == HORIZON and not len(t.taken)
         labels = np.stack([states[query.tobytes(), t.variation] for query in t.queries])
         np.testing.assert_allclose(t.labels, labels, atol=1e-3)
-    (pool,) = METHODS["icag"].learn(run, METHODS["icag"].phases(run)[0], Kept(sent))
-    assert isinstance(pool.examples[0], Examples) and len(pool.examples) == 4
+    method, data = methods.of(run), Kept(sent)
+    batch = method.data(run, method.phases(run)[0], data)(np.random.default_rng(0))
+    assert len(data.variations("pretrain", 0)) == 4 and isinstance(batch, TrainingBatch)
+    known = {tuple(label) for t in sent for label in t.labels}
+    assert {tuple(label) for label in batch.labels.reshape(-1, 4)} <= known
 
 
-def test_the_same_job_gives_the_same_bytes_and_stretches_when_they_are_asked_for(run, monkeypatch):
+def test_the_same_job_gives_the_same_bytes_with_action_windows(run, monkeypatch):
     monkeypatch.setattr(delivery, "LED", 1)
     model = dataclasses.replace(run.model, window=4)
     run = dataclasses.replace(run, model=model, pretrain=dataclasses.replace(run.pretrain, windows=3, contexts=4))
-    job = dataclasses.replace(asked(run), tasks=1, variations=asked(run).variations[:2])
-    sent, again = (list(jobs.do(job, None, "w")) for _ in range(2))
+    job = dataclasses.replace(job_of(run), tasks=1, variations=job_of(run).variations[:2])
+    sent, again = (done(run, job) for _ in range(2))
     assert [wire.trajectory_digest(t) for t in sent] == [wire.trajectory_digest(t) for t in again]
     for t in sent:
         assert t.taken.shape == (12, 4) and len(t.queries) == HORIZON + 12
 
 
-def test_who_has_no_scripted_policy_is_told_so():
+def test_scripted_histories_are_refused_where_there_is_no_scripted_policy():
     with pytest.raises(ConfigError, match=r"control\.histories = 'scripted': only Meta-World"):
         override(load("dmc-reacher-easy"), ["control.histories=scripted"], "--set")
     with pytest.raises(ConfigError, match=r"control\.histories = 'scripted': experts are made for sac"):

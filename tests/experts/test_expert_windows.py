@@ -1,0 +1,150 @@
+"""Action windows of SAC experts and their decoys, progress messages of trainings, and deployed experts."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist.config.run import ConfigError, validate
+from icrl_dist.config.sac import SACConfig
+from icrl_dist.config.sections import AdversaryConfig
+from icrl_dist.experts import cache
+from icrl_dist.experts.cache import LED, History
+from icrl_dist.experts.sac import batched
+from icrl_dist.experts.train import ExpertPolicy, ScriptedPolicy
+from icrl_dist.methods import registry as methods
+from icrl_dist.methods.dpt_loss import batch_loss
+from icrl_dist.problems import registry
+from icrl_dist.problems.continuous.config import ControlConfig
+from icrl_dist.problems.metaworld import environment, pick_place
+from icrl_dist.rollout import deployment
+from icrl_dist.rollout.episode import episode
+from icrl_dist.training import fit
+from icrl_dist.types import NULL, Variation
+from tests.experts.histories import EPISODES, HORIZON, run
+from tests.jobs import Kept, asked, done, in_problem
+
+__all__ = ["run"]
+
+
+def test_in_meta_world_labels_come_from_the_scripted_policy_at_the_true_states(small_run):
+    sac = SACConfig(hidden=(8,), batch=8, random_steps=10, warmup=10, steps=60, cache="")
+    run = in_problem(
+        small_run,
+        "metaworld-pick-place",
+        method="icag",
+        control=ControlConfig(train_tasks=2, test_tasks=1, horizon=30),
+        adversary=AdversaryConfig(count=2),
+        sac=sac,
+        pretrain=dataclasses.replace(small_run.pretrain, contexts=8, queries=5),
+    )
+    (job,) = asked(run)
+    sent = done(run, job)
+    assert len(sent) == 8
+    for t in sent:
+        assert not t.observations[:, 36:].any() and not t.queries[:, 36:].any(), "the goal stays hidden"
+        if t.variation.adversary == NULL:  # then what is shown is true, but for the goal
+            truth = t.queries.astype(np.float64)
+            truth[:, 36:] = t.variation.task.vector("goal")
+            np.testing.assert_allclose(t.labels, environment.expert(truth), atol=1e-3)
+    pushed = [t for t in sent if t.variation.adversary != NULL]
+    blind = [np.abs(environment.expert(t.queries.astype(np.float64)) - t.labels).max() for t in pushed]
+    assert min(blind) > 0.05, "labels of what is shown would be others"
+
+
+def test_each_expert_acts_in_its_own_row(run):
+    torch.manual_seed(0)
+    spec = registry.of(run).spec
+    batch = batched.SACBatch(range(3), spec, run.sac, "cpu")
+    shapes = dict.fromkeys(("actions", "adversary", "labels", "led_actions", "led_labels"), (0, 1, 2))
+    shapes |= {"rewards": (0, 1), "led_rewards": (0, 1), "observations": (0, 2, 6), "led_observations": (0, 2, 6)}
+    empty = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    actors = batch.arrays["actor"].numpy()
+    made = [History(**empty, actor=actor) for actor in actors]
+    policy = ExpertPolicy(made, run.sac)
+    seen = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
+    np.testing.assert_allclose(policy.act(seen, np.zeros((3, 2))), batch.act(seen), atol=1e-6)
+
+
+def test_the_scripted_policy_reads_the_true_states_of_its_environment():
+    env = environment.PickPlace([Variation(pick_place.task((0.02, 0.65, 0.02), (0.05, 0.85, 0.2)))] * 2)
+    policy = ScriptedPolicy(registry.problem(pick_place.KIND), env)
+    seen = env.reset([np.random.default_rng(0)] * 2)
+    np.testing.assert_array_equal(policy.act(seen * 0, np.zeros((2, 4))), environment.expert(env.truth))
+
+
+def test_a_training_reports_its_progress_and_the_cache_reports_what_it_saved(run):
+    job, received = asked(run)[0], []
+    progress = lambda text, note=False, reached=0: received.append((text, note, reached))  # noqa: E731
+    done(run, job, progress=progress)
+    assert len(received) == EPISODES and received[4][0].startswith("4 experts at 100 of 200 steps, mean return ")
+    assert not any(note for _, note, _ in received) and [reached for *_, reached in received] == list(range(20, 201, 20))
+    received.clear()
+    done(run, job, progress=progress)
+    assert received == [(f"{job.label}: 4 experts from the cache, 800 steps of SAC saved", True, 0)]
+
+
+@pytest.fixture
+def windowed(run):
+    model = dataclasses.replace(run.model, window=4)
+    fit = dataclasses.replace(run.pretrain, windows=5, decoy_fraction=0.5)
+    return dataclasses.replace(run, model=model, pretrain=fit, optim=dataclasses.replace(run.optim, windows=2))
+
+
+def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_another_task(windowed):
+    job = asked(windowed)[0]
+    sent = done(windowed, job)
+    found = [cache.any_kept(v, HORIZON, windowed.sac, windowed.seed) for v in job.variations]
+    policies = [ExpertPolicy([history] * 4, windowed.sac) for history in found]
+    unused, led = np.zeros((4, 2)), {False: 0, True: 0}
+    for t in sent:
+        row = job.variations.index(t.variation)
+        own, other = policies[row], policies[(row + 2) % 4]  # two variations of each of two tasks
+        assert t.variation.task != job.variations[(row + 2) % 4].task
+        assert len(t.queries) == 6 + 5 * 4 and len(t.taken) == 20
+        states, taken, labels = t.queries[6:].reshape(5, 4, 6), t.taken.reshape(5, 4, 2), t.labels[6:].reshape(5, 4, 2)
+        whole = found[row].led_observations[:, :-1]
+        for n in range(5):
+            np.testing.assert_allclose(labels[n], own.act(states[n], unused), atol=1e-5)
+            decoy = np.abs(taken[n] - labels[n]).max() > 1e-4
+            led[bool(decoy)] += 1
+            np.testing.assert_allclose(taken[n], (other if decoy else own).act(states[n], unused), atol=1e-5)
+            places = [(g, h) for g in range(LED) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states[n]).all()]
+            assert bool(places) != decoy, "four states in a row of an episode that its own expert led, or of another"
+            if places:
+                g, h = places[0]
+                np.testing.assert_array_equal(t.gained.reshape(5, 4)[n], found[row].led_rewards[g, h : h + 4])
+    assert min(led.values()) > 0.25 * sum(led.values())
+
+
+def test_a_job_of_one_task_has_no_decoys(windowed):
+    alone = dataclasses.replace(windowed, stream=dataclasses.replace(windowed.stream, job_tasks=1))
+    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: 0, or a stream\.job_tasks that leaves none"):
+        validate(alone, "x")
+    validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, decoy_fraction=0.0)), "x")
+
+
+def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed(windowed):
+    run = dataclasses.replace(windowed, optim=dataclasses.replace(windowed.optim, queries=8))
+    method = methods.of(run)
+    data = Kept([t for job in asked(run) for t in done(run, job)])
+    draw = method.data(run, method.phases(run)[0], data)
+    torch.manual_seed(0)
+    model = method.build(registry.of(run).spec, run)
+    taken = draw(np.random.default_rng(0)).windows.taken
+    assert taken.shape == (8, 2, 4, 2) and taken.dtype == np.float32
+
+    def loss(step):
+        return batch_loss(model, draw(np.random.default_rng(step)))
+
+    opt = fit.Optimizer(model, run.optim)
+    before = np.mean([loss(1000 + n).item() for n in range(8)])
+    fit.fit(model, opt, run.optim, 3e-3, 60, loss)
+    after = np.mean([loss(1000 + n).item() for n in range(8)])
+    assert after < before - 0.3
+    policy = deployment.in_context(model, 4, run.context)
+    assert isinstance(policy, deployment.CommittedPolicy)
+    env = registry.batch(asked(run)[0].variations)
+    ran = episode(env, policy, [np.random.default_rng(row) for row in range(4)])
+    assert ran.actions.shape == (4, HORIZON, 2) and policy.length == HORIZON
