@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
+    from icrl_dist.problems.benchmarks import Benchmarks
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -290,6 +291,11 @@ class Problem(abc.ABC):
     @property
     def game(self) -> Any:
         """What ``icrl-dist play`` plays."""
+        return None
+
+    @property
+    def benchmarks(self) -> Benchmarks | None:
+        """What ``icrl-dist bench`` needs of the problem; None for a problem that no benchmark measures."""
         return None
 
     @functools.cached_property

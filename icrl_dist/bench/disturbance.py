@@ -8,40 +8,27 @@ true goal; it observes hand and object as displaced by the adversary.
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float
 
-from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.toml import nearest
-from icrl_dist.experts import cache
-from icrl_dist.experts.cache import History
-from icrl_dist.experts.train import ExpertPolicy, train_expert
-from icrl_dist.interfaces import Policy
 from icrl_dist.problems import registry
+from icrl_dist.problems.continuous.disturbance import DisturbanceExperts, Make, Report, Setting
 from icrl_dist.problems.continuous.network_adversary import networks
-from icrl_dist.problems.dmc import domains
-from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.rollout.episode import deploy_online
-from icrl_dist.types import Adversary, Job, Task, Variation
+from icrl_dist.types import Adversary, Task, Variation
 
-PROBLEMS = (*domains.PROBLEMS, pick_place.KIND)
 WEAK = 0.02
 """Default adversaries are weak if the mean relative loss of return under them is below this."""
 EARNS = 0.01
 """Mean reward per step that an expert needs without disturbance: below it, a relative loss means nothing."""
-LONGER = dict.fromkeys(("dmc-cheetah-run", "dmc-reacher-easy", "dmc-reacher-hard"), 36_000)
-"""Training steps for problems whose experts have almost no return after the 12,000 steps of the run file."""
 _EPISODES, _ADVERSARIES = 1, 2  # spawn keys of the generators
-
-Report = Callable[[str], None]
-Make = Callable[[Any], Policy]
-"""Makes the policy for a batch of environments."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,22 +42,10 @@ class DisturbanceSizes:
     tasks: int = 5
     """Tasks of Meta-World, each with one episode per adversary, because its initial states are fixed."""
     steps: int = 0
-    """Training steps of an expert; 0: those of the run file, or of ``LONGER``."""
+    """Training steps of an expert; 0: the default of the problem."""
 
 
 QUICK = DisturbanceSizes(episodes=3, tasks=2, steps=4_000)
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """A disturbance of a problem; strength 1 is the largest force of a preset, or a displacement in metres."""
-
-    forces: str
-    """The preset, ``paper`` or ``qarl``; empty in Meta-World."""
-    task: Task
-    """The task that adversaries are made for; in DeepMind Control the nominal one, in which the expert was trained."""
-    outputs: int
-    """Components of an adversary's action."""
 
 
 def run(
@@ -84,15 +59,15 @@ def run(
     Experts have the settings of the problem's laptop run file and are stored in its cache, so each is
     trained only once.  Raises ConfigError for an unknown problem.
     """
-    if problem is not None and problem not in PROBLEMS:
-        known = ", ".join(PROBLEMS)
-        raise ConfigError(f"bench disturbance: problem = {problem!r}{nearest(problem, PROBLEMS)}: choose one of {known}")
+    known = problems()
+    if problem is not None:
+        check(problem, known)
     sizes = sizes or (QUICK if quick else DisturbanceSizes())
     rows = []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        for kind in PROBLEMS if problem is None else (problem,):
+        for kind in known if problem is None else (problem,):
             config = sac_config(kind, sizes.steps)
             make = policy(kind, config, report)
             for setting in settings(kind):
@@ -105,75 +80,40 @@ def run(
     return {"quick": quick, **dataclasses.asdict(sizes), "problems": rows, "weak": sum(bool(row["weak"]) for row in rows)}
 
 
+def problems() -> tuple[str, ...]:
+    """The names of the problems that have disturbances to measure."""
+    parts = {name: registry.problem(name).benchmarks for name in registry.names()}
+    return tuple(name for name, part in parts.items() if part is not None and part.experts is not None)
+
+
+def check(problem: str, known: Sequence[str]) -> None:
+    """Raises ConfigError, with the nearest name, for a problem that is not ``known``."""
+    if problem not in known:
+        raise ConfigError(
+            f"bench disturbance: problem = {problem!r}{nearest(problem, known)}: choose one of {', '.join(known)}"
+        )
+
+
+def experts(kind: str) -> DisturbanceExperts:
+    """Experts and disturbances of one of ``problems``."""
+    part = registry.problem(kind).benchmarks
+    assert part is not None and part.experts is not None, kind
+    return part.experts
+
+
 def sac_config(kind: str, steps: int = 0) -> SACConfig:
-    """SAC settings for this problem's experts: those of its laptop run file, with ``steps``, or the steps of ``LONGER``."""
-    config = load(f"{kind}-laptop" if kind in domains.PROBLEMS else "metaworld-laptop").sac
-    return dataclasses.replace(config, steps=steps or LONGER.get(kind, config.steps))
+    """SAC settings for this problem's experts: those of its laptop run file, with ``steps`` or the problem's default."""
+    return experts(kind).sac_config(steps)
 
 
 def settings(kind: str) -> list[Setting]:
     """The disturbances of a problem: both presets of forces if they differ; in Meta-World one displacement."""
-    if kind == pick_place.KIND:
-        return [Setting("", pick_place.task((0.0, 0.65, 0.02), (0.0, 0.85, 0.2)), pick_place.MOVED)]
-    forces = domains.problem(kind).forces
-    presets = ("paper",) if forces["paper"] == forces["qarl"] else ("paper", "qarl")
-    return [Setting(preset, domains.task(kind, forces=preset), forces[preset].count) for preset in presets]  # type: ignore[index]
+    return experts(kind).settings()
 
 
 def policy(kind: str, config: SACConfig, report: Report) -> Make:
     """The function that makes the problem's expert; trains the expert if it is not in the cache."""
-    if kind == pick_place.KIND:
-        return ScriptedWithGoal
-    history = expert(kind, config, report)
-    return lambda env: ExpertPolicy([history] * env.batch, config)
-
-
-def expert(kind: str, config: SACConfig, report: Report) -> History:
-    """The undisturbed expert of the problem's nominal task, from the cache or newly trained."""
-    variation = Variation(domains.task(kind))
-    found = cache.any_kept(variation, config, 0)
-    if found is None:
-        report(f"{kind}: training an expert for {config.steps:,} steps")
-        found = next(iter(trained(kind, (variation,), config, report)), None)
-    if found is None:
-        raise ConfigError(f"sac.cache = {config.cache!r}: the trained expert is not there; set it to a writable folder")
-    return found
-
-
-def trained(kind: str, variations: tuple[Variation, ...], config: SACConfig, report: Report) -> list[History]:
-    """Undisturbed experts, one per variation, from the cache or newly trained; without a cache they are missing."""
-    messages = itertools.count(1)
-
-    def progress(text: str, note: bool = False, reached: int = 0) -> None:
-        if note or next(messages) % 10 == 0:
-            report(f"{kind}: {text}")
-
-    settings = (*cache.settings(config), ("decoy_fraction", 0.0), ("queries", 1), ("window", 1), ("windows", 0))
-    job = Job("train_expert", "pretrain", 0, 0, variations, 1, -1, 0, settings, len(variations))
-    for _ in train_expert(job, "bench", progress):
-        pass  # the trajectories are not needed: the histories are read from the cache
-    return [history for variation in variations if (history := cache.any_kept(variation, config, 0)) is not None]
-
-
-class ScriptedWithGoal:
-    """Meta-World's scripted policy, with the observed hand and object and the true goal."""
-
-    def __init__(self, env: Any) -> None:
-        self._env = env
-        self.succeeded: Bool[np.ndarray, " B"] = np.zeros(env.batch, bool)
-        """True where the object has reached the goal."""
-
-    def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
-        """The scripted actions for the observed state and the true goal."""
-        from icrl_dist.problems.metaworld.environment import expert as scripted
-
-        state = observation.astype(np.float64)
-        state[:, 36:] = self._env.truth[:, 36:]
-        return scripted(state)
-
-    def observe(self, *transition: object) -> None:
-        """Record successes."""
-        self.succeeded = self.succeeded | self._env.success
+    return experts(kind).policy(config, report)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -209,11 +149,7 @@ def _episode_rng(episode: int, task: int) -> np.random.Generator:
 
 def variations(setting: Setting, sizes: DisturbanceSizes) -> tuple[list[Variation], int]:
     """The null adversary and K adversaries of strength 1 in each task, task by task; and the number of tasks."""
-    tasks: tuple[Task, ...] = (setting.task,)
-    if setting.task.kind == pick_place.KIND:
-        from icrl_dist.problems.metaworld.environment import ml1_tasks
-
-        tasks = ml1_tasks(sizes.tasks)
+    tasks: tuple[Task, ...] = experts(setting.task.kind).tasks(setting, sizes.tasks)
     return [Variation(task, push) for task in tasks for push in adversaries(setting, sizes.adversaries)], len(tasks)
 
 
@@ -252,14 +188,10 @@ def _error(values: Float[np.ndarray, " C"]) -> float | None:
 
 def _row(kind: str, setting: Setting, make: Make, sizes: DisturbanceSizes, config: SACConfig) -> dict[str, Any]:
     """The result row of one problem under one disturbance."""
-    rows, tasks = variations(setting, sizes)
-    measured = measure(rows, make, 1 if kind == pick_place.KIND else sizes.episodes, tasks)
+    (rows, tasks), part = variations(setting, sizes), experts(kind)
+    measured = measure(rows, make, 1 if part.fixed_starts else sizes.episodes, tasks)
     found: dict[str, Any] = {name: None if value is None else round(value, 4) for name, value in lost(measured.returns).items()}
-    if kind == pick_place.KIND:
-        about: dict[str, Any] = {"metres": pick_place.disturbance(setting.task)}
-    else:
-        newtons = domains.problem(kind).forces[setting.forces].largest  # type: ignore[index]
-        about = {"forces": setting.forces, "newtons": newtons, "steps": config.steps}
+    about = part.describe(setting, config)
     if measured.succeeded is not None:
         undisturbed, *disturbed = measured.succeeded.tolist()
         about |= {"success": round(undisturbed, 3), "success_disturbed": round(float(np.mean(disturbed)), 3)}

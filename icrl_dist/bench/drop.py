@@ -1,8 +1,8 @@
 """Calibrates ``drop:SHARE``: finds and stores the strength at which undisturbed experts lose this share of their return.
 
 In DeepMind Control the tasks are those of the smallest training set, the central 2x2 of the grid, each with
-its own undisturbed SAC expert; in Meta-World they are the first training tasks, with the scripted policy of
-``bench.disturbance``.  All strengths are compared on the same episodes (same initial states) and networks.
+its own undisturbed SAC expert; in Meta-World they are the first training tasks, with the scripted policy
+of ``problems/metaworld/bench.py``.  All strengths are compared on the same episodes (same initial states) and networks.
 """
 
 from __future__ import annotations
@@ -17,22 +17,18 @@ from typing import Any
 import torch
 
 from icrl_dist.bench import disturbance
-from icrl_dist.bench.disturbance import DisturbanceSizes, Make, Report, Setting, lost, measure, settings
+from icrl_dist.bench.disturbance import DisturbanceSizes, experts, lost, measure, settings
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.config.toml import nearest
-from icrl_dist.experts.train import ExpertPolicy
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import calibrated_strength
-from icrl_dist.problems.dmc import domains
-from icrl_dist.problems.metaworld import pick_place
+from icrl_dist.problems.continuous.disturbance import Make, Report, Setting
 from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Task, Variation
 
-KNOWN = ("dmc-cartpole-balance", pick_place.KIND)
-"""Problems whose experts are known to be competent with the settings of the laptop run file."""
 COMPETENT = 0.25
-"""Mean reward per step (at most 1) that experts need without disturbance: the drop of a worse expert means nothing."""
+"""Mean reward per step, as a share of the largest reward, that experts need without disturbance; the drop of a worse
+expert means nothing."""
 FIRST, MOST = 2.0**-3, 2.0**14
 """The smallest and the largest strength tried; strengths are doubled, then bisected to 2%."""
 SIZES = DisturbanceSizes(episodes=3)
@@ -85,21 +81,20 @@ def run(
     report: Report = lambda text: None,
     sizes: DisturbanceSizes | None = None,
 ) -> dict[str, Any]:
-    """Calibrate ``drop`` for a problem, or for all of ``KNOWN``, and store it in the user's table.
+    """Calibrate ``drop`` for a problem, or for all whose experts are known to be competent, and store it in the user's table.
 
     ``steps`` of SAC for the experts; default: those of ``bench disturbance``.  Raises ConfigError for an
     unknown problem and for experts that are not competent.
     """
     calibrated_strength.share(f"drop:{drop:g}")
-    known = (*domains.PROBLEMS, pick_place.KIND)
-    if problem is not None and problem not in known:
-        raise ConfigError(
-            f"bench disturbance: problem = {problem!r}{nearest(problem, known)}: choose one of {', '.join(known)}"
-        )
+    known = disturbance.problems()
+    if problem is not None:
+        disturbance.check(problem, known)
+    chosen = [name for name in known if experts(name).competent] if problem is None else [problem]
     threads, rows = torch.get_num_threads(), []
     torch.set_num_threads(1)
     try:
-        for kind in KNOWN if problem is None else (problem,):
+        for kind in chosen:
             rows += _calibrate(kind, drop, steps, report, sizes or SIZES)
     finally:
         torch.set_num_threads(threads)
@@ -132,9 +127,9 @@ def _calibrate(kind: str, drop: float, steps: int | None, report: Report, sizes:
 def _row(
     kind: str, setting: Setting, make: Make, drop: float, config: SACConfig, report: Report, sizes: DisturbanceSizes
 ) -> dict[str, Any]:
-    tasks = _tasks(kind, setting, sizes)
+    part, tasks = experts(kind), _tasks(kind, setting, sizes)
     found: dict[float, dict[str, float | None]] = {}
-    episodes = 1 if kind == pick_place.KIND else sizes.episodes
+    episodes = 1 if part.fixed_starts else sizes.episodes
 
     def loss(strength: float) -> float:
         adversaries = disturbance.adversaries(setting, sizes.adversaries, strength)
@@ -143,25 +138,21 @@ def _row(
         found[strength] = losses = {**lost(measured.returns), "broken": measured.broken}
         earned, share = losses["undisturbed"], losses["lost_mean"]
         if share is None or earned is None or earned < _competent_return(kind, setting):
-            remedy = "its scripted policy has failed" if kind == pick_place.KIND else "train longer with --steps"
             needed = f"have a return of {earned:.1f} undisturbed, below {_competent_return(kind, setting):g}"
-            raise ConfigError(f"bench disturbance --drop {drop:g}: the experts of {kind} {needed}: {remedy}")
+            raise ConfigError(f"bench disturbance --drop {drop:g}: the experts of {kind} {needed}: {part.remedy}")
         report(f"{kind} {setting.forces}: at strength {strength:g} the return drops by {share:.1%}")
         return share
 
     answer = solve(loss, drop)
-    presets = ["paper", "qarl"] if len(settings(kind)) == 1 else [setting.forces]
-    scripted = kind == pick_place.KIND
     names = ("undisturbed", "undisturbed_error", "lost_mean", "lost_worst", "lost_error", "broken")
     return {
         "problem": kind,
-        "forces": [] if scripted else presets,
-        "metres": pick_place.DISTURBANCE if scripted else 0.0,
+        **part.calibration_key(setting),
         "drop": drop,
         "strength": answer.strength,
         "reached": answer.reached,
         **{name: found[answer.strength][name] for name in names},
-        "expert": "scripted" if scripted else f"SAC, {config.steps:,} steps, {'-'.join(map(str, config.hidden))}",
+        "expert": part.expert(config),
         "tasks": len(tasks),
         "adversaries": sizes.adversaries,
         "episodes": episodes,
@@ -172,26 +163,16 @@ def _row(
 
 
 def _competent_return(kind: str, setting: Setting) -> float:
-    return COMPETENT * registry.spec(setting.task).horizon * (10 if kind == pick_place.KIND else 1)
+    return COMPETENT * registry.spec(setting.task).horizon * experts(kind).most_reward
 
 
 def _tasks(kind: str, setting: Setting, sizes: DisturbanceSizes) -> tuple[Task, ...]:
-    if kind != pick_place.KIND:
-        return tuple(task.replace(forces=setting.forces) for task in domains.grid(kind, 2))
-    from icrl_dist.problems.metaworld.environment import ml1_tasks
-
-    return ml1_tasks(sizes.tasks)
+    return experts(kind).calibration_tasks(setting, sizes.tasks)
 
 
 def _expert(kind: str, config: SACConfig, report: Report) -> Make:
     """The function that makes the tasks' experts, each for the rows of its task; trains those that are not in the cache."""
-    if kind == pick_place.KIND:
-        return disturbance.ScriptedWithGoal
-    variations = tuple(Variation(task) for task in domains.grid(kind, 2))
-    found = disturbance.trained(kind, variations, config, report)
-    if len(found) < len(variations):
-        raise ConfigError(f"sac.cache = {config.cache!r}: the trained experts are not there; set it to a writable folder")
-    return lambda env: ExpertPolicy([history for history in found for _ in range(env.batch // len(found))], config)
+    return experts(kind).calibration_policy(config, report)
 
 
 def _store(row: dict[str, Any]) -> None:

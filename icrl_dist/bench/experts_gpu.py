@@ -21,7 +21,7 @@ from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch, pick, train
 from icrl_dist.experts.sac.draws import EpisodeDraws
 from icrl_dist.interfaces import Batch
-from icrl_dist.problems import registry, splits
+from icrl_dist.problems import registry
 
 SIZES = ExpertSizes(160, SACConfig(replay=REPLAY), 60, 12)
 LEAST = 300.0
@@ -104,7 +104,8 @@ def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[
 def paper_env() -> tuple[Batch, SACConfig]:
     """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the settings of its SAC."""
     paper = load(PAPER)
-    rows = [row for index, task in enumerate(splits.split(paper).train) for row in splits.variations(paper, index, task)]
+    tasks = registry.of(paper).split.train
+    rows = [row for index, task in enumerate(tasks) for row in registry.training_variations(paper, index, task)]
     return registry.batch(rows), paper.sac
 
 

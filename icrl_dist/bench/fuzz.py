@@ -18,10 +18,13 @@ import numpy as np
 
 from icrl_dist.bench.mutations import mutate
 from icrl_dist.bench.stream import example
-from icrl_dist.config.run import ConfigError
+from icrl_dist.collect import kinds
+from icrl_dist.collect.adapt import Rollouts
+from icrl_dist.config.run import ConfigError, make_run
+from icrl_dist.problems import registry
 from icrl_dist.storage import segment
 from icrl_dist.stream import batching, validation, wire
-from icrl_dist.types import NULL, Job, Variation, Weights
+from icrl_dist.types import NULL, Job, Payload, Variation, Weights
 
 LIMIT = 1 << 20
 ALLOCATION = (16, 8 << 20)
@@ -62,8 +65,15 @@ def targets() -> dict[str, Target]:
         for arrays in ({"scale": np.array(2.0), "none": np.zeros((0, 3), np.int64)}, {"embed": trajectory.observations})
     )
     variations = (trajectory.variation, Variation(trajectory.variation.task, NULL))
-    job = Job("adapt", "adapt", 1, 2, variations, 4, 0, 2**40, (("beta", 1.0),))
-    large_job = dataclasses.replace(job, variations=variations * 200)
+    run = make_run()
+    problem = registry.of(run)
+    contexts, payload = problem.contexts(run).payload, Rollouts(400, "paper")
+    job = Job(payload.kind, "adapt", 1, 2, variations, 4, 0, 2**40, payload)
+    large_job = dataclasses.replace(job, kind=contexts.kind, payload=contexts, variations=variations * 200)
+
+    def read_payload(kind: str, data: Any) -> Payload:
+        return kinds.read_payload(kind, problem, data)
+
     message = wire.encode_message("hello", a=[1, {"b": None}], c=b"x", d=1.5, e="worker", f=-(2**40))
     steps, queries, taken = (len(array) for array in (trajectory.actions, trajectory.queries, trajectory.taken))
     shapes = {"actions": (steps, 4), "adversary": (steps, 2), "labels": (queries, 4), "taken": (taken, 4)}
@@ -80,7 +90,9 @@ def targets() -> dict[str, Target]:
             lambda data: wire.decode_trajectory(data, LIMIT), refusal, [encoded, wire.encode_trajectory(vectors)]
         ),
         "weights": Target(lambda data: wire.decode_weights(data, LIMIT), refusal, [small, large]),
-        "job": Target(lambda data: wire.decode_job(data, LIMIT), refusal, [wire.encode_job(job), wire.encode_job(large_job)]),
+        "job": Target(
+            lambda data: wire.decode_job(data, read_payload, LIMIT), refusal, [wire.encode_job(job), wire.encode_job(large_job)]
+        ),
         "message": Target(
             lambda data: wire.decode_message(data, LIMIT), refusal, [message, wire.encode_message("give", job=encoded)]
         ),

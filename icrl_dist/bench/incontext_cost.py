@@ -12,12 +12,13 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from icrl_dist.bench import peer
-from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, SPEC, DPTData
+from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, PROBLEM, pretraining_data, tensors
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import Policy
+from icrl_dist.methods.dpt_loss import batch_loss
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import registry
-from icrl_dist.problems.darkroom import room
+from icrl_dist.problems.benchmarks import PretrainingData
 from icrl_dist.rollout.deployment import InContextPolicy
 from icrl_dist.rollout.episode import episode
 from icrl_dist.rollout.policies import RandomPolicy
@@ -43,7 +44,9 @@ def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
     episode, as in the official code.
     """
     rng = np.random.default_rng(0)
-    env = registry.batch([Variation(room.task(goal), NULL) for goal in rng.integers(0, 10, size=(batch, 2)).tolist()])
+    part = registry.problem(PROBLEM).benchmarks
+    assert part is not None
+    env = registry.batch([Variation(row.task, NULL) for row in part.rows(rng, batch)])
     rngs = rng.spawn(batch)
     torch.manual_seed(0)
     ours = InContextPolicy(PretrainedTransformer(env.spec, MODEL).eval(), batch, ContextConfig(keep="last"))
@@ -67,11 +70,11 @@ def deployment(batch: int, pairs: int) -> dict[str, list[float]]:
 
 def training(rounds: int) -> dict[str, float]:
     """Labelled queries per CPU-second through forward, backward and optimizer; both sides alternate."""
-    data = DPTData(0)
+    data = pretraining_data(0)
     torch.manual_seed(0)
     step, labels = _our_step(data, "cpu", OPTIM.batch)
-    model = peer.Peer(SPEC)
-    optimizer, batch = peer.optimizer(model), data.draw(0, 0, peer.BATCH, 1).tensors()
+    model = peer.Peer(data.spec)
+    optimizer, batch = peer.optimizer(model), tensors(data.draw(0, 0, peer.BATCH, 1))
     ours, theirs = [], []
     for turn in range(rounds + 1):
         measured = _times(step, 8), _times(lambda: peer.train_step(model, optimizer, *batch), 5)
@@ -90,10 +93,10 @@ def by_length(repeats: int = 25) -> dict[str, Any]:
     ``length_exponent`` is the slope of log time against log length over all non-empty contexts,
     ``length_exponent_long`` over the longer half, which does not fit into the cache of every processor.
     """
-    data = DPTData(0)
+    data = pretraining_data(0)
     torch.manual_seed(0)
-    policy = InContextPolicy(PretrainedTransformer(SPEC, MODEL).eval(), ROWS, ContextConfig(max=max(LENGTHS)))
-    state = np.zeros((ROWS, SPEC.observation), np.float32)
+    policy = InContextPolicy(PretrainedTransformer(data.spec, MODEL).eval(), ROWS, ContextConfig(max=max(LENGTHS)))
+    state = np.zeros((ROWS, data.spec.observation), np.float32)
     microseconds: list[float] = []
     for number, length in enumerate(LENGTHS):
         while policy.length < length:
@@ -118,16 +121,16 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     is the rate of copying such a matrix, because a decision reads its context once per layer.  Both are
     measured here.
     """
-    draws = DPTData(0)
+    source = pretraining_data(0)
     torch.manual_seed(0)
-    step, labels = _our_step(draws, device, batch)
+    step, labels = _our_step(source, device, batch)
     step()
     with FlopCounterMode(display=False) as counter:
         step()
     label_s = statistics.median(_times(step, 9, device)) / labels
-    model = PretrainedTransformer(SPEC, MODEL).to(device).eval()
+    model = PretrainedTransformer(source.spec, MODEL).to(device).eval()
     policy = InContextPolicy(model, environments, ContextConfig())
-    data = draws.draw(0, 0, environments, 1).batch(np.zeros((environments, 1), np.int64))
+    data = source.draw(0, 0, environments, 1).batch(np.zeros((environments, 1), np.int64))
     policy.append(data.observations, data.actions, data.next_observations, data.rewards)
     state = data.queries[:, 0]
     policy.probabilities(state)
@@ -143,15 +146,15 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     }
 
 
-def _our_step(data: DPTData, device: str, batch: int) -> tuple[Callable[[], object], int]:
+def _our_step(data: PretrainingData, device: str, batch: int) -> tuple[Callable[[], object], int]:
     """A training step on one drawn batch, and its number of labelled queries."""
-    model = PretrainedTransformer(SPEC, MODEL).to(device).train()
+    model = PretrainedTransformer(data.spec, MODEL).to(device).train()
     optimizer = fit.Optimizer(model, OPTIM)
     contexts = data.draw(0, 0, batch, OPTIM.queries)
     examples = contexts.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=contexts.query.shape))
 
     def step() -> None:
-        loss = fit.batch_loss(model, examples)
+        loss = batch_loss(model, examples)
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), OPTIM.clip)
         optimizer.step(OPTIM.learning_rate)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from icrl_dist.models.dpt import Transitions
+from icrl_dist.rollout.policies import DiscretePolicy
 from icrl_dist.types import Spec
 
 LAYERS, HEADS, WIDTH = 4, 1, 32
@@ -87,7 +88,7 @@ def train_step(
     optimizer.step()
 
 
-class PeerPolicy:
+class PeerPolicy(DiscretePolicy):
     """Online deployment as in the official code: the context is the last episode."""
 
     def __init__(self, model: Peer) -> None:

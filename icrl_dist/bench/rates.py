@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +24,23 @@ import numpy as np
 import torch
 
 from icrl_dist.agent import ood_score
+from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.bench.samples import Sample, all_trials, random_trajectories
-from icrl_dist.collect import jobs
+from icrl_dist.collect import kinds
+from icrl_dist.collect.adapt import Rollouts
 from icrl_dist.config.run import Run
+from icrl_dist.config.sac import SACConfig
 from icrl_dist.diagnostics.estimate import PhaseRates, Rates
-from icrl_dist.experts.cache import sac_of
-from icrl_dist.methods.recipes import METHODS, Phase
-from icrl_dist.models.dpt import PretrainedTransformer
+from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.interfaces import Phase, Reference
+from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
-from icrl_dist.problems import registry, splits
+from icrl_dist.problems import registry
 from icrl_dist.results import evaluate
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.zenoh_link import ZenohLink
-from icrl_dist.training import batches, fit
+from icrl_dist.training import fit
 from icrl_dist.types import Job, Trajectory
 from learner.ingest import Ingest
 
@@ -59,9 +62,9 @@ def measure(run: Run, name: str, report: Report = lambda text: None, budget_s: f
 
 
 def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
-    method, spec = METHODS[run.method], splits.spec(run)
-    model = PretrainedTransformer(spec, run.model)
-    arrays = weights_of(model)
+    method, spec = methods.of(run), registry.of(run).spec
+    trained = TrainedModel(run, method, spec, method.build(spec, run))
+    arrays = weights_of(trained.model)
     weights = len(wire.encode_message("weights", **{key: value.tobytes() for key, value in arrays.items()}))
     device = torch.device("cuda" if run.learner.device != "cpu" and torch.cuda.is_available() else "cpu")
     samples: dict[str, tuple[float, list[Trajectory]]] = {}
@@ -72,14 +75,15 @@ def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
         if phase.stage not in samples:
             report(f"{phase.stage}: a job")
             torch.set_num_threads(1)
-            samples[phase.stage] = _job(run, jobs_of_phase[0], model, budget_s)
+            samples[phase.stage] = _job(trained, jobs_of_phase[0], budget_s)
             report(f"{phase.stage}: the ingest")
             torch.set_num_threads(1)
             ingest = min(ingest, _ingest(run, jobs_of_phase[0], samples[phase.stage][1]))
             report(f"{phase.stage}: steps of the fit")
             torch.set_num_threads(run.learner.threads or len(os.sched_getaffinity(0)))
-            fit_step = _fit(run, phase, model.to(device), Sample({s: t for s, (_, t) in samples.items()}), budget_s)
-            model.to("cpu")
+            trained.model.to(device)
+            fit_step = _fit(trained, phase, Sample({s: t for s, (_, t) in samples.items()}), budget_s)
+            trained.model.to("cpu")
         job_s, sample = samples[phase.stage]
         count = sum(job.trials * len(job.variations) for job in jobs_of_phase)
         # The time of the first job is used for all: fewer rows are not faster, because a decision is one call.
@@ -88,7 +92,7 @@ def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
                 name=f"{phase.stage}/{phase.round}",
                 jobs=len(jobs_of_phase),
                 trajectories=count,
-                env_steps=count * spec.horizon if jobs_of_phase[0].kind != "train_expert" else _expert_steps(jobs_of_phase),
+                env_steps=sum(_env_steps(job, spec.horizon) for job in jobs_of_phase),
                 labels=count * len(sample[0].labels),
                 job_s=job_s,
                 message_bytes=float(np.mean([len(wire.encode_trajectory(t)) for t in sample])),
@@ -98,7 +102,7 @@ def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
             )
         )
     report("the evaluation")
-    evaluation = 0.0 if run.method == "experts" else _evaluation(run, model, budget_s)
+    evaluation = _evaluation(trained, budget_s) if method.trains else 0.0
     report("a start")
     return Rates(
         run=name,
@@ -113,35 +117,37 @@ def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
     )
 
 
-def _expert_steps(expert_jobs: Sequence[Job]) -> int:
-    return sum(sac_of(job).steps * len(job.variations) for job in expert_jobs)
+def _env_steps(job: Job, horizon: int) -> int:
+    steps = job.payload.sac.steps if isinstance(job.payload, ExpertHistories) else job.trials * horizon
+    return steps * len(job.variations)
 
 
 class _RandomWeights:
     """A policy source with an untrained model: the cost of a decision does not depend on the weights."""
 
-    def __init__(self, model: PretrainedTransformer) -> None:
+    def __init__(self, model: torch.nn.Module) -> None:
         self._model = model
 
-    def at(self, version: int) -> tuple[PretrainedTransformer, str]:
+    def at(self, version: int) -> tuple[torch.nn.Module, str]:
         return self._model, "0" * 64
 
 
-def _job(run: Run, job: Job, model: PretrainedTransformer, budget_s: float) -> tuple[float, list[Trajectory]]:
+def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[Trajectory]]:
     """Seconds of the job, and trajectories like its own: all trials of some of its variations."""
-    if job.kind == "train_expert":
-        return _training(job, budget_s), random_trajectories(job)
+    if isinstance(job.payload, ExpertHistories):
+        return _training(job, job.payload.sac, budget_s), random_trajectories(job)
+    run, by_model = trained.run, isinstance(job.payload, Rollouts)
     rows, trajectories, times = len(job.variations), [], [time.perf_counter()]
-    work = jobs.do(job, _RandomWeights(model), "plan")
+    work = kinds.do(job, registry.of(run), trained.method, _RandomWeights(trained.model), "plan")
     while group := list(itertools.islice(work, rows)):
         trajectories += group
         times.append(time.perf_counter())
-        if job.kind == "adapt" and times[-1] - times[0] > budget_s and len(times) > 4:
+        if by_model and times[-1] - times[0] > budget_s and len(times) > 4:
             break
-    if job.kind != "adapt":  # its episodes run together, so the time is that of the whole job
+    if not by_model:  # its episodes run together, so the time is that of the whole job
         return times[-1] - times[0], trajectories
     spent = np.diff(times)
-    return _extrapolated(spent, job.trials, run.context.max // model.spec.horizon), all_trials(job, trajectories)
+    return _extrapolated(spent, job.trials, run.context.max // trained.spec.horizon), all_trials(job, trajectories)
 
 
 def _extrapolated(spent: np.ndarray, count: int, longest: int) -> float:
@@ -153,12 +159,12 @@ def _extrapolated(spent: np.ndarray, count: int, longest: int) -> float:
     return float(spent.sum() + later.sum())
 
 
-def _training(job: Job, budget_s: float) -> float:
+def _training(job: Job, config: SACConfig, budget_s: float) -> float:
     """Seconds of a job's SAC training, extrapolated from episodes with updates."""
     from icrl_dist.experts.sac.batched import train
     from icrl_dist.experts.train import trained_by
 
-    config, env = sac_of(job), registry.batch(job.variations)
+    env = registry.batch(job.variations)
     horizon = env.spec.horizon
     short = dataclasses.replace(config, random_steps=horizon, warmup=max(horizon, config.batch // len(job.variations) + 1))
     times: list[float] = []
@@ -177,16 +183,17 @@ class _BudgetSpent(Exception):  # noqa: N818
     """The time budget of this measurement is spent."""
 
 
-def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, budget_s: float) -> float:
+def _fit(trained: TrainedModel, phase: Phase, data: Sample, budget_s: float) -> float:
     """Seconds of an optimizer step with the drawing of its batch; 0 if the phase has no fit."""
     if not phase.steps:
         return 0.0
-    pools = METHODS[run.method].learn(run, dataclasses.replace(phase, round=0), data)
+    run, model = trained.run, trained.model
+    method = methods.of(run)  # a new one, because a method caches what it computed from the data of its run
+    draw = method.data(run, dataclasses.replace(phase, round=0), data)
     optim, times = run.optim, [0.0]
 
-    def batch(step: int) -> batches.Batch:
-        rng = np.random.default_rng(step)
-        return batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.windows)
+    def loss_of(step: int) -> torch.Tensor:
+        return method.loss(model, draw(np.random.default_rng(step)))
 
     def progress(step: int, loss: float) -> None:
         times.append(time.perf_counter())
@@ -194,13 +201,13 @@ def _fit(run: Run, phase: Phase, model: PretrainedTransformer, data: Sample, bud
             raise _BudgetSpent
 
     with contextlib.suppress(_BudgetSpent):
-        fit.fit(model, fit.Optimizer(model, optim), optim, 1e-6, 200, batch, progress)
+        fit.fit(model, fit.Optimizer(model, optim), optim, 1e-6, 200, loss_of, progress)
     return float(np.mean(np.diff(times[2:])))  # the mean, not the median: contexts differ in length between steps
 
 
 def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
     """Trajectories per second sent with credits over a link, checked, stored with fsync and acknowledged, in this process."""
-    spec, keys, numbers = splits.spec(run), Keys("plan"), itertools.count()
+    spec, keys, numbers = registry.of(run).spec, Keys("plan"), itertools.count()
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     few = sample[:_SAMPLE]
     with tempfile.TemporaryDirectory(dir=_run_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
@@ -244,40 +251,39 @@ def _stored(sample: Sequence[Trajectory]) -> float:
         return sum(file.stat().st_size for file in Path(folder).iterdir()) / len(few)
 
 
-def _evaluation(run: Run, model: PretrainedTransformer, budget_s: float) -> float:
+def _evaluation(trained: TrainedModel, budget_s: float) -> float:
     """Seconds of the end of ``train``: calibration of the OOD score on training tasks, returns on held-out tasks."""
-    times = [time.perf_counter()]
+    run, times = trained.run, [time.perf_counter()]
 
     def count(*_: object) -> None:
         times.append(time.perf_counter())
         if times[-1] - times[0] > budget_s:
             raise _BudgetSpent
 
-    with contextlib.suppress(_BudgetSpent):
-        ood_score.calibrate(run, model, count)
-    total = _extrapolated(np.diff(times), 2 * ood_score.EPISODES, 1 << 30)
-    others = list(_baselines(run))
-    for make, copies in [(evaluate.in_context(run, model), 1 + (len(METHODS[run.method].phases(run)) > 1)), *others]:
+    total = 0.0
+    if trained.method.shows_states:
+        with contextlib.suppress(_BudgetSpent):
+            ood_score.calibrate(trained, count)
+        total = _extrapolated(np.diff(times), 2 * ood_score.EPISODES, 1 << 30)
+    models = 1 + (len(trained.method.phases(run)) > 1)
+    for make, copies in [(Reference(evaluate.in_context(trained)), models), *_references(run)]:
         times[:] = [time.perf_counter()]
         small = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, p=run.evaluate.p[-1:]))
         with contextlib.suppress(_BudgetSpent):
             evaluate.online(small, {"one": make}, count)
-        spent = _extrapolated(np.diff(times), run.evaluate.episodes, run.context.max // model.spec.horizon)
+        spent = _extrapolated(np.diff(times), run.evaluate.episodes, run.context.max // trained.spec.horizon)
         total += copies * len(run.evaluate.p) * spent
     return total
 
 
-def _baselines(run: Run) -> Iterator[tuple[evaluate.MakePolicy, int]]:
-    """The baselines in the evaluation's table, and how many of them have about this cost."""
-    if run.problem == "darkroom":
-        from icrl_dist.problems.darkroom.exact_agents import RULES
-
-        yield evaluate.random, 1
-        yield evaluate.optimal(run), 1
-        for rule in RULES:
-            yield evaluate.exact(run, rule), 1
-    else:
-        yield evaluate.random_vectors, 2
+def _references(run: Run) -> list[tuple[Reference, int]]:
+    """The references in the evaluation's table, and how many of them have about this cost."""
+    problem = registry.of(run)
+    references = [(reference, 1) for reference in problem.references(run).values()]
+    if references and problem.missing_reference(run, run.problem):
+        # The missing one may exist after the training; it costs about as much as the first, a random policy.
+        references[0] = references[0][0], 2
+    return references
 
 
 def _start() -> float:

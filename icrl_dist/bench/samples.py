@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icrl_dist.methods.recipes import Key
+from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.interfaces import VariationKey
 from icrl_dist.problems import registry
-from icrl_dist.results import evaluate
 from icrl_dist.rollout.episode import episode
+from icrl_dist.rollout.policies import RandomVectorPolicy
 from icrl_dist.types import Job, Trajectory
 
 
@@ -28,13 +29,16 @@ def all_trials(job: Job, trajectories: Sequence[Trajectory]) -> list[Trajectory]
 
 
 def random_trajectories(job: Job) -> list[Trajectory]:
-    """Trajectories with the job's shapes, and random actions and labels: costs do not depend on the content."""
+    """Trajectories with the shapes of a job of experts, and random actions and labels: costs do not depend on the content."""
+    payload = job.payload
+    assert isinstance(payload, ExpertHistories)
     rng, trajectories = np.random.default_rng(0), []
     rows = job.rows()[: max(2, job.tasks)]
     chosen = list(job.variations[: len(rows)])
-    ran = episode(registry.batch(chosen), evaluate.random_vectors(chosen), [np.random.default_rng(r) for r in range(len(rows))])
-    queries, windows, length = (int(str(job.setting(name))) for name in ("queries", "windows", "window"))
-    count, actions = queries + windows * length, ran.actions.shape[-1]
+    ran = episode(registry.batch(chosen), RandomVectorPolicy(), [np.random.default_rng(r) for r in range(len(rows))])
+    of = payload.labelling
+    labelled = of.windows * of.window
+    count, actions = of.queries + labelled, ran.actions.shape[-1]
     for row, (task, variation) in enumerate(rows):
         for trial in range(job.trials):
             trajectories.append(
@@ -50,8 +54,8 @@ def random_trajectories(job: Job) -> list[Trajectory]:
                     adversary=ran.adversary[row],
                     queries=ran.observations[row][rng.integers(0, len(ran.actions[row]), count)],
                     labels=rng.uniform(-1, 1, (count, actions)).astype(np.float32),
-                    taken=np.zeros((windows * length, actions), np.float32),
-                    gained=np.zeros(windows * length, np.float32),
+                    taken=np.zeros((labelled, actions), np.float32),
+                    gained=np.zeros(labelled, np.float32),
                     origin="expert",
                 )
             )
@@ -62,14 +66,14 @@ class Sample:
     """Trajectories of timed jobs in the form of a method's dataset."""
 
     def __init__(self, stages: dict[str, list[Trajectory]]) -> None:
-        self._trials: dict[Key, list[Trajectory]] = {}
+        self._trials: dict[VariationKey, list[Trajectory]] = {}
         for stage, trajectories in stages.items():
             for trajectory in trajectories:
                 key = (stage, 0, trajectory.identity.task, trajectory.identity.variation)
                 self._trials.setdefault(key, []).append(trajectory)
 
-    def variations(self, stage: str, round: int) -> Sequence[Key]:
+    def variations(self, stage: str, round: int) -> Sequence[VariationKey]:
         return [key for key in self._trials if key[0] == stage and round == 0]
 
-    def trials(self, key: Key) -> list[Trajectory]:
+    def trials(self, key: VariationKey) -> list[Trajectory]:
         return self._trials[key]

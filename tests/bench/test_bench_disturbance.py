@@ -9,16 +9,19 @@ import pytest
 import torch
 
 from icrl_dist.bench import disturbance
-from icrl_dist.bench.disturbance import DisturbanceSizes, ScriptedWithGoal, Setting
+from icrl_dist.bench.disturbance import DisturbanceSizes
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac import batched
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import network_adversary
+from icrl_dist.problems.continuous.disturbance import Setting
 from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.dmc import domains, simulation
+from icrl_dist.problems.dmc.bench import LONGER
 from icrl_dist.problems.metaworld import environment, pick_place
+from icrl_dist.problems.metaworld.bench import ScriptedWithGoal
 from icrl_dist.types import NULL, Variation
 
 KIND = "dmc-cartpole-balance"
@@ -181,7 +184,7 @@ def test_both_presets_are_measured_if_they_differ(kind):
             [Variation(setting.task, network_adversary.network(0, registry.spec(setting.task).observation, setting.outputs))]
         )
         assert env.batch == 1
-    assert disturbance.sac_config(kind).steps == disturbance.LONGER.get(kind, 12_000)
+    assert disturbance.sac_config(kind).steps == LONGER.get(kind, 12_000)
     assert disturbance.sac_config(kind, 500).steps == 500 and disturbance.sac_config(kind).hidden == (64, 64)
 
 
@@ -190,4 +193,4 @@ def test_invalid_arguments_are_refused_with_the_nearest_name(capsys):
     assert "did you mean 'dmc-walker-run'" in capsys.readouterr().err
     assert main.main(["bench", "disturbance", "--problem", "darkroom"]) == 2
     assert main.main(["bench", "disturbance", "--seconds", "3"]) == 2
-    assert "it takes as long as it takes" in capsys.readouterr().err
+    assert "this benchmark has a fixed size" in capsys.readouterr().err

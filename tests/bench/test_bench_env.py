@@ -8,6 +8,7 @@ import pytest
 
 from icrl_dist.bench import env
 from icrl_dist.config.run import ConfigError
+from icrl_dist.problems.darkroom.problem import DarkRoomProblem
 
 
 def test_it_reports_rates() -> None:
@@ -53,3 +54,9 @@ def test_a_simulated_problem_is_compared_with_its_library_and_with_mj_step(probl
 def test_invalid_arguments_are_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         env.run(**wrong)
+
+
+def test_a_problem_without_benchmarks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DarkRoomProblem, "benchmarks", None)
+    with pytest.raises(ConfigError, match=r"problem = 'darkroom'.*choose one of dmc-cartpole-balance"):
+        env.run("darkroom")

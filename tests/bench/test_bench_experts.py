@@ -11,7 +11,7 @@ from icrl_dist.bench.experts import ExpertSizes
 from icrl_dist.cli import main
 from icrl_dist.config import run
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.problems import splits
+from icrl_dist.problems import registry
 from icrl_dist.types import Spec, Step
 
 TINY = ExpertSizes(2, SACConfig(hidden=(8, 8), batch=4, replay=50), 3, 2)
@@ -80,7 +80,7 @@ def test_bfloat16_instructions_are_read_from_cpuinfo(tmp_path):
 
 def test_seconds_are_refused(capsys):
     assert main.main(["bench", "experts", "--seconds", "3"]) == 2
-    assert "it takes as long as it takes" in capsys.readouterr().err
+    assert "this benchmark has a fixed size" in capsys.readouterr().err
 
 
 class Still:
@@ -168,7 +168,7 @@ def test_a_ratio_below_the_bound_on_a_gpu_fails(monkeypatch):
 def test_the_expert_set_is_that_of_the_paper():
     assert experts_gpu.SIZES.experts == 160 and experts_gpu.SIZES.config.hidden == (256, 256, 256)
     paper = run.load(experts_gpu.PAPER)
-    assert len(splits.split(paper).train) * paper.adversary.count == 160
+    assert len(registry.of(paper).split.train) * paper.adversary.count == 160
     assert (paper.sac.steps, paper.sac.update_every, paper.sac.warmup, paper.sac.hidden) == (200_000, 3, 5_000, (256,) * 3)
 
 

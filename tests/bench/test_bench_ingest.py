@@ -1,4 +1,4 @@
-"""The ingest benchmark: it counts trajectories of the real inbox and store, and refuses invalid arguments."""
+"""The ingest benchmark: it counts trajectories of the real ingest and store, and refuses invalid arguments."""
 
 from __future__ import annotations
 

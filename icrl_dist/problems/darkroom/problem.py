@@ -36,6 +36,7 @@ from icrl_dist.types import Adversary, Job, Spec, Split, Task, Variation
 
 if TYPE_CHECKING:
     from icrl_dist.config.run import Run
+    from icrl_dist.problems.benchmarks import Benchmarks
 
 ORACLE = "oracle"
 
@@ -217,3 +218,9 @@ class DarkRoomProblem(Problem):
         from icrl_dist.problems.darkroom.game import PlayGame
 
         return PlayGame
+
+    @property
+    def benchmarks(self) -> Benchmarks:
+        from icrl_dist.problems.darkroom import bench
+
+        return bench.benchmarks()

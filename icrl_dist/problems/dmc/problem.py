@@ -17,6 +17,7 @@ from icrl_dist.types import Spec, Split, Task, Variation
 
 if TYPE_CHECKING:
     from icrl_dist.config.run import Run
+    from icrl_dist.problems.benchmarks import Benchmarks
 
 _TASKS = domains.GRID**2
 
@@ -81,6 +82,12 @@ class DMCProblem(ContinuousProblem):
     @property
     def drawing(self) -> MakeDrawing:
         return functools.partial(_sticks, self.name)
+
+    @property
+    def benchmarks(self) -> Benchmarks:
+        from icrl_dist.problems.dmc import bench
+
+        return bench.benchmarks(self)
 
 
 def _sticks(name: str, states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from icrl_dist.types import Job, Spec, Split, Task, Trajectory, Variation
 
 if TYPE_CHECKING:
     from icrl_dist.config.run import Run
+    from icrl_dist.problems.benchmarks import Benchmarks
 
 _TASKS = 50
 """Training tasks that ML1 has."""
@@ -102,6 +103,12 @@ class MetaWorldProblem(ContinuousProblem):
     @property
     def drawing(self) -> MakeDrawing:
         return _paths
+
+    @property
+    def benchmarks(self) -> Benchmarks:
+        from icrl_dist.problems.metaworld import bench
+
+        return bench.benchmarks()
 
 
 def _paths(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
