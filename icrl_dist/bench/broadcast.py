@@ -49,7 +49,7 @@ def receive(endpoint: str) -> None:
     with ZenohLink.connect(endpoint, 30.0) as link:
 
         def subscribe(size: str) -> None:
-            loaded, keys = model(size), Keys(f"bench-{size}")
+            loaded, keys = model(size), StreamKeys(f"bench-{size}")
 
             def load(_: str, payload: bytes) -> None:
                 weights = wire.decode_weights(payload, LIMIT)
@@ -59,7 +59,7 @@ def receive(endpoint: str) -> None:
             link.subscribe(keys.weights, load)
             report(keys, f"-1 {time.monotonic()}")
 
-        def report(keys: Keys, text: str) -> None:
+        def report(keys: StreamKeys, text: str) -> None:
             link.send(keys.work, text.encode(), 60.0, lambda outcome: stop.put(None) if outcome == b"stop" else None)
 
         for size in WIDTHS:
@@ -110,7 +110,7 @@ class _OurBroadcast:
     def __init__(self, link: ZenohLink, workers: list[subprocess.Popen[bytes]]) -> None:
         self._workers = workers
         self._reports: queue.SimpleQueue[Query] = queue.SimpleQueue()
-        self._broadcasts = {size: Broadcast(link, Keys(f"bench-{size}"), _no_older_version) for size in WIDTHS}
+        self._broadcasts = {size: Broadcast(link, StreamKeys(f"bench-{size}"), _no_older_version) for size in WIDTHS}
         for size in WIDTHS:
             link.serve(StreamKeys(f"bench-{size}").work, self._reports.put)
         for _ in WIDTHS:

@@ -27,6 +27,7 @@ import psutil
 
 from icrl_dist.bench.training import need_alive, training
 from icrl_dist.stream import wire
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
@@ -123,7 +124,7 @@ class _CpuMeter:
         self._reports = 0
         self._latest = (0.0, 0)
         self._processes: list[psutil.Process] = []
-        link.subscribe(Keys(name).monitor("learner"), self._on_report)
+        link.subscribe(StreamKeys(name).monitor("learner"), self._on_report)
 
     def _on_report(self, key: str, payload: bytes) -> None:
         _, fields = wire.decode_message(payload)

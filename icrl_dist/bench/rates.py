@@ -37,8 +37,10 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.results import evaluate
+from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.training import fit
 from icrl_dist.types import Job, Trajectory
@@ -207,10 +209,10 @@ def _fit(trained: TrainedModel, phase: Phase, data: Sample, budget_s: float) -> 
 
 def _ingest(run: Run, job: Job, sample: Sequence[Trajectory]) -> float:
     """Trajectories per second sent with credits over a link, checked, stored with fsync and acknowledged, in this process."""
-    spec, keys, numbers = registry.of(run).spec, Keys("plan"), itertools.count()
+    spec, keys, numbers = registry.of(run).spec, StreamKeys("plan"), itertools.count()
     failures: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
     few = sample[:_SAMPLE]
-    with tempfile.TemporaryDirectory(dir=_run_disk()) as folder, contextlib.closing(Store(Path(folder))) as store:
+    with tempfile.TemporaryDirectory(dir=_run_disk()) as folder, contextlib.closing(Dataset(Path(folder))) as store:
         ingest = Ingest(
             store,
             spec,
@@ -246,7 +248,7 @@ def _run_disk() -> Path:
 
 def _stored(sample: Sequence[Trajectory]) -> float:
     few = sample[:_SAMPLE]
-    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Store(Path(folder), durable=False)) as store:
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Dataset(Path(folder), durable=False)) as store:
         store.append(list(few))
         return sum(file.stat().st_size for file in Path(folder).iterdir()) / len(few)
 

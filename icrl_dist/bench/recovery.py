@@ -25,7 +25,7 @@ from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config.run import ConfigError
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import monitor_messages, wire
-from icrl_dist.stream.link import Refused, Unanswered
+from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.processes import is_learner, is_worker
 from icrl_dist.types import Identity
@@ -87,7 +87,7 @@ class _RunEvents:
         self._stored = 0
         self._sent: list[tuple[float, str, Identity]] = []
         self._freed: list[tuple[str, str]] = []
-        link.subscribe(Keys(name).monitor_all, self._on_message)
+        link.subscribe(StreamKeys(name).monitor_all, self._on_message)
         threading.Thread(target=self._read_output, daemon=True).start()
 
     def _on_message(self, key: str, payload: bytes) -> None:
@@ -162,7 +162,7 @@ def _kill_the_learner(process: subprocess.Popen[str], link: ZenohLink, out: Path
     while time.monotonic() < began + 120:
         need_alive(process)
         try:
-            link.request(Keys(out.name).work, hello, timeout_s=0.5)
+            link.request(StreamKeys(out.name).work, hello, timeout_s=0.5)
         except Refused:  # an answer: the message is unknown to the learner
             break
         except Unanswered:

@@ -19,6 +19,7 @@ from actors.publisher import PERIOD_S
 from icrl_dist.monitor.feed import PERIOD_S as SNAPSHOT_S
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.stream import monitor_messages, wire
+from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 
@@ -52,7 +53,7 @@ def view(endpoint: str) -> None:
 
 def crowd(streams: int, per_s: float) -> None:
     """Publish until standard input is closed."""
-    keys = Keys("crowd")
+    keys = StreamKeys("crowd")
     with ZenohLink.listen("tcp/127.0.0.1:0") as link:
         print(link.endpoints[0], flush=True)
         ended = threading.Event()

@@ -68,7 +68,7 @@ def test_damage_during_a_run_is_found_before_training_uses_it(parent, tmp_path):
     folder, run = tmp_path / "run", override(parent[2], ["learner.cache_mb=0"], "--set")  # every example is read when drawn
     damage, happened = damaging(folder)
     result = run_inline(run, folder, damage)
-    assert len(happened) == 2 and "segment-000000.frames: took out a damaged range" in happened[1]
+    assert len(happened) == 2 and "segment-000000.frames: removed a damaged range" in happened[1]
     assert same(result, parent[1])
 
 
@@ -77,7 +77,7 @@ def test_damage_of_data_in_memory_changes_no_result_and_is_found_when_the_run_is
     damage, happened = damaging(folder)
     assert same(run_inline(parent[2], folder, damage), parent[1]) and len(happened) == 1
     assert same(run_inline(parent[2], folder, damage, resume=True), parent[1])
-    assert len(happened) == 2 and "segment-000000.frames: took out a damaged range" in happened[1]
+    assert len(happened) == 2 and "segment-000000.frames: removed a damaged range" in happened[1]
 
 
 def test_a_folder_has_at_most_one_learner(parent, monkeypatch):

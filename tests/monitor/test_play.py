@@ -71,7 +71,7 @@ def test_the_game_is_paused_without_viewers(small_run):
         (["here", "--pretrained", "darkroom"], "play: name a run folder"),
         (["--pretrained", "lightroom"], "no agent of that name is shipped; there are darkroom"),
         (["nowhere"], "nowhere: no such run folder or checkpoint"),
-        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port is 0 (any free one) to 65535"),
+        (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port must be 0 (any free port) to 65535"),
         (["--pretrained", "darkroom", "--host", "nowhere.invalid"], "name an address of this machine"),
     ],
 )
@@ -87,6 +87,6 @@ def test_a_problem_without_a_game_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(player, "load_agent", lambda *_: agent)
     assert main(["play", "runs/cheetah"]) == 2
     assert (
-        "play runs/cheetah: its agent was trained in dmc-cheetah-run, which cannot be played; use an agent of darkroom"
+        "play runs/cheetah: its agent is for dmc-cheetah-run, which cannot be played; use an agent of darkroom"
         in capsys.readouterr().err
     )
