@@ -1,4 +1,4 @@
-"""The override adversary's law against draws, and its priors."""
+"""The distribution of the override adversary against draws, and its priors."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_argmax_distribution_of_very_small_alphas() -> None:
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.3, 1.0, 2.0, 20.0])
-def test_equal_alphas_give_a_uniform_law(alpha: float) -> None:
+def test_equal_alphas_give_a_uniform_distribution(alpha: float) -> None:
     np.testing.assert_allclose(argmax_distribution((alpha,) * 5), 0.2, atol=1e-9)
 
 
@@ -55,7 +55,7 @@ def test_two_actions_have_a_closed_form(alpha: tuple[float, float]) -> None:
     np.testing.assert_allclose(argmax_distribution(alpha), [first, 1 - first], atol=1e-9)
 
 
-def test_the_law_follows_a_permutation_of_alpha() -> None:
+def test_the_distribution_follows_a_permutation_of_alpha() -> None:
     alpha = np.array(ALPHAS[4])
     order = np.array([3, 0, 4, 1, 2])
     np.testing.assert_allclose(argmax_distribution(tuple(alpha[order])), argmax_distribution(tuple(alpha))[order], atol=1e-12)

@@ -1,4 +1,4 @@
-"""The behavior policies of pretraining's contexts, against what their words say."""
+"""The behavior policies of pretraining contexts, against their descriptions."""
 
 import numpy as np
 import pytest
@@ -24,13 +24,13 @@ def visited(ran, row, upto=None):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_towards_goes_nearer_and_stays_there(seed):
+def test_towards_moves_closer_and_stays_at_the_target(seed):
     rng = np.random.default_rng(seed)
     here, target = rng.integers(0, SIZE, (2, 50, 2)).astype(float)
     target[:5] = here[:5]
-    for at, to, chance in zip(here, target, towards(here, target), strict=True):
-        assert chance.sum() == pytest.approx(1)
-        for move, p in zip(MOVES, chance, strict=True):
+    for at, to, probabilities in zip(here, target, towards(here, target), strict=True):
+        assert probabilities.sum() == pytest.approx(1)
+        for move, p in zip(MOVES, probabilities, strict=True):
             gain = np.abs(to - at).sum() - np.abs(to - at - move).sum()
             if (to == at).all():
                 assert p == (not move.any())
@@ -39,7 +39,7 @@ def test_towards_goes_nearer_and_stays_there(seed):
                 assert p == 0 or p == pytest.approx(abs((to - at) @ np.abs(move)) / np.abs(to - at).sum())
 
 
-def test_persistent_walks_mostly_go_on_as_before():
+def test_persistent_walks_mostly_repeat_their_action():
     again = (np.diff(walk("persistent", 200).actions, axis=1) == 0).mean()
     expected = np.mean(KEEP) + (1 - np.mean(KEEP)) / 5
     assert abs(again - expected) < 0.02
@@ -53,14 +53,14 @@ def test_a_sweep_enters_new_cells_until_none_is_left():
     assert np.mean([len(visited(walk("random"), row)) for row in range(40)]) < 0.6 * SIZE**2
 
 
-def test_walks_to_goals_rest_where_they_arrive():
+def test_walks_to_goals_stay_for_a_while_where_they_arrive():
     ran = walk("goals")
     stay = (ran.actions == len(MOVES) - 1).mean()
     assert 0.1 < stay < 0.4
-    assert len({tuple(ran.observations[row, -1]) for row in range(40)}) > 15, "each row has targets of its own"
+    assert len({tuple(ran.observations[row, -1]) for row in range(40)}) > 15, "rows share their targets"
 
 
-def test_rows_do_not_depend_on_their_neighbours_and_chance_is_the_rows_own():
+def test_rows_are_independent_and_have_their_own_draws():
     kinds = ["sweep", "goals", "persistent", "random"] * 2
     task = Variation(room.task((2, 2), SIZE, HORIZON))
     together = [np.random.default_rng([7, row]) for row in range(8)]

@@ -27,7 +27,7 @@ from icrl_dist.results import evaluate
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import NULL, Adversary, Variation
 from tests.problems.darkroom.test_exact_agents import Transition, likelihood
-from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, HORIZON, SIZE, Room, every_cell, normalised, slow_q
+from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, HORIZON, SIZE, Room, every_cell, normalized, slow_q
 
 GAMMA, SLACK = 0.99, 0.1
 OTHERS = (NULL, Adversary.of("dirichlet", p=0.2, alpha=ALPHA[::-1]))
@@ -60,7 +60,7 @@ def slow_labels(variations: list[Variation]) -> list[list[list[float]]]:
     for variation in variations:
         memo: dict[tuple[tuple[int, int], int], list[float]] = {}
         values = [slow_q(variation, cell, HORIZON, GAMMA, memo) for cell in every_cell()]
-        found.append([normalised([float(q >= max(row) - SLACK) for q in row]) for row in values])
+        found.append([normalized([float(q >= max(row) - SLACK) for q in row]) for row in values])
     return found
 
 
@@ -97,7 +97,7 @@ def test_exact_decisions_equal_enumeration(room: Room, prior: object) -> None:
     for b in range(3):
         steps = history(context, b)
         for t in range(2 * HORIZON + 1):
-            belief = normalised([math.prod(likelihood(v, one) for one in steps[:t]) for v in variations])
+            belief = normalized([math.prod(likelihood(v, one) for one in steps[:t]) for v in variations])
             slow = [sum(w * labels[m][query[b, t]][a] for m, w in enumerate(belief)) for a in range(ACTIONS)]
             np.testing.assert_allclose(decided[b, t], slow, atol=1e-6)
     assert np.abs(decided[:, 0] - decided[:, -1]).max() > 0.2, "the contexts changed nothing"

@@ -1,4 +1,4 @@
-"""The exact agents against the law of an agent that really draws its hypotheses, by summing over all draws."""
+"""The exact agents against the distribution of an agent that draws its hypotheses, by summing over all draws."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl_dist.problems.darkroom.exact_agents import RULES, WINDOW, ExactAgent, 
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.problems.darkroom.solver import Hypotheses
 from icrl_dist.types import NULL, Adversary, Task, Variation
-from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, normalised, outcomes
+from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, normalized, outcomes
 
 SIZE, HORIZON, EPISODES = 3, WINDOW + 2, 3
 OTHERS = (Adversary.of("uniform", p=0.5), Adversary.of("dirichlet", p=0.2, alpha=ALPHA[::-1]))
@@ -37,22 +37,22 @@ def labels_of(family: Family) -> np.ndarray:
 
 def likelihood(variation: Variation, one: Transition) -> float:
     cell, action, reward, arrived = one
-    chance = sum(p for p, there in outcomes(variation, cell, action) if there == arrived)
-    return chance * (reward == (1.0 if arrived == variation.task["goal"] else 0.0))
+    probability = sum(p for p, there in outcomes(variation, cell, action) if there == arrived)
+    return probability * (reward == (1.0 if arrived == variation.task["goal"] else 0.0))
 
 
-def slow_law(rule: Rule, family: Family, labels: np.ndarray, history: list[Transition], query: int) -> np.ndarray:
-    """Law of the action in cell ``query`` after ``history``: all hypotheses the agent may have drawn, one after another."""
+def slow_distribution(rule: Rule, family: Family, labels: np.ndarray, history: list[Transition], query: int) -> np.ndarray:
+    """Distribution of the action in cell ``query`` after ``history``, by enumeration of all draws of hypotheses."""
 
     @functools.cache
     def posterior(t: int) -> list[float]:
-        return normalised([math.prod(likelihood(v, one) for one in history[:t]) for v in family])
+        return normalized([math.prod(likelihood(v, one) for one in history[:t]) for v in family])
 
     def draws(t: int) -> list[float]:
         return posterior(t - t % HORIZON if rule == "paper" else t)
 
-    def lets_go(t: int, m: int) -> bool:
-        """Whether the hypothesis that acted at step t is drawn anew for the next."""
+    def drops(t: int, m: int) -> bool:
+        """Whether the hypothesis that acted at step t is drawn again for the next step."""
         if rule == "committed":
             return likelihood(family[m], history[t]) == 0.0
         if rule == "windows":
@@ -65,12 +65,12 @@ def slow_law(rule: Rule, family: Family, labels: np.ndarray, history: list[Trans
         if t == len(history):
             return labels[m, query].astype(float)
         (x, y), action, _, _ = history[t]
-        chance = float(labels[m, x * SIZE + y, action])
-        if chance == 0.0:
+        probability = float(labels[m, x * SIZE + y, action])
+        if probability == 0.0:
             return np.zeros(ACTIONS)
-        if not lets_go(t, m):
-            return chance * from_here(t + 1, m)
-        return chance * sum(w * from_here(t + 1, other) for other, w in enumerate(draws(t + 1)))
+        if not drops(t, m):
+            return probability * from_here(t + 1, m)
+        return probability * sum(w * from_here(t + 1, other) for other, w in enumerate(draws(t + 1)))
 
     if rule == "zeta":
         return given_zeta(posterior(len(history)), labels, history, query)
@@ -79,23 +79,23 @@ def slow_law(rule: Rule, family: Family, labels: np.ndarray, history: list[Trans
 
 
 def given_zeta(weight: list[float], labels: np.ndarray, history: list[Transition], query: int) -> np.ndarray:
-    """The law given that as many as possible of the episode's last steps were right, at most ``exact.ZETA``."""
-    lived = history[len(history) - len(history) % HORIZON :][-exact_agents.ZETA :]
-    for first in range(len(lived) + 1):
+    """The distribution given that as many as possible of the episode's last steps were optimal, up to ``exact_agents.ZETA``."""
+    recent = history[len(history) - len(history) % HORIZON :][-exact_agents.ZETA :]
+    for first in range(len(recent) + 1):
         agreed = [
-            w * math.prod(float(labels[m, x * SIZE + y, action]) for (x, y), action, _, _ in lived[first:])
+            w * math.prod(float(labels[m, x * SIZE + y, action]) for (x, y), action, _, _ in recent[first:])
             for m, w in enumerate(weight)
         ]
         if sum(agreed) > 0:
-            return np.array(normalised(agreed)) @ labels[:, query].astype(float)
+            return np.array(normalized(agreed)) @ labels[:, query].astype(float)
     raise AssertionError
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_the_law_of_every_rule_is_that_of_drawn_hypotheses(
+def test_the_distribution_of_every_rule_is_that_of_drawn_hypotheses(
     families: tuple[Family, Family], rule: Rule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rows with unlike adversaries, all steps of three episodes; the goal is met, guesses are refuted."""
+    """Rows with different adversaries, all steps of three episodes; the goal is reached, hypotheses are refuted."""
     monkeypatch.setattr(exact_agents, "ZETA", 4)
     truths = [families[0][11], families[1][6], families[0][4]]
     family = np.array([0, 1, 0])
@@ -107,20 +107,20 @@ def test_the_law_of_every_rule_is_that_of_drawn_hypotheses(
     for _ in range(EPISODES):
         observation = env.reset(rngs)
         for _ in range(HORIZON):
-            law = agent.probabilities(observation)
+            found = agent.probabilities(observation)
             for row, history in enumerate(histories):
                 x, y = (int(c) for c in observation[row])
-                slow = slow_law(rule, families[family[row]], labels[family[row]], history, x * SIZE + y)
-                np.testing.assert_allclose(law[row], slow, atol=1e-9)
-                moved = max(moved, float(np.abs(law[row] - labels[family[row]][:, x * SIZE + y].mean(axis=0)).max()))
-            action = sample(law, np.array([rng.random() for rng in rngs]))
+                slow = slow_distribution(rule, families[family[row]], labels[family[row]], history, x * SIZE + y)
+                np.testing.assert_allclose(found[row], slow, atol=1e-9)
+                moved = max(moved, float(np.abs(found[row] - labels[family[row]][:, x * SIZE + y].mean(axis=0)).max()))
+            action = sample(found, np.array([rng.random() for rng in rngs]))
             step = env.step(action)
             agent.observe(observation, action, step.reward, step.observation, step.done)
             for row, history in enumerate(histories):
                 here, there = (tuple(int(c) for c in o[row]) for o in (observation, step.observation))
                 history.append((here, int(action[row]), float(step.reward[row]), there))
             observation = step.observation
-    assert moved > 0.3, "nothing was learned: the test would pass for an agent that ignores what it sees"
+    assert moved > 0.3, "the distribution hardly changed, so the test would pass for an agent that ignores its observations"
     assert any(one[2] == 1.0 for history in histories for one in history)
 
 
@@ -132,11 +132,11 @@ def test_the_rules_differ(families: tuple[Family, Family]) -> None:
         for agent in agents.values():
             agent.observe(origin, np.array([0]), np.zeros(1, np.float32), origin, False)
     query = np.array([[1.0, 1.0]], np.float32)
-    laws = [agent.probabilities(query)[0].round(9).tolist() for agent in agents.values()]
-    assert len({tuple(law) for law in laws}) == len(RULES), laws
+    found = [agent.probabilities(query)[0].round(9).tolist() for agent in agents.values()]
+    assert len({tuple(one) for one in found}) == len(RULES), found
 
 
-def test_given_data_count_at_once_and_a_kept_hypothesis_is_let_go(families: tuple[Family, Family]) -> None:
+def test_given_data_count_at_once_and_a_kept_hypothesis_is_dropped(families: tuple[Family, Family]) -> None:
     h, labels = Hypotheses.of(families[0]), labels_of(families[0])
     env, rng = DarkRoom([families[0][7]]), np.random.default_rng(1)
     states, actions, rewards = [env.reset([rng])], [], []
@@ -147,7 +147,7 @@ def test_given_data_count_at_once_and_a_kept_hypothesis_is_let_go(families: tupl
         rewards.append(step.reward)
     places = [(int(s[0, 0]), int(s[0, 1])) for s in states]
     history = list(zip(places, (int(a[0]) for a in actions), (float(r[0]) for r in rewards), places[1:], strict=False))
-    belief = normalised([math.prod(likelihood(v, one) for one in history) for v in families[0]])
+    belief = normalized([math.prod(likelihood(v, one) for one in history) for v in families[0]])
     given = [np.stack(column, axis=1) for column in (states[:-1], actions, states[1:], rewards)]
     query = np.array([[0.0, 2.0]], np.float32)
     for rule in RULES:
@@ -170,8 +170,8 @@ def test_an_agent_that_keeps_a_hypothesis_refuses_actions_that_none_would_take(r
             agent.observe(*away)
 
 
-def test_optimal_agent_earns_what_optimal_returns_promises() -> None:
-    """Theory against the simulator: p, q, walls, horizon and start must agree in both."""
+def test_the_optimal_agent_reaches_the_optimal_return() -> None:
+    """Solver against simulation: p, q, walls, horizon and start must agree in both."""
     rows, horizon = 2000, 15
     adversaries = (NULL, Adversary.of("uniform", p=0.5), Adversary.of("dirichlet", p=0.4, alpha=ALPHA))
     kinds = [

@@ -1,4 +1,4 @@
-"""Dark Room against one slow environment of python ints, and its adversary's frequencies."""
+"""Dark Room against a slow environment of Python ints, and the frequencies of its adversary."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rngs(seeds: Sequence[int]) -> list[np.random.Generator]:
 
 
 def slow_step(cell: tuple[int, int], executed: int, size: int) -> tuple[int, int]:
-    """The room once more, for one environment, as the appendix says it."""
+    """A second implementation of the room for one environment, by the appendix."""
     x, y = cell
     if executed == 0 and x < size - 1:
         return x + 1, y
@@ -60,14 +60,14 @@ def test_every_step_equals_the_slow_loop(room: Room, size: int, adversary: Adver
             visited.add(cell)
             used.add(executed)
             rewarded += cell == task["goal"]
-    assert len(visited) == size * size, "some cell was never reached: the comparison proves too little"
+    assert len(visited) == size * size, "a cell was never reached, so the comparison proves too little"
     assert used == set(range(ACTIONS))
     assert rewarded > 0
 
 
 def test_adversary_takes_over_with_p_and_draws_from_q() -> None:
-    """P(executed = b | a) = (1 - p) [a = b] + p q_b, seen in where the agent really goes."""
-    # So large a room that 100 steps from its middle never meet a wall: every move shows.
+    """P(executed = b | a) = (1 - p) [a = b] + p q_b, measured by the agent's moves."""
+    # The room is so large that 100 steps from its center never reach a wall, so every move is visible.
     size, horizon, rows, p = 203, 100, 60, 0.3
     variation = Variation(darkroom.task((0, 0), size, horizon, start=(101, 101)), MEDDLER)
     direction = {move: b for b, move in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1), (0, 0)])}
@@ -91,7 +91,7 @@ def test_adversary_takes_over_with_p_and_draws_from_q() -> None:
 
 
 @pytest.mark.parametrize(("p", "share"), [(0.0, 0.0), (1.0, 1.0)])
-def test_the_ends_of_p(p: float, share: float) -> None:
+def test_p_of_0_and_1(p: float, share: float) -> None:
     variation = Variation(darkroom.task((0, 0), 3, 30), Adversary.of("uniform", p=p))
     _, steps = play(DarkRoom([variation] * 20), range(20), np.zeros((30, 20), np.int64))
     assert np.mean([s.adversary >= 0 for s in steps]) == share
@@ -119,7 +119,7 @@ def test_random_starts_are_uniform_and_a_given_start_is_kept() -> None:
     assert (start[1800:] == [2, 1]).all()
 
 
-def test_a_row_is_the_same_whatever_stands_beside_it(room: Room) -> None:
+def test_a_row_does_not_depend_on_the_other_rows(room: Room) -> None:
     horizon, tasks = 25, room(5, 25)
     adversaries = (NULL, MEDDLER, Adversary.of("uniform", p=0.5))
     variations = [Variation(tasks[row % 25], adversaries[row % 3]) for row in range(50)]
@@ -135,8 +135,8 @@ def test_a_row_is_the_same_whatever_stands_beside_it(room: Room) -> None:
         assert bytes_of(*alone, 0) == bytes_of(*together, row)
 
 
-def test_what_the_agent_does_leaves_the_adversary_alone() -> None:
-    """Chance is drawn at reset: when and what the adversary plays does not hang on the actions."""
+def test_actions_of_the_agent_do_not_change_those_of_the_adversary() -> None:
+    """All draws happen at reset: when and how the adversary acts does not depend on the agent's actions."""
     variation = Variation(darkroom.task((0, 0), 5, 40), MEDDLER)
     logs = [
         np.stack([s.adversary for s in play(DarkRoom([variation] * 4), range(4), np.full((40, 4), a, np.int64))[1]])
@@ -159,7 +159,7 @@ def test_horizon_is_enforced() -> None:
 
 
 @pytest.mark.parametrize("actions", [[0, 5], [-1, 0], [0], [0, 0, 0]])
-def test_actions_that_are_none_are_refused(actions: list[int]) -> None:
+def test_invalid_actions_are_refused(actions: list[int]) -> None:
     room = DarkRoom([Variation(darkroom.task((0, 0), 3, 4))] * 2)
     room.reset(rngs([0, 1]))
     with pytest.raises(ValueError, match="action"):
@@ -187,7 +187,7 @@ def test_a_wrong_number_of_generators_is_refused() -> None:
         ({"horizon": float("inf")}, r"horizon=inf"),
     ],
 )
-def test_a_room_that_cannot_be_is_refused_with_its_value(wrong: dict[str, object], message: str) -> None:
+def test_an_impossible_room_is_refused_with_its_value(wrong: dict[str, object], message: str) -> None:
     task = darkroom.task((1, 1), 3, 5).replace(**wrong)
     with pytest.raises(ValueError, match=message):
         DarkRoom([Variation(task)])
@@ -211,7 +211,7 @@ def test_task_itself_refuses_a_goal_outside() -> None:
         (Adversary.of("wind", p=0.1), "'wind'.*null, uniform and dirichlet"),
     ],
 )
-def test_an_adversary_that_cannot_be_is_refused_with_its_value(adversary: Adversary, message: str) -> None:
+def test_an_impossible_adversary_is_refused_with_its_value(adversary: Adversary, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DarkRoom([Variation(darkroom.task((0, 0), 3, 5), adversary)])
 
@@ -224,7 +224,7 @@ def test_mixed_batches_are_refused() -> None:
         DarkRoom([small, Variation(darkroom.task((0, 0), 3, 6))])
 
 
-def test_step_has_the_wires_dtypes_and_does_not_share_memory(room: Room) -> None:
+def test_step_has_the_dtypes_of_messages_and_does_not_share_memory(room: Room) -> None:
     batch = DarkRoom([Variation(t, MEDDLER) for t in room(3, 5)])
     start = batch.reset(rngs(range(9)))
     kept = start.copy()

@@ -1,4 +1,4 @@
-"""The exact answers against slow enumeration in plain Python, in rooms small enough for it."""
+"""The exact answers against slow enumeration, in small rooms."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def hypotheses(room: Room) -> tuple[Variation, ...]:
     return tuple(Variation(t, a) for t in room(SIZE, HORIZON) for a in ADVERSARIES)
 
 
-# The room once more, slowly.
+# A slow second implementation of the room.
 
 
 @functools.cache
-def law_of(variation: Variation) -> tuple[float, list[float]]:
+def override_of(variation: Variation) -> tuple[float, list[float]]:
     if variation.adversary == NULL:
         return 0.0, [0.2] * 5
     if variation.adversary.kind == "uniform":
@@ -47,7 +47,7 @@ def moved(cell: Cell, action: int, size: int) -> Cell:
 
 def outcomes(variation: Variation, cell: Cell, action: int) -> list[tuple[float, Cell]]:
     """Every (probability, next cell) of an action, one entry an executed action."""
-    p, q = law_of(variation)
+    p, q = override_of(variation)
     size = int(variation.task.number("size"))
     return [(1 - p, moved(cell, action, size)), *((p * q[b], moved(cell, b, size)) for b in range(ACTIONS))]
 
@@ -55,7 +55,7 @@ def outcomes(variation: Variation, cell: Cell, action: int) -> list[tuple[float,
 def slow_q(
     variation: Variation, cell: Cell, steps: int, gamma: float, memo: dict[tuple[Cell, int], list[float]]
 ) -> list[float]:
-    """Q of each action with ``steps`` to go, by recursion over everything that can happen."""
+    """Q of each action with ``steps`` to go, by recursion over all outcomes."""
     if (cell, steps) not in memo:
         values = []
         for action in range(ACTIONS):
@@ -108,13 +108,13 @@ def slow_likelihood(variation: Variation, seen: Sequence[Trajectory], steps: int
     for one in seen:
         for h in range(len(one.actions) if steps is None else steps):
             cell, arrived = (tuple(int(c) for c in one.observations[i]) for i in (h, h + 1))
-            chance = sum(p for p, there in outcomes(variation, cell, int(one.actions[h])) if there == arrived)
+            probability = sum(p for p, there in outcomes(variation, cell, int(one.actions[h])) if there == arrived)
             right = float(one.rewards[h]) == (1.0 if arrived == variation.task["goal"] else 0.0)
-            total *= chance * right
+            total *= probability * right
     return total
 
 
-def normalised(weights: Sequence[float]) -> list[float]:
+def normalized(weights: Sequence[float]) -> list[float]:
     return [w / sum(weights) for w in weights]
 
 
@@ -131,7 +131,7 @@ def test_q_values_equal_the_recursion(hypotheses: tuple[Variation, ...], gamma: 
 def test_optimal_returns_equal_the_recursion(hypotheses: tuple[Variation, ...], start: Cell) -> None:
     best = solver.optimal_returns(Hypotheses.of(hypotheses), start)
     np.testing.assert_allclose(best, [max(slow_q(v, start, HORIZON, 1.0, {})) for v in hypotheses], atol=1e-12)
-    # Without disturbance the answer is arithmetic: the first reward comes with the arrival.
+    # Without disturbance the return follows from the distance: the first reward comes with the arrival.
     for value, v in zip(best, hypotheses, strict=True):
         distance = sum(abs(g - s) for g, s in zip(v.task.vector("goal"), start, strict=True))
         if v.adversary == NULL:
@@ -200,9 +200,9 @@ def test_posterior_equals_enumeration(hypotheses: tuple[Variation, ...], seed: i
     slow = [slow_likelihood(v, seen) for v in hypotheses]
     np.testing.assert_allclose(np.exp(loglik), slow, rtol=1e-9)
     prior = [1.0 + (i % 5) for i in range(18)]
-    belief = solver.posterior(np.log(normalised(prior)), loglik)
-    np.testing.assert_allclose(belief, normalised([a * b for a, b in zip(prior, slow, strict=True)]), rtol=1e-9)
-    assert belief[(5 * seed + 1) % 18] > 0, "the truth was refuted"
+    belief = solver.posterior(np.log(normalized(prior)), loglik)
+    np.testing.assert_allclose(belief, normalized([a * b for a, b in zip(prior, slow, strict=True)]), rtol=1e-9)
+    assert belief[(5 * seed + 1) % 18] > 0, "the true hypothesis has probability 0"
     assert 0 < (belief > 0).sum() < 18
 
 
@@ -217,7 +217,7 @@ def test_a_reward_and_its_absence_both_count(hypotheses: tuple[Variation, ...]) 
 
 
 def test_posterior_of_many_contexts_at_once_and_of_unlikely_ones() -> None:
-    """Rows are independent, and log-likelihoods far below float's range still normalise."""
+    """Rows are independent, and log-likelihoods far below float's range can still be normalized."""
     loglik = np.array([[-5000.0, -5000.0 + math.log(3)], [-np.inf, -1.0]])
     belief = solver.posterior(np.log(np.array([0.5, 0.5])), loglik)
     np.testing.assert_allclose(belief, [[0.25, 0.75], [0.0, 1.0]])
@@ -225,7 +225,7 @@ def test_posterior_of_many_contexts_at_once_and_of_unlikely_ones() -> None:
 
 def test_an_impossible_context_raises(hypotheses: tuple[Variation, ...]) -> None:
     h = Hypotheses.of(hypotheses)
-    # From (0, 0) to (2, 2) in one step: no adversary can do that.
+    # No adversary can move the agent from (0, 0) to (2, 2) in one step.
     jump = solver.log_likelihood(h, np.array([0]), np.array([4]), np.array([0.0], np.float32), np.array([8]))
     with pytest.raises(ValueError, match="probability 0 under every hypothesis"):
         solver.posterior(np.zeros(18), jump[0])
@@ -248,7 +248,7 @@ def test_posterior_action_is_the_sum_over_hypotheses(hypotheses: tuple[Variation
             assert result[b, action] == pytest.approx(slow)
 
 
-def test_hypotheses_refuse_a_mixture(room: Room) -> None:
+def test_hypotheses_of_unlike_rooms_are_refused(room: Room) -> None:
     with pytest.raises(ValueError, match=r"\(3, 6\), \(4, 6\)"):
         Hypotheses.of([Variation(room(3, 6)[0]), Variation(room(4, 6)[0])])
     with pytest.raises(ValueError, match=r"goal=\(5, 5\)"):

@@ -1,4 +1,4 @@
-"""The DeepMind Control games against dm_control itself, and what they refuse."""
+"""The DeepMind Control problems against dm_control itself, and refused tasks and adversaries."""
 
 import math
 import os
@@ -24,7 +24,7 @@ def corner(kind, which):
 
 
 def reference(kind, task, seed):
-    """dm_control's own environment with the task's parameters, set here once more by name."""
+    """dm_control's own environment with the task's parameters, set here a second time by name."""
     os.environ.setdefault("MUJOCO_GL", "disabled")
     from dm_control import suite
 
@@ -55,12 +55,12 @@ PUSHED = {
     "walker": [("right_foot", "xz"), ("left_foot", "xz")],
 }
 LARGEST = {"cartpole": 0.005, "cheetah": 1.0, "hopper": 1.0, "quadruped": 10.0, "reacher": 0.1, "walker": 1.0}
-"""Table 2, written down once more."""
+"""A second copy of Table 2."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_step_is_dm_controls_own_forces_included(kind):
-    domain, chance = kind.split("-")[1], np.random.default_rng(7)
+    domain, rng = kind.split("-")[1], np.random.default_rng(7)
     tasks = [corner(kind, 0), corner(kind, 1)]
     game = simulation.DMC(tasks)
     rngs = [np.random.default_rng(row) for row in range(2)]
@@ -71,8 +71,8 @@ def test_every_step_is_dm_controls_own_forces_included(kind):
         np.testing.assert_array_equal(shown[row], np.clip(np.float32(flat(env.reset().observation)), low, high))
     paid = 0.0
     for _ in range(STEPS):
-        actions = chance.uniform(-1, 1, (2, game.spec.actions)).astype(np.float32)
-        pushes = chance.uniform(-1, 1, (2, game.disturbance)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (2, game.spec.actions)).astype(np.float32)
+        pushes = rng.uniform(-1, 1, (2, game.disturbance)).astype(np.float32)
         step = game.step(actions, pushes)
         for row, env in enumerate(theirs):
             left = list(pushes[row])
@@ -111,7 +111,7 @@ def test_there_are_11_problems_in_6_domains():
 
 
 @pytest.mark.parametrize("kind", ["dmc-hopper-hop", "dmc-reacher-easy"])
-def test_a_row_does_not_depend_on_its_neighbours(kind):
+def test_a_row_does_not_depend_on_the_other_rows(kind):
     tasks = domains.grid(kind, 2)
     adversaries = [
         NULL,
@@ -132,7 +132,7 @@ def envs_forces(kind):
     return domains.problem(kind).forces["paper"].count
 
 
-def test_the_adversary_pushes_by_what_is_shown_and_its_action_is_logged():
+def test_the_adversary_acts_on_the_observation_and_its_action_is_recorded():
     kind = "dmc-cheetah-run"
     adversary = network_adversary.network(5, 17, 6, strength=2.0)
     env = registry.batch([Variation(domains.task(kind), adversary), Variation(domains.task(kind))])
@@ -145,10 +145,10 @@ def test_the_adversary_pushes_by_what_is_shown_and_its_action_is_logged():
         shown = step.observation
         moved = max(moved, np.abs(step.adversary[0]).max())
     assert 0.5 < moved <= 2.0
-    assert np.abs(shown[0] - shown[1]).max() > 1e-3, "the force did nothing"
+    assert np.abs(shown[0] - shown[1]).max() > 1e-3, "the force changed nothing"
 
 
-def test_a_network_is_rebuilt_bit_for_bit_and_answers_as_a_slow_loop_does():
+def test_a_network_is_rebuilt_bit_for_bit_and_equals_a_slow_loop():
     spec = Spec((-2.0, 0.0), (2.0, 10.0), 1, 5, discrete=False)
     one, other = network_adversary.network(3, 2, 4, 0.5), network_adversary.network(4, 2, 4)
     for mine, again in zip(
@@ -184,7 +184,7 @@ def masses(task, body):
     return model.body_mass[number], model.body_inertia[number].copy(), model.body_subtreemass[1]
 
 
-def test_a_mass_takes_inertia_and_what_is_derived_along_unless_as_in_qarls_code():
+def test_a_mass_changes_inertia_and_derived_constants_except_with_qarls_forces():
     kind = "dmc-cheetah-run"
     mass, inertia, whole = masses(domains.task(kind), "torso")
     heavy, rescaled, heavier = masses(domains.task(kind, torso_mass=9.0), "torso")
@@ -195,7 +195,7 @@ def test_a_mass_takes_inertia_and_what_is_derived_along_unless_as_in_qarls_code(
     np.testing.assert_array_equal(kept, inertia)
 
 
-def test_friction_is_every_geoms():
+def test_friction_applies_to_every_geom():
     model = simulation.DMC([domains.task("dmc-cheetah-run", friction=0.3)])._models[0]
     np.testing.assert_array_equal(model.geom_friction[:, 0], 0.3)
 
@@ -209,7 +209,7 @@ def test_qarls_forces_are_a_preset():
     np.testing.assert_allclose(game._data[0].xfrc_applied[torso], [1.0, 0, 2.0, 0, 3.0, 0], rtol=1e-6)
 
 
-def test_the_grid_is_8_by_8_and_pretraining_has_its_middle():
+def test_the_grid_is_8_by_8_and_pretraining_has_its_center():
     kind = "dmc-walker-run"
     whole, middle = domains.grid(kind), domains.grid(kind, 4)
     assert (len(whole), len(middle)) == (64, 16) and set(middle) <= set(whole)
@@ -221,8 +221,8 @@ def test_the_grid_is_8_by_8_and_pretraining_has_its_middle():
         domains.grid(kind, 3)
 
 
-def test_a_simulation_that_breaks_down_stands_still_without_reward_and_the_next_episode_is_whole(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its warnings where it stands
+def test_a_diverged_simulation_stands_still_without_reward_and_the_next_episode_is_complete(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its warnings into the working folder
     game = simulation.DMC(domains.grid("dmc-cheetah-run", 2)[:2])
     nothing = np.zeros((2, 6), np.float32)
     game.reset([np.random.default_rng(row) for row in range(2)])
@@ -237,7 +237,7 @@ def test_a_simulation_that_breaks_down_stands_still_without_reward_and_the_next_
     assert not game.step(nothing, nothing).diverged.any()
 
 
-def test_an_episode_that_breaks_down_ends_truncated_and_says_so(tmp_path, monkeypatch):
+def test_a_diverged_episode_is_truncated_and_marked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env = registry.make(Variation(domains.task("dmc-cartpole-balance")))
     env.reset(seed=0)
@@ -250,7 +250,7 @@ def test_an_episode_that_breaks_down_ends_truncated_and_says_so(tmp_path, monkey
 @pytest.mark.parametrize(
     "kind", ["dmc-cheetah-run", "dmc-hopper-stand", "dmc-quadruped-walk", "dmc-walker-walk", "dmc-cartpole-swingup"]
 )
-def test_violent_actions_seldom_pass_the_range_of_an_observation(kind):
+def test_extreme_actions_rarely_leave_the_range_of_an_observation(kind):
     game, rng = simulation.DMC(domains.grid(kind, 2)), np.random.default_rng(0)
     game.reset([np.random.default_rng(row) for row in range(4)])
     edge = []
@@ -258,11 +258,11 @@ def test_violent_actions_seldom_pass_the_range_of_an_observation(kind):
         actions = rng.choice([-1.0, 1.0], (4, game.spec.actions)).astype(np.float32)
         step = game.step(actions, np.ones((4, game.disturbance), np.float32))
         edge.append(np.abs(step.observation) >= np.float32(game.spec.high) * (1 - 1e-6))
-    bounded = np.float32(game.spec.high) > 1.0  # a cosine may well be 1
+    bounded = np.float32(game.spec.high) > 1.0  # a cosine reaches 1
     assert np.stack(edge)[..., bounded].mean() < 0.003
 
 
-def test_what_is_no_task_is_refused_with_the_remedy():
+def test_an_impossible_task_is_refused_with_the_remedy():
     for kind, settings, said in (
         ("dmc-cheeta-run", {}, "'dmc-cheeta-run'.*did you mean 'dmc-cheetah-run'"),
         ("dmc-cheetah-run", {"torso_mas": 5.0}, "'torso_mas'.*torso_mass"),
@@ -279,7 +279,7 @@ def test_what_is_no_task_is_refused_with_the_remedy():
         registry.spec(Task.of("dmc-cheetah-rum"))
 
 
-def test_what_does_not_fit_the_game_is_refused_with_the_remedy():
+def test_variations_and_actions_that_do_not_fit_are_refused_with_the_remedy():
     cheetah, walker = domains.task("dmc-cheetah-run"), domains.task("dmc-walker-run")
     with pytest.raises(ValueError, match="one problem, horizon and preset"):
         simulation.DMC([cheetah, walker])

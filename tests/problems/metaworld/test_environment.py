@@ -1,4 +1,4 @@
-"""Meta-World's pick-place: its own simulation, a goal that only the labeller sees, and what an adversary may move."""
+"""Meta-World's pick-place: its own simulation, a goal that is hidden from the agent, and the reach of an adversary."""
 
 import functools
 import pickle
@@ -19,7 +19,7 @@ ADVERSARY = network_adversary.network(3, 39, 9)
 
 @pytest.fixture(scope="module", autouse=True)
 def anew():
-    """Meta-World's ML1, which in this module is made once for a seed: it simulates all of its 50 tasks before it answers."""
+    """Meta-World's ML1, made once for each seed, because it simulates all of its 50 tasks when it is made."""
     import metaworld
 
     anew = metaworld.ML1
@@ -47,7 +47,7 @@ def test_ml1s_first_20_tasks_are_its_own_and_fit_the_box(ml1, anew):
         environment.ml1_tasks(51)
 
 
-def test_every_step_is_metaworlds_own(ml1):
+def test_every_step_equals_meta_worlds(ml1):
     from metaworld import ML1
 
     suite = ML1("pick-place-v3", seed=0)
@@ -78,8 +78,8 @@ def run(env, choose):
     return success, total
 
 
-def test_the_scripted_policy_needs_the_goal_that_only_the_labeller_sees(ml1):
-    """Labels come from the true state; from what the agent is shown, the same policy never succeeds."""
+def test_the_scripted_policy_needs_the_goal_that_is_hidden_from_the_agent(ml1):
+    """Labels come from the true state; given the agent's observation, the same policy never succeeds."""
     env = PickPlace([Variation(task) for task in ml1[:2]])
     knowing, paid = run(env, lambda env, shown: environment.expert(env.truth))
     blind, poor = run(env, lambda env, shown: environment.expert(shown.astype(np.float64)))
@@ -88,7 +88,7 @@ def test_the_scripted_policy_needs_the_goal_that_only_the_labeller_sees(ml1):
     assert np.abs(environment.expert(env.truth)).max() <= 1
 
 
-def test_an_adversary_moves_hand_and_object_by_a_centimetre_at_most_and_nothing_else():
+def test_an_adversary_moves_hand_and_object_by_a_centimeter_at_most_and_nothing_else():
     env = PickPlace([Variation(TASK, ADVERSARY), Variation(TASK)])
     net = Networks([ADVERSARY], env.spec, 9)
     shown, most = env.reset(rngs(2)), 0.0
@@ -112,14 +112,14 @@ def test_an_adversary_moves_hand_and_object_by_a_centimetre_at_most_and_nothing_
     assert most > 0.005
 
 
-def test_the_first_observation_carries_it_too():
+def test_the_first_observation_is_disturbed_too():
     env = PickPlace([Variation(TASK, ADVERSARY), Variation(TASK)])
     shown = env.reset(rngs(2))
     assert np.abs(shown[0, :3] - shown[1, :3]).max() > 1e-4
     np.testing.assert_array_equal(shown[:, 18:36], shown[:, :18])
 
 
-def test_a_goal_that_is_shown_is_moved_as_well():
+def test_a_visible_goal_is_disturbed_too():
     task = TASK.replace(goal_shown=1, disturbance=0.02)
     env = PickPlace([Variation(task, ADVERSARY), Variation(task)])
     shown = env.reset(rngs(2))
@@ -129,8 +129,8 @@ def test_a_goal_that_is_shown_is_moved_as_well():
     np.testing.assert_array_equal(env.truth[:, 36:], np.array([[0.05, 0.85, 0.2]] * 2))
 
 
-def test_a_simulation_that_breaks_down_stands_still_without_reward_and_the_next_episode_is_whole(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its warnings where it stands
+def test_a_diverged_simulation_stands_still_without_reward_and_the_next_episode_is_complete(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its warnings into the working folder
     env, still = PickPlace([Variation(TASK), Variation(TASK)]), np.zeros((2, 4), np.float32)
     env.reset(rngs(2))
     env.step(still)
@@ -158,13 +158,13 @@ def test_a_simulation_that_breaks_down_stands_still_without_reward_and_the_next_
         ({"goal_show": 1}, r"no parameter 'goal_show'.*did you mean 'goal_shown'"),
     ],
 )
-def test_what_is_no_task_is_refused(settings, said):
+def test_an_impossible_task_is_refused(settings, said):
     given = {"object": (0.02, 0.65, 0.02), "goal": (0.05, 0.85, 0.2), **settings}
     with pytest.raises(ValueError, match=said):
         pick_place.task(given.pop("object"), given.pop("goal"), **given)
 
 
-def test_what_does_not_fit_is_refused():
+def test_variations_and_actions_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"17 inputs.*this game has 39"):
         registry.batch([Variation(TASK, network_adversary.network(0, 17, 9))])
     with pytest.raises(ValueError, match="null and network"):
