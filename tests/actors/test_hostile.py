@@ -20,7 +20,7 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 from tests.e2e.training import wait_for
-from tests.jobs import asked
+from tests.jobs import jobs_of
 
 KEYS = StreamKeys("test")
 HOSTILE = Path(__file__).parent / "hostile"
@@ -42,7 +42,7 @@ class LearnerSide:
 
     def __init__(self, run, folder, lease_s):
         self.run, self.folder, self.stored, self.events, self.failures = run, folder, {}, [], []
-        self.jobs = asked(run, "icag")[:2]
+        self.jobs = jobs_of(run, "icag")[:2]
         self.everything = {i for job in self.jobs for i in job.identities()}
         self.lock = threading.Lock()
         self.scheduler = LeaseScheduler(lease_s, floor_s=lease_s)
@@ -108,7 +108,7 @@ def hostile(small_run, monkeypatch):
     """``hostile(failure)``: in processes started later, the second variation of the second task fails in this way."""
 
     def begin(failure):
-        job = asked(small_run, "icag")[0]
+        job = jobs_of(small_run, "icag")[0]
         monkeypatch.setenv("HOSTILE", failure)
         monkeypatch.setenv("HOSTILE_VARIATION", repr(job.variations[4]))
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HOSTILE), str(HOSTILE.parents[2])]))

@@ -26,7 +26,7 @@ from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 from tests.contracts.link_battery import eventually
-from tests.jobs import asked
+from tests.jobs import jobs_of
 
 KEYS = StreamKeys("test")
 
@@ -78,7 +78,7 @@ STOP = wire.encode_message("stop")
 
 
 def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
-    job = asked(small_run, "icag")[2]
+    job = jobs_of(small_run, "icag")[2]
     learner = ScriptedLearner(hub(), small_run, [wire.encode_message("wait", seconds=0.01), job_message(job), STOP])
     seen = []
     watching = hub()
@@ -95,7 +95,7 @@ def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
 
 
 def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
-    good, other = asked(small_run, "icag")[:2]
+    good, other = jobs_of(small_run, "icag")[:2]
     bad = dataclasses.replace(other, payload=dataclasses.replace(other.payload, behaviors=()))
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     Worker(hub(), "test", "w0").run()
@@ -112,7 +112,7 @@ def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
 
 
 def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, small_run, monkeypatch, tmp_path):
-    job = asked(small_run, "icag")[0]
+    job = jobs_of(small_run, "icag")[0]
     real = kinds.do
 
     def breaks_at_the_third(*given):
@@ -134,7 +134,7 @@ def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, smal
 
 
 def test_a_refused_trajectory_fails_its_own_job_only(hub, small_run):
-    bad, good = asked(small_run, "icag")[:2]
+    bad, good = jobs_of(small_run, "icag")[:2]
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     learner.refused = set(list(bad.identities())[:5])
     Worker(hub(), "test", "w0").run()
@@ -146,7 +146,7 @@ def test_a_refused_trajectory_fails_its_own_job_only(hub, small_run):
 
 def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, small_run, monkeypatch):
     monkeypatch.setattr(worker_module, "HEARTBEAT_S", 0.01)
-    job = asked(small_run, "icag")[0]
+    job = jobs_of(small_run, "icag")[0]
     heartbeats = []
     beaten = threading.Event()
     watching = hub()
@@ -202,7 +202,7 @@ def always(monkeypatch):
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
 def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monkeypatch):
     always(monkeypatch)
-    job = asked(committed_run, phase=1)[0]
+    job = jobs_of(committed_run, phase=1)[0]
     job = dataclasses.replace(job, payload=dataclasses.replace(job.payload, deploy=deploy, context_max=20))
 
     def work(topic):
@@ -251,7 +251,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
         return b""
 
     monkeypatch.setattr(publish_belief, "_message", message)
-    job = asked(small_run, phase=1)[0]
+    job = jobs_of(small_run, phase=1)[0]
     identity = next(iter(job.identities()))
 
     def published_in(seconds):
@@ -270,7 +270,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
 def test_an_error_in_a_belief_does_not_fail_the_job(hub, small_run, monkeypatch, caplog):
     always(monkeypatch)
     monkeypatch.setattr(Room, "read", lambda *arguments: 1 / 0)
-    job = asked(small_run, phase=1)[0]
+    job = jobs_of(small_run, phase=1)[0]
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     hub().serve(KEYS.weights_latest, lambda query: query.reply(wire.encode_weights(weights(small_run, 0))))
     hub().subscribe(KEYS.monitor_all, lambda key, payload: None)

@@ -23,7 +23,7 @@ from icrl_dist.rollout.episode import episode
 from icrl_dist.training import fit
 from icrl_dist.types import NULL, Variation
 from tests.experts.histories import EPISODES, HORIZON, run
-from tests.jobs import Kept, asked, done, in_problem
+from tests.jobs import InMemoryDataset, do, in_problem, jobs_of
 
 __all__ = ["run"]
 
@@ -39,8 +39,8 @@ def test_in_meta_world_labels_come_from_the_scripted_policy_at_the_true_states(s
         sac=sac,
         pretrain=dataclasses.replace(small_run.pretrain, contexts=8, queries=5),
     )
-    (job,) = asked(run)
-    sent = done(run, job)
+    (job,) = jobs_of(run)
+    sent = do(run, job)
     assert len(sent) == 8
     for t in sent:
         assert not t.observations[:, 36:].any() and not t.queries[:, 36:].any(), "the goal stays hidden"
@@ -75,13 +75,13 @@ def test_the_scripted_policy_reads_the_true_states_of_its_environment():
 
 
 def test_a_training_reports_its_progress_and_the_cache_reports_what_it_saved(run):
-    job, received = asked(run)[0], []
+    job, received = jobs_of(run)[0], []
     progress = lambda text, note=False, reached=0: received.append((text, note, reached))  # noqa: E731
-    done(run, job, progress=progress)
+    do(run, job, progress=progress)
     assert len(received) == EPISODES and received[4][0].startswith("4 experts at 100 of 200 steps, mean return ")
     assert not any(note for _, note, _ in received) and [reached for *_, reached in received] == list(range(20, 201, 20))
     received.clear()
-    done(run, job, progress=progress)
+    do(run, job, progress=progress)
     assert received == [(f"{job.label}: 4 experts from the cache, 800 steps of SAC saved", True, 0)]
 
 
@@ -93,8 +93,8 @@ def windowed(run):
 
 
 def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_another_task(windowed):
-    job = asked(windowed)[0]
-    sent = done(windowed, job)
+    job = jobs_of(windowed)[0]
+    sent = do(windowed, job)
     found = [cache.any_kept(v, HORIZON, windowed.sac, windowed.seed) for v in job.variations]
     policies = [ExpertPolicy([history] * 4, windowed.sac) for history in found]
     unused, led = np.zeros((4, 2)), {False: 0, True: 0}
@@ -128,7 +128,7 @@ def test_a_job_of_one_task_has_no_decoys(windowed):
 def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed(windowed):
     run = dataclasses.replace(windowed, optim=dataclasses.replace(windowed.optim, queries=8))
     method = methods.of(run)
-    data = Kept([t for job in asked(run) for t in done(run, job)])
+    data = InMemoryDataset([t for job in jobs_of(run) for t in do(run, job)])
     draw = method.data(run, method.phases(run)[0], data)
     torch.manual_seed(0)
     model = method.build(registry.of(run).spec, run)
@@ -145,6 +145,6 @@ def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed
     assert after < before - 0.3
     policy = deployment.in_context(model, 4, run.context)
     assert isinstance(policy, deployment.CommittedPolicy)
-    env = registry.batch(asked(run)[0].variations)
+    env = registry.batch(jobs_of(run)[0].variations)
     ran = episode(env, policy, [np.random.default_rng(row) for row in range(4)])
     assert ran.actions.shape == (4, HORIZON, 2) and policy.length == HORIZON

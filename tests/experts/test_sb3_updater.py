@@ -13,7 +13,7 @@ from icrl_dist.experts.sac.sb3_expert import Expert
 from icrl_dist.experts.sac.sb3_files import load
 from tests.experts.histories import KilledError, digests, run  # noqa: F401
 from tests.experts.sac_cases import LINE, SMALL, SPEC, Line, random_updates, updated_by_sb3
-from tests.jobs import asked, done
+from tests.jobs import do, jobs_of
 
 BACKEND = "stable-baselines3"
 
@@ -57,12 +57,12 @@ def test_settings_that_stable_baselines3_does_not_support_are_refused(more):
 def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_bytes(run, monkeypatch):  # noqa: F811
     trained, real = [], stable_baselines3.SAC.train
     monkeypatch.setattr(stable_baselines3.SAC, "train", lambda self, *given: trained.append(type(self)) or real(self, *given))
-    whole = asked(run)[0]
+    whole = jobs_of(run)[0]
     none = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=""))
-    pair = dataclasses.replace(asked(none)[0], variations=whole.variations[:2], tasks=1)
-    done(run, pair)
+    pair = dataclasses.replace(jobs_of(none)[0], variations=whole.variations[:2], tasks=1)
+    do(run, pair)
     assert not trained
-    undisturbed = digests(done(run, dataclasses.replace(pair, variations=whole.variations[:1])))
+    undisturbed = digests(do(run, dataclasses.replace(pair, variations=whole.variations[:1])))
     updates = len(trained)
     assert updates == (run.sac.steps - run.sac.warmup) // run.sac.update_every and set(trained) == {Expert}
     one, begun = dataclasses.replace(whole, variations=whole.variations[:1], tasks=1), []
@@ -77,6 +77,6 @@ def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_byte
     monkeypatch.setattr(experts, "CHECKPOINT_S", 0.0)
     monkeypatch.setattr(experts, "save_checkpoint", killed)
     with pytest.raises(KilledError):
-        done(run, one)
-    assert digests(done(run, one)) == undisturbed
+        do(run, one)
+    assert digests(do(run, one)) == undisturbed
     assert len(trained) == 2 * updates, "an episode was trained twice"

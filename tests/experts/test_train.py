@@ -16,22 +16,22 @@ from icrl_dist.results import evaluate
 from icrl_dist.stream import wire
 from icrl_dist.types import NULL
 from tests.experts.histories import EPISODES, HORIZON, Breaking, KilledError, digests, run, trained
-from tests.jobs import Fixed, asked, decoded, done
+from tests.jobs import FixedWeights, decoded, do, jobs_of
 
 __all__ = ["run", "trained"]
 
 
 def test_a_job_has_all_variations_of_a_few_tasks_and_the_section_sac(run):
-    first, second = asked(run)
+    first, second = jobs_of(run)
     assert first.kind == "train_expert" and (first.trials, first.tasks, second.task) == (3, 2, 2)
     assert [v.adversary == NULL for v in first.variations] == [True, False] * 2
     assert first.payload.sac == run.sac and decoded(run, wire.encode_job(first)) == first
-    assert {v.adversary for job in asked(run, "dpt") for v in job.variations} == {NULL}
+    assert {v.adversary for job in jobs_of(run, "dpt") for v in job.variations} == {NULL}
 
 
 def test_contexts_are_episodes_of_the_training_and_labels_are_actions_of_its_expert(run):
-    job = asked(run)[0]
-    sent = done(run, job)
+    job = jobs_of(run)[0]
+    sent = do(run, job)
     assert [t.identity for t in sent] == list(job.identities())
     found = [cache.any_kept(v, HORIZON, run.sac, run.seed) for v in job.variations]
     for t in sent:
@@ -52,54 +52,54 @@ def test_contexts_are_episodes_of_the_training_and_labels_are_actions_of_its_exp
 
 
 def test_the_same_job_gives_the_same_bytes_with_or_without_a_cache(run, tmp_path):
-    job = asked(run)[0]
-    here = digests(done(run, job, worker="w0"))
-    assert digests(done(run, job, worker="w1")) == here, "from the cache"
+    job = jobs_of(run)[0]
+    here = digests(do(run, job, worker="w0"))
+    assert digests(do(run, job, worker="w1")) == here, "from the cache"
     none = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=""))
-    assert digests(done(run, asked(none)[0])) == here, "without one"
+    assert digests(do(run, jobs_of(none)[0])) == here, "without one"
     other = dataclasses.replace(none, seed=1)
-    assert digests(done(run, asked(other)[0])) != here
+    assert digests(do(run, jobs_of(other)[0])) != here
 
 
 def test_nothing_is_trained_that_is_in_the_cache(run, trained, caplog):
-    job = asked(run)[0]
-    first = digests(done(run, job))
+    job = jobs_of(run)[0]
+    first = digests(do(run, job))
     assert trained == [4]
-    assert digests(done(run, dataclasses.replace(job, trials=2))) != first and trained == [4]
+    assert digests(do(run, dataclasses.replace(job, trials=2))) != first and trained == [4]
     file = cache.file(run.sac, cache.key(job.variations[2], HORIZON, run.sac, run.seed, "lockstep"))
     whole = file.read_bytes()
     for damage in (whole[: len(whole) // 2], b"nothing"):
         file.write_bytes(damage)
-        assert digests(done(run, job)) == first
+        assert digests(do(run, job)) == first
     assert trained == [4, 1, 1] and "made anew" in caplog.text and file.read_bytes() == whole
 
 
 def test_a_method_takes_the_experts_that_another_method_trained_and_ends_with_the_same_bytes(run, trained, tmp_path):
     """DPT needs the undisturbed ones of ICAG's experts, which train with other experts."""
     alone = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=str(tmp_path / "other")))
-    own = [digests(done(run, job)) for job in asked(alone, "dpt")]
+    own = [digests(do(run, job)) for job in jobs_of(alone, "dpt")]
     assert trained == [2, 2]
-    for job in asked(run, "icag"):
-        done(run, job)
+    for job in jobs_of(run, "icag"):
+        do(run, job)
     assert trained == [2, 2, 4, 4]
-    assert [digests(done(run, job)) for job in asked(run, "dpt")] == own and trained == [2, 2, 4, 4]
+    assert [digests(do(run, job)) for job in jobs_of(run, "dpt")] == own and trained == [2, 2, 4, 4]
 
 
 def test_a_history_delivers_at_most_the_episodes_of_its_training_and_keeps_all_of_them_if_all_are_needed(run, monkeypatch):
     monkeypatch.setattr(cache, "KEPT", 6)
     many = dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, contexts=8 * 30))
-    job = asked(many)[0]
+    job = jobs_of(many)[0]
     assert job.trials == EPISODES
-    sent = done(run, job)
+    sent = do(run, job)
     assert len({t.actions.tobytes() for t in sent}) == len(sent) == 4 * EPISODES
-    few = asked(run)[0]
+    few = jobs_of(run)[0]
     assert few.trials == 3
-    done(run, few)
+    do(run, few)
     assert len(cache.kept(few.variations[0], HORIZON, run.sac, run.seed, "lockstep").rewards) == 6
 
 
 def test_every_number_that_decides_a_history_is_part_of_its_key(run, monkeypatch):
-    job = asked(run)[0]
+    job = jobs_of(run)[0]
     one = cache.key(job.variations[0], HORIZON, run.sac, 0, "lockstep")
     changed = [
         cache.key(job.variations[1], HORIZON, run.sac, 0, "lockstep"),
@@ -122,8 +122,8 @@ def test_every_number_that_decides_a_history_is_part_of_its_key(run, monkeypatch
 
 
 def test_a_killed_training_continues_from_its_checkpoint_to_the_same_bytes(run, monkeypatch):
-    job = asked(run)[0]
-    undisturbed = digests(done(run, asked(dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache="")))[0]))
+    job = jobs_of(run)[0]
+    undisturbed = digests(do(run, jobs_of(dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache="")))[0]))
     monkeypatch.setattr(train, "CHECKPOINT_S", 0.0)
     real, begun = train.save_checkpoint, []
 
@@ -136,9 +136,9 @@ def test_a_killed_training_continues_from_its_checkpoint_to_the_same_bytes(run, 
     monkeypatch.setattr(train, "save_checkpoint", killed)
     for _ in range(2):
         with pytest.raises(KilledError):
-            done(run, job)
+            do(run, job)
     assert all(name.startswith("part-") for name in begun) and len(begun) == 7
-    assert digests(done(run, job)) == undisturbed
+    assert digests(do(run, job)) == undisturbed
     assert len([name for name in begun if name.startswith("part-")]) == EPISODES, "no episode was trained twice"
     assert not list(cache.file(run.sac, "").parent.glob("part-*"))
 
@@ -147,12 +147,12 @@ def test_a_killed_training_continues_from_its_checkpoint_to_the_same_bytes(run, 
 def test_episodes_that_diverged_are_left_out(run, monkeypatch, always):
     real = DMCProblem.batch
     monkeypatch.setattr(DMCProblem, "batch", lambda problem, variations: Breaking(real(problem, variations), always))
-    job = asked(run)[0]
+    job = jobs_of(run)[0]
     if always:
         with pytest.raises(RuntimeError, match="breaks down in every episode"):
-            done(run, job)
+            do(run, job)
         return
-    done(run, job)
+    do(run, job)
     lengths = [len(cache.any_kept(v, HORIZON, run.sac, run.seed).rewards) for v in job.variations]
     assert lengths == [EPISODES, EPISODES - 2, EPISODES, EPISODES - 2]
 
@@ -170,26 +170,26 @@ def test_an_evaluation_counts_episodes_that_diverged_and_reports_missing_experts
     assert "broken" not in evaluate.online(run, agents)[0].row()
     assert "4 of the evaluated tasks" in problem.missing_reference(run, file)
     assert f"`icrl-dist train experts-{file} --out OTHER` trains them" in problem.missing_reference(run, file)
-    done(run, asked(run)[0])
+    do(run, jobs_of(run)[0])
     assert "2 of the evaluated tasks" in problem.missing_reference(run, file)
     assert EXPERT not in problem.references(run)
-    done(run, asked(run)[1])
+    do(run, jobs_of(run)[1])
     assert problem.references(run)[EXPERT].ceiling and problem.missing_reference(run, file) == ""
 
 
 def test_a_rollout_that_diverged_fails_its_job(run, monkeypatch):
     icaa = dataclasses.replace(run, method="icaa")
-    job, weights = asked(icaa, phase=1)[0], Fixed(icaa)
-    assert len(done(icaa, job, weights)) == len(list(job.identities()))
+    job, weights = jobs_of(icaa, phase=1)[0], FixedWeights(icaa)
+    assert len(do(icaa, job, weights)) == len(list(job.identities()))
     real = DMCProblem.batch
     monkeypatch.setattr(DMCProblem, "batch", lambda problem, variations: Breaking(real(problem, variations), True))
     with pytest.raises(RuntimeError, match=r"adapt/0/0/1/0, adapt/0/1/1/0: the simulation diverged"):
-        done(icaa, job, weights)
+        do(icaa, job, weights)
 
 
 def test_the_actions_of_the_model_become_labels(run):
     icaa = dataclasses.replace(run, method="icaa")
-    trials = done(icaa, asked(icaa, phase=1)[0], Fixed(icaa))
+    trials = do(icaa, jobs_of(icaa, phase=1)[0], FixedWeights(icaa))
     own = [t for t in trials if t.identity[:4] == trials[0].identity[:4]]
     examples = self_labelled(icaa, own)
     later = own[icaa.icaa.context_trials + 1 :]

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from learner.scheduler import LeaseScheduler
-from tests.jobs import asked
+from tests.jobs import jobs_of
 
 LEASE = 10.0
 PHASE = ("pretrain", 0)
@@ -14,7 +14,7 @@ PHASE = ("pretrain", 0)
 @pytest.fixture
 def jobs(small_run):
     """Three jobs of two tasks with three variations each, two trials."""
-    first_jobs = asked(small_run, "icag")[:3]
+    first_jobs = jobs_of(small_run, "icag")[:3]
     assert [(len(job.variations), job.tasks, job.trials) for job in first_jobs] == [(6, 2, 2)] * 3
     return first_jobs
 

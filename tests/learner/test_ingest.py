@@ -13,7 +13,7 @@ from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import batching, wire
 from icrl_dist.types import Identity, Spec
 from learner.ingest import REASONS, Ingest, Rejected, check
-from tests.jobs import asked, done
+from tests.jobs import do, jobs_of
 
 
 class FakeQuery:
@@ -39,12 +39,12 @@ class FakeQuery:
 
 @pytest.fixture
 def job(small_run):
-    return asked(small_run, "icag")[0]
+    return jobs_of(small_run, "icag")[0]
 
 
 @pytest.fixture
 def trajectories(small_run, job):
-    return done(small_run, job)
+    return do(small_run, job)
 
 
 @pytest.fixture

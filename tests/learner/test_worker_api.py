@@ -16,7 +16,7 @@ from icrl_dist.telemetry import crash_reports
 from learner import worker_api as worker_api_module
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
-from tests.jobs import asked, decoded
+from tests.jobs import decoded, jobs_of
 
 KEYS = StreamKeys("test")
 COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "waited_s": 0.0}
@@ -29,7 +29,7 @@ class Server:
     def __init__(self, run, folder, hub, monkeypatch):
         monkeypatch.setattr(worker_api_module, "_STACKS_DELAY_S", 0.0)
         self.run, self.folder, self.events, self.failures = run, folder, [], []
-        self.jobs = asked(run, "icag")[:3]
+        self.jobs = jobs_of(run, "icag")[:3]
         self.scheduler = LeaseScheduler(60.0)
         self.scheduler.open(self.jobs, lambda job: ())
         self.policy_version = None

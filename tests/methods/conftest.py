@@ -12,10 +12,9 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw, Method, Phase, TrajectoryDataset
 from icrl_dist.methods import examples
 from icrl_dist.methods import registry as methods
-from icrl_dist.problems import registry as problems
 from icrl_dist.training.batches import Pool
 from icrl_dist.types import Trajectory
-from tests.methods.collecting import FixedWeights, collect
+from tests.jobs import FixedWeights, collect
 
 PoolsOf = Callable[[Method, Run, Phase, TrajectoryDataset], Sequence[Pool]]
 
@@ -30,7 +29,7 @@ class Collected(NamedTuple):
 @pytest.fixture
 def collected(small_run: Run) -> Collected:
     """All trajectories of ``small_run``, which is an ICAA run, with an untrained model."""
-    weights = FixedWeights(problems.of(small_run).spec, small_run.model)
+    weights = FixedWeights(small_run)
     phases = methods.of(small_run).phases(small_run)
     return Collected([t for phase in phases for t in collect(small_run, phase, weights)], weights)
 

@@ -9,7 +9,7 @@ import numpy as np
 from icrl_dist.config.run import Run
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels
-from tests.methods.collecting import collect
+from tests.jobs import collect
 from tests.methods.conftest import Collected
 
 

@@ -17,7 +17,7 @@ from icrl_dist.methods.examples import self_labelled
 from icrl_dist.problems import registry as problems
 from icrl_dist.training.batches import Examples
 from icrl_dist.types import Trajectory
-from tests.methods.collecting import InMemoryDataset, do
+from tests.jobs import InMemoryDataset, do
 from tests.methods.conftest import Collected, PoolsOf
 
 

@@ -13,7 +13,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels
 from icrl_dist.types import NULL
-from tests.methods.collecting import FixedWeights, InMemoryDataset, collect
+from tests.jobs import FixedWeights, InMemoryDataset, collect
 from tests.methods.conftest import PoolsOf
 
 
@@ -39,7 +39,7 @@ def test_dagger_adds_own_histories_from_the_origin_with_optimal_labels(icag_run:
     dagger = DAggerConfig(rounds=2, trials=3, steps=7, learning_rate=0.5, new_fraction=0.25)
     run = dataclasses.replace(icag_run, dagger=dagger)
     problem, method, data = problems.of(run), methods.of(run), InMemoryDataset()
-    weights = FixedWeights(problem.spec, run.model)
+    weights = FixedWeights(run)
     phases = method.phases(run)
     assert [(p.stage, p.policy_version, p.next_version) for p in phases] == [
         ("pretrain", -1, 0),

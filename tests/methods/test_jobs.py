@@ -18,7 +18,7 @@ from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.types import Identity, Job
 from learner.phases import PhasePlan
-from tests.methods.collecting import do
+from tests.jobs import do
 
 
 def test_every_method_shares_out_the_same_number_of_contexts(small_run: Run) -> None:

@@ -15,7 +15,7 @@ from icrl_dist.storage.segment import HEADER_BYTES, NAME, SEAL_BYTES, TRAJECTORY
 from icrl_dist.storage.sharing import adopt
 from icrl_dist.stream import wire
 from icrl_dist.types import Identity
-from tests.collecting import collected
+from tests.jobs import collected
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from icrl_dist.storage import segment
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
-from tests.collecting import collected
+from tests.jobs import collected
 
 
 class Bomb:

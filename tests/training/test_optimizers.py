@@ -19,7 +19,7 @@ from icrl_dist.training import fit, optimizers
 from icrl_dist.training.batches import TrainingBatch
 from icrl_dist.training.fit import Optimizer
 from learner import checkpoints
-from tests.methods.collecting import InMemoryDataset, collect
+from tests.jobs import InMemoryDataset, collect
 
 CONFIG = OptimConfig(learning_rate=1e-2, batch=8, queries=4, weight_decay=0.1, beta2=0.9, warmup=2)
 

@@ -8,12 +8,11 @@ import pytest
 from icrl_dist.collect.adapt import Rollouts
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.examples import self_labelled
-from icrl_dist.problems import registry as problems
 from icrl_dist.problems.darkroom.room import next_cell
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels
 from icrl_dist.training import batches
 from icrl_dist.training.batches import Examples, Pool
-from tests.methods.collecting import FixedWeights, do
+from tests.jobs import FixedWeights, do
 from tests.models.windowed import HORIZON, LENGTH
 
 
@@ -112,7 +111,7 @@ def test_training_draws_windows_of_the_contexts_variation():
 
 def test_own_trials_are_cut_into_windows_that_do_not_cross_episodes(run):
     run = dataclasses.replace(run, method="icaa", icaa=dataclasses.replace(run.icaa, label_trials="later"))
-    weights, method = FixedWeights(problems.of(run).spec, run.model), methods.of(run)
+    weights, method = FixedWeights(run), methods.of(run)
     job = method.ask(run, method.phases(run)[1])[0]
     assert isinstance(job.payload, Rollouts) and job.payload.deploy == "committed"
     made = [t for t in do(run, job, weights) if t.identity[2:4] == (job.task, 0)]

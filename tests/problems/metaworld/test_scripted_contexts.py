@@ -15,7 +15,7 @@ from icrl_dist.problems.metaworld import environment, pick_place, scripted_conte
 from icrl_dist.problems.metaworld.scripted_contexts import Lead
 from icrl_dist.stream import wire
 from icrl_dist.training.batches import TrainingBatch
-from tests.jobs import Kept, asked, decoded, done, in_problem
+from tests.jobs import InMemoryDataset, decoded, do, in_problem, jobs_of
 
 HORIZON, TRIALS = 10, 2
 
@@ -36,7 +36,7 @@ def run(small_run, monkeypatch):
 
 
 def job_of(run):
-    (job,) = asked(run)
+    (job,) = jobs_of(run)
     return job
 
 
@@ -65,7 +65,7 @@ def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_g
     drawn = Lead.drawn.__func__
     keep = lambda cls, *args: given.append(drawn(cls, *args)) or given[-1]  # noqa: E731
     monkeypatch.setattr(Lead, "drawn", classmethod(keep))
-    sent = done(run, job)
+    sent = do(run, job)
     assert [t.identity for t in sent] == list(job.identities()) and {t.origin for t in sent} == {"expert"}
     states = {}
     for trial in range(TRIALS):
@@ -88,7 +88,7 @@ def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_g
         assert not t.observations[:, 36:].any() and len(t.queries) == HORIZON and not len(t.taken)
         labels = np.stack([states[query.tobytes(), t.variation] for query in t.queries])
         np.testing.assert_allclose(t.labels, labels, atol=1e-3)
-    method, data = methods.of(run), Kept(sent)
+    method, data = methods.of(run), InMemoryDataset(sent)
     batch = method.data(run, method.phases(run)[0], data)(np.random.default_rng(0))
     assert len(data.variations("pretrain", 0)) == 4 and isinstance(batch, TrainingBatch)
     known = {tuple(label) for t in sent for label in t.labels}
@@ -100,7 +100,7 @@ def test_the_same_job_gives_the_same_bytes_with_action_windows(run, monkeypatch)
     model = dataclasses.replace(run.model, window=4)
     run = dataclasses.replace(run, model=model, pretrain=dataclasses.replace(run.pretrain, windows=3, contexts=4))
     job = dataclasses.replace(job_of(run), tasks=1, variations=job_of(run).variations[:2])
-    sent, again = (done(run, job) for _ in range(2))
+    sent, again = (do(run, job) for _ in range(2))
     assert [wire.trajectory_digest(t) for t in sent] == [wire.trajectory_digest(t) for t in again]
     for t in sent:
         assert t.taken.shape == (12, 4) and len(t.queries) == HORIZON + 12
