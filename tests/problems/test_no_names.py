@@ -122,7 +122,7 @@ def test_folders_and_names_are_found() -> None:
         "import icrl_dist.problems.dmc.suite",
         "from icrl_dist.problems import darkroom",
         "from icrl_dist.problems.metaworld.pick_place import KIND",
-        "def f():\n    from icrl_dist.problems.continuous import config",
+        "def f():\n    from icrl_dist.problems.metaworld import environment",
         'importlib.import_module("icrl_dist.problems.darkroom.solver")',
     ],
 )
