@@ -82,7 +82,7 @@ class InContextAgent:
         return self._policy.act(states, self._rng.random((len(states), 1 if self.spec.discrete else self.spec.actions)))
 
     def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
-        """Record one transition of each environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, others ``(B,)``.
+        """Record one transition per environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, others ``(B,)``.
 
         ``done``: whether the episode ended.  Raises ValueError for another shape, or if only some of the
         episodes ended: all environments of a batch have the same horizon.

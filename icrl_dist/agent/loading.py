@@ -44,7 +44,7 @@ def shipped(name: str | Path) -> Path:
 
 
 def slim(checkpoint: Checkpoint) -> Checkpoint:
-    """The parts of a checkpoint that deployment needs: weights, outcome readout and manifest, without optimizer and dataset list."""
+    """The parts of a checkpoint that deployment needs: weights, outcome readout and manifest, without the dataset list."""
     manifest = {key: value for key, value in checkpoint.manifest.items() if key != "dataset"}
     return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith(("model/", "outcomes/"))}, manifest)
 
@@ -75,7 +75,7 @@ def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda 
 
 
 def checkpoint_file(what: Path, version: int | None = None) -> Path:
-    """The checkpoint file at this path, or of this version (None: the newest) in a run folder.  Raises ConfigError if missing."""
+    """The checkpoint file at this path, or of this version (None: newest) in a run folder.  Raises ConfigError if none exists."""
     if not what.is_dir():
         if what.is_file():
             return what

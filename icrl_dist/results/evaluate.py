@@ -62,7 +62,7 @@ class Result:
 
 
 def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple[Variation, ...]:
-    """Every evaluated task (or each of ``tasks``) under its test adversary of strength p; episodes start as test episodes do."""
+    """Every evaluated task (or each of ``tasks``) under its test adversary of strength p; starts are those of test episodes."""
     problem = registry.of(run)
     chosen = problem.evaluated if tasks is None else tasks
     return tuple(
