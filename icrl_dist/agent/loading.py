@@ -75,7 +75,7 @@ def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda 
 
 
 def checkpoint_file(what: Path, version: int | None = None) -> Path:
-    """The checkpoint file at this path, or of this version (None: newest) in a run folder.  Raises ConfigError if none exists."""
+    """The checkpoint file at this path, or of this version (None: newest) in a run folder.  Raises ConfigError if missing."""
     if not what.is_dir():
         if what.is_file():
             return what
