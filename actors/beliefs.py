@@ -1,4 +1,4 @@
-"""Publishes what an in-context policy believes of its task; without a subscriber nothing is computed."""
+"""Publishes the belief of an in-context policy about its task; computes nothing without a subscriber."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from icrl_dist.types import Identity, Variation
 _log = logging.getLogger(__name__)
 
 PERIOD_S = 1.0
-"""At most so often, and"""
+"""Shortest time between two messages, in seconds."""
 SHARE = 1 / 200
-"""never more than this share of the worker's time."""
+"""Largest share of the worker's time that beliefs may take."""
 
 
 class BeliefPublisher:
-    """The ``look`` of ``collect.kinds.do``: reads a policy's belief and publishes it.
+    """The ``look`` argument of ``collect.kinds.do``: reads the policy's belief and publishes it.
 
-    It draws nothing, changes nothing of the policy, and raises nothing, so trajectories are the same,
-    byte for byte, with and without a subscriber.
+    It makes no random draws, does not change the policy and raises no errors, so trajectories have the same
+    bytes with and without a subscriber.
     """
 
     def __init__(self, link: Link, key: str, worker: str, problem: Problem) -> None:
-        """``key``: where on the monitor plane."""
+        """``key``: key of the messages on the monitor plane."""
         self._link, self._key, self._worker, self._problem = link, key, worker, problem
-        self._at = 0.0
+        self._next = 0.0
         self._reader: tuple[Variation, BeliefReader] | None = None
 
     def __call__(self, policy: Policy, row: int, identity: Identity, variation: Variation) -> None:
-        """Publish the belief of environment ``row`` if there is a subscriber, and not too often."""
+        """Publish the belief of environment ``row``, if there is a subscriber and the limits above allow it."""
         now = time.monotonic()
-        if now < self._at or self._problem.belief is None:
+        if now < self._next or self._problem.belief is None:
             return
-        spent = time.thread_time()
+        began = time.thread_time()
         try:
             if self._link.has_subscribers(self._key):
                 self._link.publish(self._key, self._message(policy, row, identity, variation), droppable=True)
         except Exception as error:
-            _log.warning("a belief is lost: %s", error)
-        self._at = now + max(PERIOD_S, (time.thread_time() - spent) / SHARE)
+            _log.warning("a belief could not be published: %s", error)
+        self._next = now + max(PERIOD_S, (time.thread_time() - began) / SHARE)
 
     def _message(self, policy: Policy, row: int, identity: Identity, variation: Variation) -> bytes:
         assert self._problem.belief is not None

@@ -1,4 +1,4 @@
-"""A worker: ask for a job, do it, stream every trajectory, ask again."""
+"""Rollout worker: requests jobs from the learner, does them and sends each trajectory when its episode ends."""
 
 from __future__ import annotations
 
@@ -35,37 +35,38 @@ from icrl_dist.types import Identity, Job, Payload, Trajectory
 _log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.5
+"""Seconds between heartbeats."""
 
 
 class Worker:
-    """One worker on its own link.  Nothing is pushed at it; it holds at most one job."""
+    """One worker on its own link.  It requests its jobs and has at most one at a time."""
 
     def __init__(self, link: Link, run_name: str, name: str, patience_s: float = 60.0, folder: Path | None = None) -> None:
-        """``patience_s``: how long the learner may be away before the worker gives up.
+        """``patience_s``: seconds without an answer of the learner after which the worker ends.
 
-        ``folder``: the run folder, for a worker that has its process to itself: there it leaves
-        its crash records, and its stacks when it must end because a job outlasts its deadline.
+        ``folder``: the run folder, for a worker that is the only one in its process.  The worker writes its
+        crash records there, and the stacks of its threads when the watchdog ends it after a deadline.
         """
         self._link, self._keys, self.name, self._patience_s = link, StreamKeys(run_name), name, patience_s
         self._folder = folder
         self._stop = threading.Event()
         self._episodes = self._steps = 0
         self._job = self._doing = ""
-        self._weights, self._reached = -1, 0
+        self._policy_version, self._reached = -1, 0
         self._publisher = TrajectoryPublisher(link, self._keys, name)
 
     def stop(self) -> None:
-        """End after the job at hand."""
+        """End after the current job."""
         self._stop.set()
 
     def run(self) -> None:
-        """Work until the learner says stop.
+        """Do jobs until the learner answers ``stop``.
 
-        Raises Refused if the learner refuses this worker, Unanswered if the learner is away for
+        Raises Refused if the learner refuses this worker, Unanswered if the learner does not answer for
         longer than ``patience_s``.
         """
         self._link.announce(self._keys.alive(self.name))
-        _, hello = self._ask("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
+        _, hello = self._request("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
         run = parse(read(messages.Welcome, hello, "hello").run, "the learner's run")
         problem, method = problems.of(run), methods.of(run)
         weights = WeightCache(self._link, self._keys, method.build(problem.spec, run), run.stream.max_message_bytes)
@@ -74,16 +75,16 @@ class Worker:
         watchdog = Watchdog(self._folder, self.name)
         with contextlib.closing(watchdog), contextlib.closing(sender), self._heartbeat(sender):
             while not self._stop.is_set():
-                kind, fields = self._ask("ask", **self._count(sender))
+                kind, fields = self._request("ask", **self._count(sender))
                 if kind == "stop":
                     return
                 if kind == "wait":
                     self._stop.wait(read(messages.Wait, fields, kind).seconds)
                 else:
                     lease = read(messages.LeasedJob, fields, kind)
-                    job = wire.decode_job(lease.job, functools.partial(_payload, problem))
-                    waiting = _Waiting(weights, watchdog)
-                    work = functools.partial(kinds.do, job, problem, method, waiting, self.name, self._tell, beliefs)
+                    job = wire.decode_job(lease.job, functools.partial(_read_payload, problem))
+                    paused = _PausedWatchdog(weights, watchdog)
+                    work = functools.partial(kinds.do, job, problem, method, paused, self.name, self._report, beliefs)
                     self._do(job, work, lease.deadline_s, sender, watchdog, run.stream.lease_s)
 
     def _do(
@@ -95,8 +96,8 @@ class Worker:
         watchdog: Watchdog,
         drain_s: float,
     ) -> None:
-        """Do a job, each trajectory within ``deadline_s``; waiting for others does not count."""
-        self._job, self._weights = job.label, job.policy_version
+        """Do a job, each trajectory within ``deadline_s``, not counting the time in which it waits for the learner."""
+        self._job, self._policy_version = job.label, job.policy_version
         made: set[Identity] = set()
         try:
             trajectories = work()
@@ -109,35 +110,35 @@ class Worker:
             self._publisher.flush()
             sender.drain(timeout_s=drain_s)
         except Unanswered as error:
-            _log.warning("job %s given back: %s", job.label, error)
+            _log.warning("job %s ended without its result, so the learner leases it again: %s", job.label, error)
         except Exception as error:
             _log.exception("job %s failed", job.label)
             refused = isinstance(error, Refused)  # then the reason names the trajectory
-            under_way = None if refused else next((identity for identity in job.identities() if identity not in made), None)
-            record = crash_reports.raised(self.name, job, under_way, error)
-            _settle(sender, drain_s)
-            self._ask("failed", job=list(job.name), record=record, file=self._keep(record))
+            current = None if refused else next((identity for identity in job.identities() if identity not in made), None)
+            record = crash_reports.raised(self.name, job, current, error)
+            _drain(sender, drain_s)
+            self._request("failed", job=list(job.name), record=record, file=self._write(record))
         finally:
             self._job, self._doing, self._reached = "", "", 0
 
-    def _tell(self, text: str, note: bool = False, reached: int = 0) -> None:
-        """A note goes to whoever looks at the run; anything else with the next heartbeat."""
+    def _report(self, text: str, note: bool = False, reached: int = 0) -> None:
+        """Send a note to the learner at once; other texts are part of the next heartbeat."""
         if note:
-            self._ask("note", text=text)
+            self._request("note", text=text)
         else:
             self._doing, self._reached = text, reached
 
-    def _keep(self, record: dict[str, Any]) -> str:
-        """Write the record into the run folder, if that is on this machine; the file's name."""
+    def _write(self, record: dict[str, Any]) -> str:
+        """Write a crash record into the run folder, if it is on this node; returns the file name, or an empty string."""
         try:
             return crash_reports.write(self._folder, record).name if self._folder else ""
         except OSError as error:
-            _log.warning("the learner is to write this crash record: %s", error)
+            _log.warning("the crash record could not be written here, so the learner writes it: %s", error)
             return ""
 
-    def _ask(self, kind: str, **fields: object) -> tuple[str, dict[str, Any]]:
+    def _request(self, kind: str, **fields: object) -> tuple[str, dict[str, Any]]:
         payload = wire.encode_message(kind, worker=self.name, **fields)
-        reply = patiently(lambda: self._link.request(self._keys.work, payload, timeout_s=5.0), self._patience_s)
+        reply = request_with_retries(lambda: self._link.request(self._keys.work, payload, timeout_s=5.0), self._patience_s)
         return wire.decode_message(reply)
 
     def _count(self, sender: CreditSender) -> dict[str, float]:
@@ -151,7 +152,7 @@ class Worker:
 
     @contextlib.contextmanager
     def _heartbeat(self, sender: CreditSender) -> Iterator[None]:
-        """Meanwhile tell the monitor plane how it goes, from a thread that is not stuck when the work is."""
+        """Send heartbeats to the monitor plane meanwhile, from a thread of its own, so a job cannot block them."""
         ended = threading.Event()
 
         def beat() -> None:
@@ -162,7 +163,7 @@ class Worker:
                     "job": self._job,
                     "doing": self._doing,
                     "reached": self._reached,
-                    "policy_version": self._weights,
+                    "policy_version": self._policy_version,
                     "pid": os.getpid(),
                     "time": time.time(),
                 }
@@ -171,7 +172,7 @@ class Worker:
                     self._link.publish(key, message, droppable=True)
                     self._publisher.flush()
                 except LinkError as error:
-                    _log.warning("a heartbeat is lost: %s", error)
+                    _log.warning("a heartbeat could not be sent: %s", error)
                 if ended.wait(HEARTBEAT_S):
                     return
 
@@ -184,12 +185,12 @@ class Worker:
             thread.join(5.0)
 
 
-def _payload(problem: Problem, kind: str, data: Any) -> Payload:
+def _read_payload(problem: Problem, kind: str, data: Any) -> Payload:
     return kinds.read_payload(kind, problem, data)
 
 
-class _Waiting:
-    """The policy as jobs see it: waiting for the weights is no environment's fault."""
+class _PausedWatchdog:
+    """The weights that a job requests; the watchdog pauses while the worker waits for them."""
 
     def __init__(self, weights: WeightCache, watchdog: Watchdog) -> None:
         self._weights, self._watchdog = weights, watchdog
@@ -204,22 +205,22 @@ def _next(work: Iterator[Trajectory], watchdog: Watchdog, deadline_s: float) -> 
         return next(work, None)
 
 
-def _settle(sender: CreditSender, timeout_s: float) -> None:
-    """What the job made until it failed is stored or refused before the next one begins."""
+def _drain(sender: CreditSender, timeout_s: float) -> None:
+    """Wait until the learner has stored or refused the trajectories of a failed job, so the next job starts without them."""
     while True:
         try:
             sender.drain(timeout_s)
         except Refused as error:
-            _log.warning("refused as well: %s", error)
+            _log.warning("another trajectory of the failed job was refused: %s", error)
         except Unanswered as error:
-            _log.warning("still being sent: %s", error)
+            _log.warning("trajectories of the failed job are not answered yet: %s", error)
             return
         else:
             return
 
 
-def patiently(request: Callable[[], bytes], patience_s: float) -> bytes:
-    """Ask again while the learner is away.  Raises Unanswered after ``patience_s``, Refused at once."""
+def request_with_retries(request: Callable[[], bytes], patience_s: float) -> bytes:
+    """Repeat a request until the learner answers.  Raises Unanswered after ``patience_s``, Refused at once."""
     deadline, pause = time.monotonic() + patience_s, 0.05
     while True:
         try:

@@ -1,4 +1,4 @@
-"""What the learner must remember to go on: weights, optimizer, and where it stood."""
+"""The learner's checkpoints: weights, optimizer state and manifest."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from icrl_dist.config.run import ConfigError, Run, dumps
 from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.problems import registry
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
-from icrl_dist.stream.wire import weights_digest
+from icrl_dist.stream import wire
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.types import Spec, Weights
 
 PARTIAL = "partial.npz"
+"""File name of the checkpoint of a fit that is not finished."""
 
 
 def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]:
-    """What a checkpoint says of itself: enough to deploy it, and to know where it comes from."""
+    """The manifest of a checkpoint: what its deployment needs, and its origin."""
     return {
         "method": run.method,
         "version": version,
@@ -42,36 +43,38 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
 
 
 def weights(version: int, model: nn.Module) -> Weights:
-    """The model's parameters as policy version ``version``, with their digest."""
+    """The parameters of the model as policy version ``version``, with their digest."""
     arrays = weights_of(model)
-    return Weights(version, arrays, weights_digest(arrays))
+    return Weights(version, arrays, wire.weights_digest(arrays))
 
 
 def save(path: Path, weights: Weights, opt: Optimizer, about: Mapping[str, Any]) -> None:
-    """Write weights, the optimizer's moments and the manifest atomically."""
+    """Write weights, optimizer state and manifest atomically."""
     arrays = {f"model/{name}": value for name, value in weights.arrays.items()}
     arrays |= {f"optimizer/{name}": value.cpu().numpy() for name, value in opt.state().items()}
     save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights.digest}))
 
 
 def read_manifest(path: Path) -> Mapping[str, Any]:
-    """A checkpoint's manifest alone."""
+    """The manifest of a checkpoint."""
     return load_checkpoint(path).manifest
 
 
 def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping[str, Any]:
-    """Load what ``save`` wrote into model and optimizer; returns the manifest.
+    """Load a checkpoint of ``save`` into model and optimizer; returns the manifest.
 
     Raises ConfigError for a checkpoint of another spec, another model size or another optimizer.
     """
     checkpoint = load_checkpoint(path)
-    theirs = spec_from(checkpoint.manifest["spec"])
-    if theirs != spec:
-        raise ConfigError(f"{path}: a checkpoint of another spec ({theirs}), this run needs {spec}: use another --out")
+    found = spec_from(checkpoint.manifest["spec"])
+    if found != spec:
+        raise ConfigError(f"{path}: a checkpoint of another spec ({found}), this run needs {spec}: use another --out")
     try:
         load_weights(model, checkpoint.part("model"))
     except RuntimeError as error:
-        raise ConfigError(f"{path}: a checkpoint of another model ({' '.join(str(error).split())})") from None
+        raise ConfigError(
+            f"{path}: a checkpoint of another model ({' '.join(str(error).split())}): use another --out"
+        ) from None
     try:
         opt.load({name: torch.from_numpy(np.array(value)) for name, value in checkpoint.part("optimizer").items()})
     except ValueError as error:
@@ -79,12 +82,12 @@ def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping
     return checkpoint.manifest
 
 
-def given_up(folder: Path, version: int) -> dict[str, str]:
-    """The variations that were quarantined up to a version, and why."""
+def quarantined(folder: Path, version: int) -> dict[str, str]:
+    """The variations that were quarantined up to a version: name and cause of each."""
     return dict(read_manifest(version_file(folder, version)).get("quarantined", {})) if version >= 0 else {}
 
 
 def weights_of_file(path: Path, version: int) -> Weights:
-    """The weights in a checkpoint, as they were broadcast.  Raises StoreError if there is none."""
+    """The weights in a checkpoint, with their digest.  Raises StoreError if there is no checkpoint."""
     arrays = load_checkpoint(path).part("model")
-    return Weights(version, arrays, weights_digest(arrays))
+    return Weights(version, arrays, wire.weights_digest(arrays))

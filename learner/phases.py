@@ -1,4 +1,4 @@
-"""What a run still needs: its phases, the jobs of each, and what the store holds of them."""
+"""The phases of a run: their jobs, and which trajectories of them are stored."""
 
 from __future__ import annotations
 
@@ -10,47 +10,49 @@ from icrl_dist.types import Identity, Job
 
 
 class PhasePlan:
-    """A method's phases and what the dataset holds of each."""
+    """The phases of a method, and how much data of each the dataset holds."""
 
-    def __init__(self, run: Run, lineage: Lineage, store: Dataset, method: Method, given_up: dict[str, str]) -> None:
+    def __init__(self, run: Run, lineage: Lineage, store: Dataset, method: Method) -> None:
         self.method = method
         self.phases = self.method.phases(run)
-        self.given_up = given_up
-        """Variations that are quarantined, ``adapt/0/3/1``, and why."""
+        self.quarantined: dict[str, str] = {}
+        """The cause of each quarantined variation, by its name, such as ``adapt/0/3/1``."""
         self._staleness, self._lineage, self._store = run.stream.staleness, lineage, store
-        self._whole: set[Phase] = set()
-        self._asked: dict[Phase, tuple[Job, ...]] = {}
+        self._complete: set[Phase] = set()
+        self._jobs: dict[Phase, tuple[Job, ...]] = {}
 
     def ask(self, phase: Phase) -> tuple[Job, ...]:
-        """The phase's jobs, computed once, with the numbers of the run that first collected it."""
-        if phase not in self._asked:
-            self._asked[phase] = self.method.ask(self._lineage.run_of(phase.next_version), phase)
-        return self._asked[phase]
+        """The jobs of a phase, computed once, with the settings of the run that first collected it."""
+        if phase not in self._jobs:
+            self._jobs[phase] = self.method.ask(self._lineage.run_of(phase.next_version), phase)
+        return self._jobs[phase]
 
     def next(self, version: int) -> Phase | None:
-        """The first phase that is not fitted, or whose data is not whole, given the newest version."""
-        return next((phase for phase in self.phases if phase.next_version > version or not self.whole(phase)), None)
+        """The first phase that is not fitted, or whose data is not complete; ``version``: the newest one."""
+        return next((phase for phase in self.phases if phase.next_version > version or not self.is_complete(phase)), None)
 
-    def look_again(self) -> None:
-        """Look at every phase's data once more, for some may have been lost."""
-        self._whole.clear()
+    def recheck(self) -> None:
+        """Drop what is known of the data of all phases, because the store may have lost some of it."""
+        self._drop_quarantined()
+        self._complete.clear()
 
-    def whole(self, phase: Phase) -> bool:
-        """Whether nothing of the phase is missing."""
-        if phase not in self._whole and self._count(phase):
-            self._whole.add(phase)
-        return phase in self._whole
+    def is_complete(self, phase: Phase) -> bool:
+        """Whether all trajectories of the phase are stored, apart from quarantined variations."""
+        if phase not in self._complete and self._all_stored(phase):
+            self._complete.add(phase)
+        return phase in self._complete
 
-    def _count(self, phase: Phase) -> bool:
-        expected = sum(job.trials * sum(_name(job, *row) not in self.given_up for row in job.rows()) for job in self.ask(phase))
+    def _all_stored(self, phase: Phase) -> bool:
+        jobs = self.ask(phase)
+        expected = sum(job.trials * sum(_name(job, *row) not in self.quarantined for row in job.rows()) for job in jobs)
         return self._store.index.count(phase.stage, phase.round) >= expected
 
     def incomplete(self, phase: Phase) -> list[Job]:
-        """The phase's jobs of which something is missing."""
-        return [job for job in self.ask(phase) if len(self.have(job)) < job.trials * len(job.variations)]
+        """The jobs of the phase with missing trajectories."""
+        return [job for job in self.ask(phase) if len(self.not_needed(job)) < job.trials * len(job.variations)]
 
     def ahead(self, phase: Phase, version: int) -> list[Phase]:
-        """The phases after this one whose work may go out already: ``stream.staleness``."""
+        """The later phases whose jobs may be leased during this one, by ``stream.staleness``; ``version``: the newest one."""
         newest = version + self._staleness
         return [
             p
@@ -58,26 +60,30 @@ class PhasePlan:
             if p.next_version > max(version, phase.next_version) and version >= 0 and p.policy_version <= newest
         ]
 
-    def have(self, job: Job) -> list[Identity]:
-        """What need not be asked for: what is stored, and what was given up before."""
+    def not_needed(self, job: Job) -> list[Identity]:
+        """The identities of a job that need not be collected: stored ones and those of quarantined variations."""
         stored = self._store.index.identities(job.stage, job.round, (job.task, job.task + job.tasks))
-        given_up = {row for row in job.rows() if _name(job, *row) in self.given_up}
-        return stored + [i for i in job.identities() if (i.task, i.variation) in given_up]
+        quarantined = {row for row in job.rows() if _name(job, *row) in self.quarantined}
+        return stored + [i for i in job.identities() if (i.task, i.variation) in quarantined]
 
-    def acting(self, job: Job, version: int) -> int:
-        """The version that acts in a job: its own, or the newest while rounds overlap.
+    def policy_version(self, job: Job, version: int) -> int:
+        """The policy version that acts in a job: the job's own, or the newest (``version``) while rounds overlap.
 
-        One T^j acts in all trials of a job, so what is stored of it decides.
+        The same T^j acts in all trials of a job, so the version in its stored trajectories has priority.
         """
         if job.policy_version < 0:
             return job.policy_version
-        acted = self._store.index.policy_versions(job.stage, job.round, (job.task, job.task + job.tasks))
-        return acted[0] if acted else min(version, job.policy_version)
+        stored = self._store.index.policy_versions(job.stage, job.round, (job.task, job.task + job.tasks))
+        return stored[0] if stored else min(version, job.policy_version)
 
-    def give_up(self, variations: dict[str, str]) -> None:
-        """Leave variations out from now on; some of their trials may be there, and which ones is chance."""
-        self.given_up.update(variations)
-        for name in self.given_up:
+    def quarantine(self, variations: dict[str, str]) -> None:
+        """Leave these variations (name: cause) out from now on."""
+        self.quarantined.update(variations)
+        self._drop_quarantined()
+
+    def _drop_quarantined(self) -> None:
+        """Remove their trials from the index, because which of them are stored depends on the timing of workers."""
+        for name in self.quarantined:
             stage, *numbers = name.split("/")
             round_, task, variation = map(int, numbers)
             self._store.index.drop((stage, round_, task, variation))

@@ -1,4 +1,4 @@
-"""The learner: hand out a phase's work, take it in, fine-tune, broadcast, and so on."""
+"""The learner: for each phase, opens its jobs, stores the trajectories, fits the model and publishes its weights."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
@@ -22,10 +21,10 @@ from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.stream.link import Link, StreamKeys
 from icrl_dist.telemetry.metrics import Metrics
-from icrl_dist.training import fit
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
 from learner.broadcast import Broadcast
+from learner.fitting import Fitting
 from learner.ingest import Ingest
 from learner.phases import PhasePlan
 from learner.reporter import Reporter
@@ -36,41 +35,37 @@ Report = Callable[[dict[str, Any]], None]
 
 
 class RunFailed(RuntimeError):  # noqa: N818
-    """The run cannot go on; the message is one line for the user."""
+    """The run cannot continue; the message is one line for the user."""
 
 
 class Interrupted(Exception):  # noqa: N818
-    """The run was asked to stop; a checkpoint has been written."""
+    """The run ended because of ``Service.stop``; a checkpoint is written."""
 
 
 class Service:
-    """One run's learner.  ``report`` receives what happens as plain dicts, for a terminal."""
+    """The learner of one run.  ``report`` is called with every event as a dict, for a terminal."""
 
     def __init__(self, run: Run, folder: Path, link: Link, report: Report) -> None:
-        """Opens the run folder and takes up where its checkpoints and dataset end.
+        """Opens the run folder and continues from its checkpoints and its dataset.
 
-        Raises StoreError if another learner is at work there, or if it cannot be used.
+        Raises StoreError if another learner uses the folder, or if its files cannot be used.
         """
         self._run, self._folder, self._link, self._report = run, folder, link, report
         with contextlib.ExitStack() as closing:
             closing.enter_context(files.hold(folder))
-            self._begin(closing)
+            self._open(closing)
             self._closing = closing.pop_all()
 
-    def _begin(self, closing: contextlib.ExitStack) -> None:
+    def _open(self, closing: contextlib.ExitStack) -> None:
+        """Create the parts of the learner; ``closing`` gets the function that closes each."""
         run, folder, link, report = self._run, self._folder, self._link, self._report
         self._keys = StreamKeys(folder.name)
         self._spec = registry.of(run).spec
         lineage = Lineage.of(folder, run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
-        torch.manual_seed(run.seed)
-        torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self._device = _device(run.learner.device)
         self._method = methods.of(run)
-        self.model = self._method.build(self._spec, run).to(self._device)
-        self._opt = fit.Optimizer(self.model, run.optim)
-        self.version = checkpoint.newest_version(folder)
-        self._partial = 0
+        self._fitting = Fitting(run, folder, self._method, self._spec, self._device, self._threads)
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
         self._reporter = Reporter(run, folder, link, self._keys, self._metrics, report, lambda: self.version)
@@ -81,42 +76,48 @@ class Service:
         self._changed = threading.Event()
         self._error: BaseException | None = None
         self._lag = 0
-        self._mended = 0
+        self._repairs = 0
         self.store = Dataset(folder / "dataset")
         closing.callback(self.store.close)
-        self._tell_repairs()
-        self._plan = PhasePlan(run, lineage, self.store, self._method, {})
-        self._plan.give_up(checkpoints.given_up(folder, self.version))
-        self._opened: set[Phase] = set()
-        self._broadcast = Broadcast(link, self._keys, self._older)
+        self._report_repairs()
+        self._plan = PhasePlan(run, lineage, self.store, self._method)
+        self._plan.quarantine(checkpoints.quarantined(folder, self.version))
+        self._open_phases: set[Phase] = set()
+        self._broadcast = Broadcast(link, self._keys, self._load_weights)
         self.ingest = Ingest(
             self.store,
             self._spec,
             run.stream.max_message_bytes,
-            self._wants,
+            self._pending_job,
             self._broadcast.digest_of,
             self._stored,
             self.fail,
         )
         closing.callback(self.ingest.close)
-        acting = lambda job: self._plan.acting(job, self.version)  # noqa: E731
+        policy_version = lambda job: self._plan.policy_version(job, self.version)  # noqa: E731
         fail = lambda line: self.fail(RunFailed(line))  # noqa: E731
         report = self._reporter.event
-        self.worker_api = WorkerAPI(run, folder, link, self._keys, self._scheduler, self._lock, report, fail, acting)
+        self.worker_api = WorkerAPI(run, folder, link, self._keys, self._scheduler, self._lock, report, fail, policy_version)
         closing.callback(self.worker_api.close)
-        self._taking = False
-        self._take_up()
+        self._serving = False
+        if newest := self._fitting.resume():
+            self._broadcast.publish(newest)
+
+    @property
+    def version(self) -> int:
+        """The newest policy version; -1 before the first."""
+        return self._fitting.version
 
     @property
     def device(self) -> str:
-        """Where fits run, and with what: ``cuda, NVIDIA H100``, ``cpu, 2 threads``."""
-        kind = self._device
-        return f"cuda, {torch.cuda.get_device_name(kind)}" if kind.type == "cuda" else f"cpu, {self._threads} threads"
+        """The device of fits: ``cuda, NVIDIA H100`` or ``cpu, 2 threads``."""
+        device = self._device
+        return f"cuda, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else f"cpu, {self._threads} threads"
 
-    # What other threads call.
+    # Called from other threads.
 
     def stop(self) -> None:
-        """Ask the run to end soon, with a checkpoint."""
+        """End the run soon, with a checkpoint."""
         self._stop.set()
         self._changed.set()
 
@@ -125,7 +126,8 @@ class Service:
         self._error = error
         self._changed.set()
 
-    def _wants(self, identity: Identity) -> Job | None:
+    def _pending_job(self, identity: Identity) -> Job | None:
+        """The job that this trajectory is missing from; None if it is stored or was not requested."""
         with self._lock:
             job = self._scheduler.pending_job(identity)
             if job is None:
@@ -133,6 +135,7 @@ class Service:
             return job
 
     def _stored(self, trajectory: Trajectory) -> None:
+        """Record that a trajectory is stored."""
         identity = trajectory.identity
         with self._lock:
             self._scheduler.received(identity, time.monotonic())
@@ -143,16 +146,17 @@ class Service:
         if done:
             self._changed.set()
 
-    def _older(self, version: int) -> Weights:
+    def _load_weights(self, version: int) -> Weights:
+        """The weights of an earlier version, from its checkpoint."""
         return checkpoints.weights_of_file(checkpoint.version_file(self._folder, version), version)
 
-    # The run, on the caller's thread.
+    # Called from the thread of ``run``.
 
     def run(self) -> dict[str, Any]:
-        """Go through the method's phases to the end; returns the result that was stored.
+        """Run all phases of the method; returns digests, counts and versions for ``result.json``.
 
-        Raises Interrupted after ``stop`` (a checkpoint has been written), RunFailed or
-        StoreError if the run cannot go on.
+        Raises Interrupted after ``stop``, when a checkpoint is written; RunFailed or StoreError if the
+        run cannot continue.
         """
         try:
             result = self._run_phases()
@@ -169,8 +173,8 @@ class Service:
         self._reporter.describe(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
         while (phase := self._plan.next(self.version)) is not None:
             if phase.next_version <= self.version:
-                lost = ", ".join(job.label for job in self._plan.incomplete(phase))
-                self._reporter.event({"event": "note", "text": f"trajectories of {lost} are missing: collecting them again"})
+                jobs = ", ".join(job.label for job in self._plan.incomplete(phase))
+                self._reporter.event({"event": "note", "text": f"trajectories of {jobs} are missing: collecting them again"})
             try:
                 self._collect(phase)
                 if phase.next_version > self.version:
@@ -178,9 +182,8 @@ class Service:
             except Damaged as error:
                 self._reporter.event({"event": "note", "text": str(error)})
                 self.store.repair()
-                self._tell_repairs()
-                self._plan.give_up({})
-                self._plan.look_again()
+                self._report_repairs()
+                self._plan.recheck()
         self.store.seal()
         return {
             "dataset_digest": self.store.digest(),
@@ -189,8 +192,8 @@ class Service:
             "trajectories": len(self.store),
             "drops": dict(self.ingest.drops),
             "resent": self.worker_api.resent,
-            "repaired": self._mended,
-            "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.given_up.items()],
+            "repaired": self._repairs,
+            "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.quarantined.items()],
             "staleness": self._run.stream.staleness,
             "lag": {str(lag): count for lag, count in self.store.index.lags().items()},
             "threads": self._threads,
@@ -198,32 +201,36 @@ class Service:
         }
 
     def close(self) -> None:
-        """Stop taking in and let go of the files."""
+        """Stop storing trajectories and close all files."""
         self._closing.close()
 
-    def _open(self, phase: Phase) -> None:
-        """Put a phase's work on the LeaseScheduler, and that of phases which may run ahead of it."""
+    def _open_phase(self, phase: Phase) -> None:
+        """Open the jobs of a phase for leasing, and those of later phases that may overlap with it."""
         for one in (phase, *self._plan.ahead(phase, self.version)):
-            if one not in self._opened:
+            if one not in self._open_phases:
                 jobs = self._plan.ask(one)
                 with self._lock:
-                    self._scheduler.open(jobs, self._plan.have)
-                self._opened.add(one)
+                    self._scheduler.open(jobs, self._plan.not_needed)
+                self._open_phases.add(one)
 
     def _collect(self, phase: Phase) -> None:
-        self._open(phase)
+        """Open a phase and wait until each of its trajectories is stored or quarantined.
+
+        Raises RunFailed if all are quarantined.
+        """
+        self._open_phase(phase)
         self._reporter.phase_started()
         with self._lock:
-            already, _ = self._scheduler.progress(phase.stage, phase.round)
-        if not self._taking:  # earlier, nothing was expected yet: what comes meanwhile is sent again
+            before, _ = self._scheduler.progress(phase.stage, phase.round)
+        if not self._serving:  # not before the first phase is open: until then every trajectory would be unexpected
             self._link.serve(self._keys.data, self.ingest.put)
-            self._taking = True
+            self._serving = True
         began = time.monotonic()
         while True:
             with self._lock:
                 arrived, expected = self._scheduler.progress(phase.stage, phase.round)
                 done = self._scheduler.done(phase.stage, phase.round)
-            per_s = (arrived - already) / max(1e-3, time.monotonic() - began)
+            per_s = (arrived - before) / max(1e-3, time.monotonic() - began)
             self._progress("collect", phase, arrived, expected, per_s=per_s, force=done)
             if done:
                 break
@@ -232,14 +239,14 @@ class Service:
             self._changed.clear()
         with self._lock:
             leases = self._scheduler.leases(phase.stage, phase.round)
-            blamed = dict(self._scheduler.quarantine_causes(phase.stage, phase.round))
+            causes = dict(self._scheduler.quarantine_causes(phase.stage, phase.round))
             self._scheduler.close(phase.stage, phase.round)
-            self._opened.discard(phase)
-        self._plan.give_up(blamed)
+            self._open_phases.discard(phase)
+        self._plan.quarantine(causes)
         if not self.store.index.count(phase.stage, phase.round):
             raise RunFailed(
-                f"{phase.stage}/{phase.round}: no trajectory was stored, and {len(blamed)} of its variations are "
-                f"quarantined; first: {next(iter(blamed.values()))}"
+                f"{phase.stage}/{phase.round}: no trajectory was stored, and {len(causes)} of its variations are "
+                f"quarantined; first: {next(iter(causes.values()))}"
             )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         quality = self._method.label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
@@ -247,75 +254,41 @@ class Service:
             self._reporter.labels_rated(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
+        """Fit the model to the data of a phase, write its checkpoint and publish its weights."""
         draw = self._method.data(self._run, phase, self.store) if phase.steps else None
-        optim, torch_threads = self._run.optim, torch.get_num_threads()
-        torch.set_num_threads(self._threads)
         began = time.monotonic()
-        partial = self._folder / "checkpoints" / checkpoints.PARTIAL
 
-        def loss_of(step: int) -> torch.Tensor:
-            assert draw is not None
-            rng = generator(self._run.seed, RandomKey.FIT, phase.next_version, step)
-            torch.manual_seed(int(rng.integers(2**31)))
-            return self._method.loss(self.model, draw(rng))
-
-        def progress(step: int, loss: float) -> None:
-            self._partial = step  # damage may end this fit: it is taken up from here
+        def report(step: int, loss: float) -> None:
             self._progress("fit", phase, step, phase.steps, loss=loss, force=step == phase.steps)
             if step % 50 == 0 or step == phase.steps:
                 self._metrics.write(step, f"fit/{phase.next_version}", loss=loss)
-            if self._stop.is_set() or step % 1000 == 0:
-                self._save(partial, self._weights(), next_version=phase.next_version, step=step)
-            self._check()
 
-        first = self._partial
-        try:
-            loss = fit.fit(self.model, self._opt, optim, phase.learning_rate, phase.steps, loss_of, progress, first)
-        finally:
-            torch.set_num_threads(torch_threads)
-        self._partial = 0
-        self.version = phase.next_version
+        loss = self._fitting.fit(phase, draw, report, self._stop, self._check)
         self.store.seal()
-        where = {
-            "dataset": self.store.manifest(),
-            "dataset_digest": self.store.digest(self.version),
-            "quarantined": self._plan.given_up,
-        }
-        weights = self._weights()
-        self._save(checkpoint.version_file(self._folder, self.version), weights, loss=loss, **where)
-        partial.unlink(missing_ok=True)
+        weights = self._fitting.save(
+            loss=loss,
+            dataset=self.store.manifest(),
+            dataset_digest=self.store.digest(self.version),
+            quarantined=self._plan.quarantined,
+        )
         self._broadcast.publish(weights)
         self._reporter.fitted(loss, time.monotonic() - began)
 
-    def _weights(self) -> Weights:
-        """The model's parameters, hashed once."""
-        return checkpoints.weights(self.version, self.model)
-
-    def _save(self, path: Path, weights: Weights, **where: object) -> None:
-        about = checkpoints.manifest(self._run, self._spec, self.version, self._threads)
-        checkpoints.save(path, weights, self._opt, {**about, **where})
-
-    def _take_up(self) -> None:
-        """Continue from the newest version, and from the fit that was interrupted, if there are any."""
-        if self.version >= 0:
-            checkpoints.restore(checkpoint.version_file(self._folder, self.version), self._spec, self.model, self._opt)
-            self._broadcast.publish(self._weights())
-        partial = self._folder / "checkpoints" / checkpoints.PARTIAL
-        if partial.exists() and checkpoints.read_manifest(partial)["next_version"] == self.version + 1:
-            self._partial = checkpoints.restore(partial, self._spec, self.model, self._opt)["step"]
-
-    def _tell_repairs(self) -> None:
-        self._mended += len(self.store.repaired)
+    def _report_repairs(self) -> None:
+        """Report the damaged data that was removed when the dataset was opened."""
+        self._repairs += len(self.store.repaired)
         for note in self.store.repaired:
             self._reporter.event({"event": "repaired", "text": note})
 
     def _check(self) -> None:
+        """Raises the error of ``fail``, or Interrupted after ``stop``."""
         if self._error is not None:
             raise self._error
         if self._stop.is_set():
             raise Interrupted
 
     def _progress(self, what: str, phase: Phase, done: int, total: int, force: bool, **values: float) -> None:
+        """Report the progress of a phase: ``what`` is ``collect`` or ``fit``; ``force`` as in ``Reporter.progress``."""
         fields: dict[str, Any] = {
             "stage": what,
             "round": phase.round,
@@ -334,6 +307,7 @@ class Service:
 
 
 def _device(name: str) -> torch.device:
+    """The device of ``learner.device``.  Raises RunFailed if it is ``cuda`` and torch finds no GPU."""
     if name == "cuda" and not torch.cuda.is_available():
-        raise RunFailed("learner.device = 'cuda': no GPU is seen by torch; use auto or cpu")
+        raise RunFailed("learner.device = 'cuda': torch finds no GPU; use auto or cpu")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -1,1 +1,1 @@
-"""The trained model as a user deploys it: load, act, observe, out-of-distribution score."""
+"""Agents: load a trained model, act, observe, out-of-distribution (OOD) score."""

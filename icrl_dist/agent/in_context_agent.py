@@ -1,4 +1,4 @@
-"""The trained model as a user deploys it: act, observe.  It depends on no environment."""
+"""The deployed agent: act and observe.  It needs no environment of this package."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from icrl_dist.models.outcome_readout import OutcomeModel
 class InContextAgent:
     """T_theta deployed in B environments at once, without weight updates.
 
-    ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` says what happened.  Deployed by
-    ``paper`` (Algorithm 1) that joins the context D_on when the episode is done; by ``committed``,
-    the default for a model trained on windows, at once.
+    ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` records the transition.  With the deployment
+    rule ``paper`` (Algorithm 1) transitions join the context D_on at the end of the episode; with
+    ``committed``, the default for a model trained on action windows, they join it at once.
     """
 
     def __init__(
@@ -32,49 +32,49 @@ class InContextAgent:
         deploy: Deployment | None = None,
         outcomes: OutcomeModel | None = None,
     ) -> None:
-        """Raises ConfigError for a deployment that the model was not trained for."""
+        """Raises ConfigError for a deployment rule that the model was not trained for."""
         self._trained, self.spec = trained, trained.spec
         self.outcomes = outcomes
-        """What the model expects to happen, for ``surprise``; None if nobody asked it after training."""
+        """The model's prediction of outcomes, for ``surprise``; None for a checkpoint that was not calibrated."""
         self.manifest = manifest
-        """Where the agent comes from: method, version, digests, seeds, versions of the
-        libraries; in Dark Room also ``test_goals`` as ``[x, y]`` pairs, ``size``, ``horizon``."""
+        """Origin of the agent: method, version, digests, seeds and library versions; in Dark Room also
+        ``test_goals`` as ``[x, y]`` pairs, ``size`` and ``horizon``."""
         self.deploy: Deployment = deploy or trained.method.deployment(trained.run)
-        """The rule by which the context grows."""
+        """The deployment rule."""
         self._rng = np.random.default_rng(seed)
         self.reset_context()
 
     def reset_context(self, batch: int = 1) -> None:
-        """Forget everything and begin anew in ``batch`` environments, with the model's weights as they are now."""
+        """Start with an empty context in ``batch`` environments, with the current weights of the model."""
         self._surprise = Surprise(self.outcomes, self.spec, batch) if self.outcomes else None
         watch = self._surprise.observe if self._surprise else None
-        of = self._trained
-        self._policy: Any = of.method.policy(of.model, batch, of.run.context, self.deploy, watch)
+        trained = self._trained
+        self._policy: Any = trained.method.policy(trained.model, batch, trained.run.context, self.deploy, watch)
         self._batch = batch
 
     @property
     def model(self) -> torch.nn.Module:
-        """The model that acts."""
+        """The trained model."""
         return self._trained.model
 
     @property
     def surprise(self) -> Float[np.ndarray, " B"]:
-        """How unlike pretraining each environment has been over its last 100 transitions: when not to trust the agent.
+        """OOD score of each environment: how unlike pretraining its last 100 transitions are.
 
-        From the loss of the model's own predictions of what its actions bring, in training tasks
-        kept apart from the fit of these predictions: 0 is their median, 1 what one stretch of time
-        in a hundred reaches there.  0 before the first transition; only transitions after an
-        ``act`` count.  Raises ConfigError for a checkpoint that was not calibrated.
+        A high score means that the agent should not be trusted.  It is the loss of the model's predictions
+        of outcomes, scaled by the losses in training tasks that the predictions were not fitted to: 0 is
+        their median, 1 their 99th percentile.  It is 0 before the first transition, and only transitions
+        after an ``act`` count.  Raises ConfigError for a checkpoint that was not calibrated.
         """
         if self._surprise is None:
             raise ConfigError(
-                "surprise: this checkpoint was not calibrated, as the last one of a run is: "
-                "`icrl-dist train RUN --resume` calibrates a run's, `icrl-dist export` the file that it makes"
+                "surprise: this checkpoint was not calibrated: `icrl-dist train RUN --resume` calibrates the last one "
+                "of a run, `icrl-dist export` calibrates the file that it writes"
             )
-        return self._surprise.now()
+        return self._surprise.score()
 
     def act(self, obs: ArrayLike) -> Actions:
-        """One action for each observation of ``obs (B, S)``: numbers ``(B,)``, or vectors in [-1, 1] ``(B, A)``.
+        """Actions for the observations ``obs (B, S)``: numbers ``(B,)``, or vectors in [-1, 1] ``(B, A)``.
 
         Raises ValueError for a batch of another shape.
         """
@@ -82,15 +82,15 @@ class InContextAgent:
         return self._policy.act(states, self._rng.random((len(states), 1 if self.spec.discrete else self.spec.actions)))
 
     def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
-        """One transition of each environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, the others ``(B,)``.
+        """Record one transition per environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, others ``(B,)``.
 
-        ``done`` says where the episode ended.  Raises ValueError for another shape, or if only
-        some of the episodes ended: a batch shares one horizon.
+        ``done``: whether the episode ended.  Raises ValueError for another shape, or if only some of the
+        episodes ended: all environments of a batch have the same horizon.
         """
         spec, size = self.spec, self.spec.observation
         ended = self._shaped("done", done, np.bool_)
         if ended.any() != ended.all():
-            raise ValueError("done: the episodes of a batch end together; deploy unlike horizons in separate agents")
+            raise ValueError("done: the episodes of a batch must end together; use one agent per horizon")
         self._policy.observe(
             self._shaped("obs", obs, np.float32, size),
             self._shaped("action", action, *((np.int64,) if spec.discrete else (np.float32, spec.actions))),
@@ -102,17 +102,14 @@ class InContextAgent:
     def distribution(self, states: ArrayLike, row: int = 0) -> Float[np.ndarray, "Q A"]:
         """T_theta(. | s, D) over discrete actions at states ``(Q, S)``, given the context of environment ``row``.
 
-        What the agent would do anywhere, were it there: nothing that it does later is changed by asking.
-        Raises ValueError for vectors of actions.
+        The call does not change later actions.  Raises ValueError if actions are vectors.
         """
         if not self.spec.discrete:
-            raise ValueError(
-                "distribution: this agent's actions are vectors; only a distribution over discrete ones can be listed"
-            )
+            raise ValueError("distribution: the actions of this agent are vectors; use an agent with discrete actions")
         return self._policy.distribution(np.asarray(states, np.float32), row)
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
-        """D of ``distribution``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
+        """The context D of environment ``row``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
         return self._policy.context(row)
 
     def _shaped(self, name: str, value: ArrayLike, dtype: type, *rest: int) -> np.ndarray:

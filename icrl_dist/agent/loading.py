@@ -20,16 +20,16 @@ from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist.agent.shipped")))
 SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
-"""Agents that come with the package (docs/results/engine.md says how each was made)."""
+"""Names of the agents in the package; docs/results/engine.md describes the training of each."""
 
 
 def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | None = None) -> InContextAgent:
-    """The agent of a run folder (its newest version), of one checkpoint file, or a shipped one by its name.
+    """The agent of a run folder (its newest version), of a checkpoint file, or of the package, by its name.
 
-    ``load_agent("darkroom")`` works at once; a run folder of such a name is ``"./darkroom"``.
+    ``load_agent("darkroom")`` loads the agent of the package; write ``"./darkroom"`` for a run folder of that name.
 
-    Raises ConfigError if there is no such thing or it was not trained to be deployed so, StoreError
-    if it was not written by this system.  Loading executes no code from the file.
+    Raises ConfigError if there is no such agent or it was not trained for the rule ``deploy``, StoreError
+    if the file was not written by this system.  Loading executes no code from the file.
     """
     checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
@@ -37,32 +37,32 @@ def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | N
 
 
 def shipped(name: str | Path) -> Path:
-    """The checkpoint of an agent that comes with the package.  Raises ConfigError if there is none."""
+    """The checkpoint file of an agent in the package.  Raises ConfigError for an unknown name."""
     if name not in SHIPPED:
-        raise ConfigError(f"--pretrained {name}: no agent of that name is shipped; there are {', '.join(SHIPPED)}")
+        raise ConfigError(f"--pretrained {name}: no agent of that name in the package; there are {', '.join(SHIPPED)}")
     return _AGENTS / f"{name}.npz"
 
 
 def slim(checkpoint: Checkpoint) -> Checkpoint:
-    """What deployment needs of a checkpoint: the weights and where they come from, not the optimizer or the dataset's list."""
+    """The parts of a checkpoint that deployment needs: weights, outcome readout and manifest, without the dataset list."""
     manifest = {key: value for key, value in checkpoint.manifest.items() if key != "dataset"}
     return Checkpoint({k: v for k, v in checkpoint.arrays.items() if k.startswith(("model/", "outcomes/"))}, manifest)
 
 
 def is_slim(path: Path) -> bool:
-    """Whether a file is an agent as ``slim`` leaves it: to replace it loses nothing that training needs."""
+    """Whether a file holds only what ``slim`` keeps.  Such a file can be replaced: training does not need it."""
     try:
         checkpoint = load_checkpoint(path)
     except StoreError:
         return False
-    kept = slim(checkpoint)
-    return kept.arrays.keys() == checkpoint.arrays.keys() and kept.manifest.keys() == checkpoint.manifest.keys()
+    slimmed = slim(checkpoint)
+    return slimmed.arrays.keys() == checkpoint.arrays.keys() and slimmed.manifest.keys() == checkpoint.manifest.keys()
 
 
 def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda episodes: None) -> Checkpoint:
     """The checkpoint with the outcome readout of its model (``ood_score.calibrate``).
 
-    As it is if it has one, or if its method shows no states.
+    Returned unchanged if it has one, or if its method gives no states to ``watch``.
     """
     if checkpoint.part("outcomes"):
         return checkpoint
@@ -75,7 +75,7 @@ def calibrated(checkpoint: Checkpoint, progress: Callable[[int], None] = lambda 
 
 
 def checkpoint_file(what: Path, version: int | None = None) -> Path:
-    """The checkpoint at this path, or this (else the newest) version in a run folder."""
+    """The checkpoint file at this path, or of this version (None: newest) in a run folder.  Raises ConfigError if missing."""
     if not what.is_dir():
         if what.is_file():
             return what
@@ -87,9 +87,9 @@ def checkpoint_file(what: Path, version: int | None = None) -> Path:
 
 
 def trained(checkpoint: Checkpoint) -> TrainedModel:
-    """The model that a checkpoint holds, with the run that trained it.
+    """The model of a checkpoint, with the run that trained it.
 
-    Raises StoreError if the arrays are not those of the model that the manifest describes.
+    Raises StoreError if the arrays do not fit the model that the manifest describes.
     """
     try:
         run = parse(checkpoint.manifest["run"], "checkpoint")
@@ -102,9 +102,9 @@ def trained(checkpoint: Checkpoint) -> TrainedModel:
 
 
 def outcomes_of(checkpoint: Checkpoint) -> OutcomeModel | None:
-    """What the checkpoint's model expects to happen; None if it was not calibrated.
+    """The outcome readout of a checkpoint; None if it was not calibrated.
 
-    Raises StoreError if its arrays are others than a calibrated checkpoint's.
+    Raises StoreError if the names of its arrays are wrong.
     """
     try:
         return OutcomeModel.of(checkpoint.part("outcomes"))
@@ -113,6 +113,6 @@ def outcomes_of(checkpoint: Checkpoint) -> OutcomeModel | None:
 
 
 def spec_from(fields: dict[str, Any]) -> Spec:
-    """The inverse of ``dataclasses.asdict`` after a passage through JSON."""
+    """The spec from the fields that ``dataclasses.asdict`` gives, after JSON changed tuples to lists."""
     low, high = tuple(fields["low"]), tuple(fields["high"])
     return Spec(low, high, fields["actions"], fields["horizon"], fields["discrete"])

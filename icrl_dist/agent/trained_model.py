@@ -1,4 +1,4 @@
-"""A trained model and the run that it comes from."""
+"""A trained model with the run that trained it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrl_dist.types import Spec
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """What is needed to deploy a model."""
+    """A model, and the run, method and spec that its deployment needs."""
 
     run: Run
     method: Method

@@ -164,7 +164,7 @@ def _extrapolated(spent: np.ndarray, count: int, longest: int) -> float:
 def _training(job: Job, config: SACConfig, budget_s: float) -> float:
     """Seconds of a job's SAC training, extrapolated from episodes with updates."""
     from icrl_dist.experts.sac.batched import train
-    from icrl_dist.experts.train import trained_by
+    from icrl_dist.experts.train import sac_backend
 
     env = registry.batch(job.variations)
     horizon = env.spec.horizon
@@ -177,7 +177,7 @@ def _training(job: Job, config: SACConfig, budget_s: float) -> float:
             raise _BudgetSpent
 
     with contextlib.suppress(_BudgetSpent):
-        train(env, short, 20 * horizon, range(env.batch), progress, backend=trained_by(env.batch))
+        train(env, short, 20 * horizon, range(env.batch), progress, backend=sac_backend(env.batch))
     return float(np.median(np.diff(times))) * config.steps / horizon  # without the first episode, which has no updates
 
 

@@ -113,7 +113,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
 
                 if trains:
                     with launch.interruptible():
-                        heldout.keep_calibrated(folder, display)
+                        heldout.save_calibrated(folder, display)
                         results = heldout.online(run, folder, display)
         except launch.TrainInterrupted:
             text = f"`{_resume_command(arguments.given)}` continues from the checkpoint"

@@ -1,1 +1,1 @@
-"""The jobs that a worker can do, one file a kind."""
+"""What a worker does for each kind of job, one file per kind."""

@@ -16,16 +16,16 @@ from icrl_dist.rollout.episode import deploy_online
 from icrl_dist.types import Identity, Job, Payload, Trajectory, Variation
 
 Look = Callable[[Policy, int, Identity, Variation], None]
-"""Called after every decision with the policy, a row of it, and that row's identity and variation; changes nothing."""
+"""Called after every decision with the policy, a row, and the identity and variation of that row.  It must change nothing."""
 
 
 @dataclass(frozen=True)
 class Rollouts(Payload):
-    """Histories of T^j without labels: its own later actions become labels, by the learner's choice (ICAA)."""
+    """Histories of T^j without labels; in ICAA the learner makes labels of T^j's later actions."""
 
     kind: ClassVar[str] = "adapt"
     context_max: Positive
-    """As ``context.max``."""
+    """Most transitions in a context, as ``context.max``."""
     deploy: Deployment
     """The deployment rule."""
 
@@ -42,7 +42,7 @@ class LabelledRollouts(Rollouts):
 def rollouts(
     job: Job, problem: Problem, method: Method, weights: Weighted, worker: str, look: Look | None = None
 ) -> Iterator[Trajectory]:
-    """N + 1 trials of T^j in each variation; one T^j, the version that the job names, acts in all of them.
+    """N + 1 trials in each variation, all by T^j of the version that the job names.
 
     Raises RuntimeError if a simulation diverges.
     """
@@ -64,11 +64,11 @@ def rollouts(
         labeller = problem.labeller(job, payload.labelling)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
-    for row, draws, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
+    for row, generators, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
         if ran.diverged is not None and ran.diverged.any():
             lost = [str(identity) for identity, gone in zip(row, ran.diverged, strict=True) if gone]
-            raise RuntimeError(f"{', '.join(lost)}: the simulation diverged, so nothing may be learned from this episode")
-        labelled = labeller(row, draws) if labeller else [unlabelled(env.spec)] * len(row)
+            raise RuntimeError(f"{', '.join(lost)}: the simulation diverged, so the episode is not used for training")
+        labelled = labeller(row, generators) if labeller else [unlabelled(env.spec)] * len(row)
         for b, identity in enumerate(row):
             yield trajectory(job, identity, ran, b, worker, weights_digest, labelled[b])
         trial = min(trial + 1, job.trials - 1)

@@ -14,11 +14,11 @@ from icrl_dist.types import Job, Payload, Trajectory
 
 @dataclass(frozen=True)
 class BehaviorContexts(Payload):
-    """Episodes of the problem's behavior policies, which know nothing of the task."""
+    """Episodes of the problem's behavior policies, which are not given the task."""
 
     kind: ClassVar[str] = "behavior_context"
     behaviors: tuple[str, ...]
-    """Names of the policies, in turn from trial to trial."""
+    """Names of the policies; trial n uses name n modulo their number."""
     labelling: Any
     """The problem's ``Labelling``."""
 

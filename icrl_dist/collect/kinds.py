@@ -1,4 +1,4 @@
-"""Every kind of job, and doing a job of any kind."""
+"""Every kind of job: its payload, and the function that does it."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def do(
 ) -> Iterator[Trajectory]:
     """Do the job; yields each trajectory when its episode ends.
 
-    ``look`` reads the in-context policy at work, and must leave it unchanged.  Raises ValueError for a job
-    of an unknown kind.
+    ``look`` is called with the in-context policy after every decision and must not change it.  Raises
+    ValueError for a job of an unknown kind.
     """
     if isinstance(job.payload, Rollouts):
         return rollouts(job, problem, method, weights, worker, look)

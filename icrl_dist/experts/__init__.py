@@ -1,1 +1,1 @@
-"""SAC experts of continuous problems: training, cache, and the trajectories made from them."""
+"""SAC experts of continuous problems: training, cache, and trajectories from their histories."""

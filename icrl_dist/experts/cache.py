@@ -1,4 +1,4 @@
-"""Histories of SAC experts, and where they are kept: by what they are of, so that nobody makes them twice."""
+"""Histories of SAC experts, and their cache: a key holds everything that determines a history, so none is trained twice."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from icrl_dist.types import Variation
 
 _log = logging.getLogger(__name__)
 
-KEPT = 200
-"""Episodes of a history, evenly spaced over the training; all, if there are fewer or more are asked for."""
-LED = 8
-"""Further episodes that the variation's own expert leads."""
+RECORDED_EPISODES = 200
+"""Training episodes in a history, evenly spaced; all of them if there are fewer, or if a job needs more than this."""
+WINDOW_EPISODES = 8
+"""Episodes after training in which the expert acts, from which action windows are cut."""
 
 Trainer = Literal["lockstep", "stable-baselines3", "lockstep, cuda"]
-"""Who trains an expert, and where: each has its own last digits, and so its own experts."""
+"""The implementation that trains an expert, and its device: their roundoff differs, so their experts are not the same."""
 
 _VERSIONS = ("dm-control", "metaworld", "mujoco", "stable-baselines3", "torch")
 _CODE = ("experts/", "problems/", "rollout/recorder.py", "config/sac.py", "training/optimizers.py")
@@ -36,79 +36,84 @@ _CODE = ("experts/", "problems/", "rollout/recorder.py", "config/sac.py", "train
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class History:
-    """E episodes of one expert's training, what the expert would have done in them, and the expert."""
+    """E episodes of one expert's training with the expert's actions as labels, and the expert.
+
+    Field names are also the names of the arrays in the cache's files.
+    """
 
     actions: Float32[np.ndarray, "E H A"]
     observations: Float32[np.ndarray, "E H+1 S"]
     rewards: Float32[np.ndarray, "E H"]
     adversary: Float32[np.ndarray, "E H F"]
     labels: Float32[np.ndarray, "E H A"]
-    """The right action at each of the first H states: the expert's mean; in Meta-World the scripted policy's."""
+    """The right action at each of the first H states: the expert's mean action, or that of the scripted policy."""
     led_actions: Float32[np.ndarray, "G H A"]
-    """G further episodes, which windows are cut from (zeta of eq. 6): in each the expert acted, without chance of its own."""
+    """G episodes after training from which action windows (zeta of eq. 6) are cut: the expert acts by its mean actions."""
     led_observations: Float32[np.ndarray, "G H+1 S"]
     led_rewards: Float32[np.ndarray, "G H"]
     led_labels: Float32[np.ndarray, "G H A"]
     """The right action at each of their first H states."""
     actor: Float32[np.ndarray, " P"]
-    """The expert's parameters, as ``algos.stacked.Shape`` lays them out."""
+    """The expert's parameters, in the layout of ``experts.sac.stacked.Shape``."""
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """By name, as they are kept."""
+        """The arrays by name, as stored in a file."""
         return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
 
 
-def own_seed(variation: Variation, seed: int) -> int:
-    """The seed of a variation's expert in a run with this one: nothing of it depends on its company."""
+def expert_seed(variation: Variation, seed: int) -> int:
+    """Seed of a variation's expert in a run with this seed; it does not depend on the other variations of a job."""
     return int.from_bytes(hashlib.sha256(msgpack.packb([wire.from_variation(variation), seed])).digest()[:16])
 
 
-def episodes(horizon: int, config: SACConfig) -> int:
-    """Episodes of an expert's whole training, ``horizon`` steps each."""
+def training_episodes(horizon: int, config: SACConfig) -> int:
+    """Number of episodes in an expert's training, ``horizon`` steps each."""
     return max(1, config.steps // horizon)
 
 
-def remembered(horizon: int, config: SACConfig, trials: int = 1) -> int:
-    """Episodes that a history keeps if ``trials`` of them are needed: ``KEPT``, or all if that is too few."""
-    return episodes(horizon, config) if trials > KEPT else min(KEPT, episodes(horizon, config))
+def recorded_episodes(horizon: int, config: SACConfig, trials: int = 1) -> int:
+    """Number of episodes in a history of which a job needs ``trials``; see ``RECORDED_EPISODES``."""
+    episodes = training_episodes(horizon, config)
+    return episodes if trials > RECORDED_EPISODES else min(RECORDED_EPISODES, episodes)
 
 
-def key(variation: Variation, horizon: int, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> str:
-    """What a variation's history is kept under: all that decides it, physics and code included."""
+def key(variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1) -> str:
+    """Cache key of a history: the SHA-256 of all that determines it, with library versions and the code's digest."""
     versions = [[name, metadata.version(name)] for name in _VERSIONS]
     numbers = [[f"sac.{item.name}", getattr(config, item.name)] for item in dataclasses.fields(config) if item.name != "cache"]
-    whole = [wire.from_variation(variation), numbers, seed, by, versions, version.digest_of(_CODE)]
-    whole += [remembered(horizon, config, trials), LED]
-    return hashlib.sha256(msgpack.packb(whole)).hexdigest()
+    fields = [wire.from_variation(variation), numbers, seed, trainer, versions, version.digest_of(_CODE)]
+    fields += [recorded_episodes(horizon, config, trials), WINDOW_EPISODES]
+    return hashlib.sha256(msgpack.packb(fields)).hexdigest()
 
 
-def kept(variation: Variation, horizon: int, config: SACConfig, seed: int, by: Trainer, trials: int = 1) -> History | None:
-    """The history in the cache; None if it is not there, or damaged."""
+def load(variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1) -> History | None:
+    """The history from the cache; None if it is missing or damaged."""
     if not config.cache:
         return None
-    path = file(config, key(variation, horizon, config, seed, by, trials))
+    path = file(config, key(variation, horizon, config, seed, trainer, trials))
     try:
         return History(**load_checkpoint(path).arrays) if path.exists() else None
     except (StoreError, TypeError) as error:
-        _log.warning("made anew: %s", error)
+        _log.warning("the history is made again: %s", error)
         return None
 
 
-def any_kept(variation: Variation, horizon: int, config: SACConfig, seed: int) -> History | None:
-    """The same, whoever trained the expert, and whatever is kept of that."""
-    found = (kept(variation, horizon, config, seed, by, trials) for by in get_args(Trainer) for trials in (1, KEPT + 1))
+def load_any(variation: Variation, horizon: int, config: SACConfig, seed: int) -> History | None:
+    """The history of any trainer, with any number of recorded episodes, from the cache; None if there is none."""
+    keys = ((trainer, trials) for trainer in get_args(Trainer) for trials in (1, RECORDED_EPISODES + 1))
+    found = (load(variation, horizon, config, seed, trainer, trials) for trainer, trials in keys)
     return next((history for history in found if history is not None), None)
 
 
 def file(config: SACConfig, name: str) -> Path:
-    """Where it is kept."""
+    """The file of the cache with this name."""
     return Path(config.cache).expanduser() / f"{name}.npz"
 
 
-def keep(
-    history: History, variation: Variation, horizon: int, config: SACConfig, seed: int, by: Trainer, trials: int = 1
+def save(
+    history: History, variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1
 ) -> None:
-    """For every later run that asks for the same."""
+    """Write the history to the cache, if the run has one."""
     if config.cache:
-        path = file(config, key(variation, horizon, config, seed, by, trials))
-        save_checkpoint(path, Checkpoint(history.arrays(), {"of": str(variation), "by": by}))
+        path = file(config, key(variation, horizon, config, seed, trainer, trials))
+        save_checkpoint(path, Checkpoint(history.arrays(), {"of": str(variation), "by": trainer}))

@@ -1,4 +1,4 @@
-"""What jobs of SAC experts and scripted policies carry."""
+"""Payloads of the jobs that collect histories of SAC experts or episodes of scripted policies."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from icrl_dist.types import Payload
 
 @dataclass(frozen=True)
 class ExpertLabelling:
-    """Query states and action windows of a trajectory that an expert labels."""
+    """How many query states and action windows an expert labels per trajectory."""
 
     queries: Positive
-    """Query states a trajectory."""
+    """Query states per trajectory."""
     window: Positive
     """States of an action window."""
     windows: NotNegative
-    """Action windows a trajectory."""
+    """Action windows per trajectory."""
     decoy_fraction: Share
     """Share of the windows in which another task's expert acts."""
 
 
 @dataclass(frozen=True)
 class ExpertHistories(Payload):
-    """Histories of SAC experts, trained or from the cache."""
+    """Histories of SAC experts, from the cache or newly trained."""
 
     kind: ClassVar[str] = "train_expert"
     arrives_at_once: ClassVar[bool] = True

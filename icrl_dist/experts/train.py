@@ -1,9 +1,9 @@
-"""SAC experts of the variations of a continuous game, and the histories of how they came to be (appendix C.3).
+"""Trains SAC experts of continuous variations and makes the histories of their training (appendix C.3).
 
-What a variation is learned from: episodes of its expert's training, from the first random ones to
-the last, and at every state of them the action of the expert that came of it.  Expert networks
-never travel; histories and experts are kept where they were made, by what they are of, so that
-nobody trains them twice.  An expert is seeded by its variation: in any company it becomes the same.
+A history holds episodes of the training, from the first random ones to the last, with the action of the
+final expert at every state as label.  Workers do not send expert networks; they keep histories and experts
+in a cache on their node, so that none is trained twice.  The seed of an expert depends on its variation and
+the run's seed only, so the expert is the same in every job.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts.cache import History, Trainer, episodes, file, keep, kept, key, own_seed, remembered
-from icrl_dist.experts.delivery import Act, delivered, labelled, lead, scripted
+from icrl_dist.experts import cache
+from icrl_dist.experts.cache import History, Trainer, expert_seed
 from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.experts.trajectories import Act, history_trajectories, scripted_actions, window_episodes, with_labels
 from icrl_dist.interfaces import Batch, Problem, Progress, no_progress
 from icrl_dist.rollout.recorder import Recorder
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -34,146 +35,151 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CHECKPOINT_S = 60.0
-"""A training that is under way is written down so often; after a kill it goes on from there."""
+"""Seconds between checkpoints of a training that is not finished; after a kill it continues from the last one."""
 
 
 def train_expert(job: Job, problem: Problem, worker: str, progress: Progress = no_progress) -> Iterator[Trajectory]:
-    """Histories D^{i,k} of SAC experts of each variation, query states and labels (Algorithm 2, lines 8 to 12).
+    """Histories D^{i,k} of SAC experts of each variation, with query states and labels (Algorithm 2, lines 8 to 12).
 
-    All of a job's experts train together, in lockstep; they, and so the histories, are known when
-    the last step is made.  Settings: those of ``settings``; ``queries`` a trajectory; ``windows``
-    a trajectory, of ``window`` states, a share ``decoy_fraction`` of them led by another task's expert.  Raises
-    RuntimeError for a variation whose simulation keeps breaking down.
+    All experts of a job train together, so the first trajectory is ready after the last training step.
+    Raises RuntimeError for a variation whose simulation diverges in every episode.
     """
     payload = job.payload
     assert isinstance(payload, ExpertHistories)
     found = _histories(job, problem, payload.sac, progress)
-    yield from delivered(job, problem, payload.labelling, found, worker, _by_actors(found, payload.sac))
+    yield from history_trajectories(job, problem, payload.labelling, found, worker, _mean_actions(found, payload.sac))
 
 
 def _histories(job: Job, problem: Problem, config: SACConfig, progress: Progress) -> list[History]:
-    """Of each of the job's variations: from the cache, and of a training of those that are not there."""
-    by, horizon = trained_by(len(job.variations)), problem.spec_of(job.variations[0].task).horizon
-    there = {variation: kept(variation, horizon, config, job.seed, _trainer(by), job.trials) for variation in job.variations}
-    found = {variation: history for variation, history in there.items() if history is not None}
-    missing = [variation for variation in there if variation not in found]
+    """The history of each variation of the job, from the cache; those that are missing are trained and cached."""
+    backend, horizon = sac_backend(len(job.variations)), problem.spec_of(job.variations[0].task).horizon
+    trainer = _trainer(backend)
+    cached = {variation: cache.load(variation, horizon, config, job.seed, trainer, job.trials) for variation in job.variations}
+    found = {variation: history for variation, history in cached.items() if history is not None}
+    missing = [variation for variation in cached if variation not in found]
     if found:
         progress(
             f"{job.label}: {len(found)} experts from the cache, {len(found) * config.steps:,} steps of SAC saved", note=True
         )
     if missing:
-        for variation, history in zip(missing, _train(job, problem, missing, by, config, progress), strict=True):
-            keep(history, variation, horizon, config, job.seed, _trainer(by), job.trials)
+        for variation, history in zip(missing, _train(job, problem, missing, backend, config, progress), strict=True):
+            cache.save(history, variation, horizon, config, job.seed, trainer, job.trials)
             found[variation] = history
     return [found[variation] for variation in job.variations]
 
 
-def trained_by(experts: int) -> Backend:
-    """stable-baselines3, the reference, trains a job's expert that is alone; several train in lockstep, and one on a GPU."""
+def sac_backend(experts: int) -> Backend:
+    """The implementation that trains a job's experts: stable-baselines3 for one expert on the CPU, else lockstep."""
     from icrl_dist.experts.sac.batched import pick
 
     return "stable-baselines3" if experts == 1 and pick("auto").type == "cpu" else "lockstep"
 
 
-def _trainer(by: Backend) -> Trainer:
+def _trainer(backend: Backend) -> Trainer:
     from icrl_dist.experts.sac.batched import pick
 
-    return "lockstep, cuda" if by == "lockstep" and pick("auto").type == "cuda" else by
+    return "lockstep, cuda" if backend == "lockstep" and pick("auto").type == "cuda" else backend
 
 
 def _train(
-    job: Job, problem: Problem, variations: Sequence[Variation], by: Backend, config: SACConfig, progress: Progress
+    job: Job, problem: Problem, variations: Sequence[Variation], backend: Backend, config: SACConfig, progress: Progress
 ) -> list[History]:
     from icrl_dist.experts.sac.batched import train
 
     horizon = problem.spec_of(variations[0].task).horizon
-    names = [key(variation, horizon, config, job.seed, _trainer(by), job.trials) for variation in variations]
-    part = file(config, "part-" + hashlib.sha256("".join(names).encode()).hexdigest()) if config.cache else None
-    env, seeds = problem.batch(variations), [own_seed(variation, job.seed) for variation in variations]
-    recorder = Recorder(env, episodes(horizon, config), remembered(horizon, config, job.trials))
-    state = _resumed(part, recorder) if part is not None and part.exists() else None
-    written = time.monotonic()
+    keys = [cache.key(variation, horizon, config, job.seed, _trainer(backend), job.trials) for variation in variations]
+    part = cache.file(config, "part-" + hashlib.sha256("".join(keys).encode()).hexdigest()) if config.cache else None
+    env, seeds = problem.batch(variations), [expert_seed(variation, job.seed) for variation in variations]
+    episodes = cache.training_episodes(horizon, config)
+    recorder = Recorder(env, episodes, cache.recorded_episodes(horizon, config, job.trials))
+    state = _load_training(part, recorder) if part is not None and part.exists() else None
+    saved = time.monotonic()
 
     def report(experts: SACBatch, returns: np.ndarray) -> None:
-        nonlocal written
+        nonlocal saved
         mean = f"mean return {returns.mean():.0f}"
-        progress(f"{len(names)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
-        if part is not None and time.monotonic() - written >= CHECKPOINT_S:
+        progress(f"{len(keys)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
+        if part is not None and time.monotonic() - saved >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}
             save_checkpoint(part, Checkpoint(arrays, {}))
-            written = time.monotonic()
+            saved = time.monotonic()
 
-    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, backend=by)
-    columns, led = labelled(recorder.columns(), problem, experts.act), lead(env, problem, experts.act, seeds, range(env.batch))
-    made = assembled(job, variations, columns, led, experts.arrays["actor"].cpu().numpy(), progress)
+    experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, backend=backend)
+    columns = with_labels(recorder.columns(), problem, experts.act)
+    windows = window_episodes(env, problem, experts.act, seeds, range(env.batch))
+    histories = make_histories(job, variations, columns, windows, experts.arrays["actor"].cpu().numpy(), progress)
     if part is not None:
         part.unlink(missing_ok=True)
-    return made
+    return histories
 
 
-def assembled(
+def make_histories(
     job: Job,
     variations: Sequence[Variation],
     columns: dict[str, np.ndarray],
-    led: dict[str, np.ndarray],
+    windows: dict[str, np.ndarray],
     actors: np.ndarray,
     progress: Progress,
 ) -> list[History]:
-    """The history of each of these of the job's variations, without the episodes that broke down.
+    """The history of each of these variations of the job, without episodes whose simulation diverged.
 
-    Raises RuntimeError for a variation of which nothing is left.
+    ``columns``: training episodes; ``windows``: episodes of ``window_episodes``; ``actors``: parameters per
+    variation.  Raises RuntimeError for a variation without any other episode.
     """
-    parts, made = {"": columns, "led_": led}, []
+    parts, histories = {"": columns, "led_": windows}, []
     for row, variation in enumerate(variations):
-        whole = {prefix: of["whole"][row] for prefix, of in parts.items()}
-        lost = sum(int((~one).sum()) for one in whole.values())
-        if lost:
-            progress(f"{job.label}: {lost} episodes of {variation} broke down, and are left out", note=True)
+        whole = {prefix: part["whole"][row] for prefix, part in parts.items()}
+        diverged = sum(int((~one).sum()) for one in whole.values())
+        if diverged:
+            progress(f"{job.label}: {diverged} episodes of {variation} diverged and are left out", note=True)
         if not all(one.any() for one in whole.values() if len(one)):
-            raise RuntimeError(f"{variation}: its simulation breaks down in every episode; leave it out, or push it less")
-        taken = {
+            raise RuntimeError(
+                f"{variation}: the simulation diverges in every episode; use a weaker adversary, or another task"
+            )
+        arrays = {
             prefix + name: column[row][whole[prefix]]
-            for prefix, of in parts.items()
-            for name, column in of.items()
+            for prefix, part in parts.items()
+            for name, column in part.items()
             if name != "whole"
         }
-        made.append(History(**taken, actor=actors[row]))
-    return made
+        histories.append(History(**arrays, actor=actors[row]))
+    return histories
 
 
-def _resumed(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
-    """The state of a training that was under way; None if it cannot be read."""
+def _load_training(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
+    """The checkpoint of a training that was not finished; None if it cannot be read."""
     try:
         stored = load_checkpoint(part)
         recorder.load(stored.part("episodes"))
         return stored.part("state")
     except (StoreError, KeyError) as error:
-        _log.warning("this training begins anew: %s", error)
+        _log.warning("the training starts again from step 0: %s", error)
         return None
 
 
-def _by_actors(found: Sequence[History], config: SACConfig) -> Act:
-    """What these experts do, by ``History.actor``."""
+def _mean_actions(histories: Sequence[History], config: SACConfig) -> Act:
+    """The mean actions of the experts of these histories."""
     import torch
 
     from icrl_dist.experts.sac.stacked import Shape, outputs
 
-    sizes = found[0].observations.shape[-1], *config.hidden, 2 * found[0].actions.shape[-1]
-    shape, actors = Shape(sizes), torch.from_numpy(np.stack([history.actor for history in found]))
+    first = histories[0]
+    sizes = first.observations.shape[-1], *config.hidden, 2 * first.actions.shape[-1]
+    shape, actors = Shape(sizes), torch.from_numpy(np.stack([history.actor for history in histories]))
 
-    def act(seen: np.ndarray) -> np.ndarray:
-        mean: np.ndarray = outputs(shape, actors, torch.from_numpy(seen.copy()))[..., : sizes[-1] // 2].tanh().numpy()
+    def act(states: np.ndarray) -> np.ndarray:
+        mean: np.ndarray = outputs(shape, actors, torch.from_numpy(states.copy()))[..., : sizes[-1] // 2].tanh().numpy()
         return mean
 
     return act
 
 
 class ExpertPolicy:
-    """The experts of B variations, each in its row: means of their actions."""
+    """The experts of B variations, one per row; they act by their mean actions."""
 
     def __init__(self, histories: Sequence[History], config: SACConfig) -> None:
-        self._act = _by_actors(histories, config)
+        self._act = _mean_actions(histories, config)
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
         """The mean action of each expert."""
@@ -181,19 +187,19 @@ class ExpertPolicy:
         return mean
 
     def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
+        """Does nothing: the policy does not learn."""
 
 
 class ScriptedPolicy:
-    """A problem's scripted policy, which reads the true states of one batch of environments."""
+    """A problem's scripted policy in one batch of environments, whose true states it reads."""
 
     def __init__(self, problem: Problem, env: Batch) -> None:
         self._problem, self._env = problem, env
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
-        """Its actions in the true states, whatever is observed."""
+        """The actions in the true states; ``observation`` is not used."""
         truth: np.ndarray = self._env.truth  # type: ignore[attr-defined]  # of problems with a scripted policy
-        return scripted(self._problem, truth)
+        return scripted_actions(self._problem, truth)
 
     def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
+        """Does nothing: the policy does not learn."""

@@ -1,1 +1,1 @@
-"""The in-context methods: what each collects and what each learns from."""
+"""The in-context methods: the data that each collects, its model, its loss and its deployed policy."""

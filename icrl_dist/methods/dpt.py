@@ -36,18 +36,19 @@ class DPT(Method):
     shows_states = True
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """The task without disturbance."""
+        """The task under the null adversary alone."""
         return (Variation(task),)
 
     def phases(self, run: Run) -> tuple[Phase, ...]:
-        """The fit to D_pre, then the DAgger rounds, of which the paper has none."""
-        of = run.dagger
-        return (pretrain_phase(run), *(Phase("adapt", j, of.steps, of.learning_rate) for j in range(of.rounds)))
+        """The fit to D_pre, then the DAgger rounds (an extension of the paper; none by default)."""
+        dagger = run.dagger
+        rounds = (Phase("adapt", j, dagger.steps, dagger.learning_rate) for j in range(dagger.rounds))
+        return (pretrain_phase(run), *rounds)
 
     def ask(self, run: Run, phase: Phase) -> tuple[Job, ...]:
-        """Contexts and labels of every variation; in a DAgger round histories of T^j with the same labels.
+        """Jobs of contexts and labels in every variation; in a DAgger round jobs of labelled histories of T^j.
 
-        A model with action windows is deployed by Algorithm 1 in two of three jobs, because those histories
+        Two of three DAgger jobs deploy a model with action windows by Algorithm 1, because those histories
         differ most from D_pre.
         """
         choose = functools.partial(self._choose, run)
@@ -60,18 +61,18 @@ class DPT(Method):
         return self.training_variations(run, index, task, 0)
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
-        """D_pre, and in a DAgger round the histories of this and all earlier rounds."""
+        """Draws from D_pre; in a DAgger round also from the histories of this round and all earlier ones."""
         from icrl_dist.methods import examples
-        from icrl_dist.training.batches import Pool, Shelved
+        from icrl_dist.training.batches import CachedExamples, Pool
 
-        shelf = examples.shelf(run, dataset, examples.labelled)
-        pretrain = Pool(1.0, Shelved(shelf, dataset.variations("pretrain", 0)), run.optim.episodes)
+        cache = examples.cache(run, dataset, examples.labelled)
+        pretrain = Pool(1.0, CachedExamples(cache, dataset.variations("pretrain", 0)), run.optim.episodes)
         if phase.stage == "pretrain":
             return examples.draw(run, [pretrain])
         histories = [key for j in range(phase.round + 1) for key in dataset.variations("adapt", j)]
         share = run.dagger.new_fraction
-        both = [dataclasses.replace(pretrain, share=1 - share), Pool(share, Shelved(shelf, histories), run.dagger.trials)]
-        return examples.draw(run, both)
+        dagger = Pool(share, CachedExamples(cache, histories), run.dagger.trials)
+        return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), dagger])
 
     def build(self, spec: Spec, run: Run) -> PretrainedTransformer:
         from icrl_dist.models.dpt import PretrainedTransformer
@@ -79,7 +80,7 @@ class DPT(Method):
         return PretrainedTransformer(spec, run.model)
 
     def loss(self, model: PretrainedTransformer, batch: TrainingBatch) -> torch.Tensor:
-        """Eq. (1), with action windows also eq. (6)."""
+        """The loss of eq. (1); with action windows also that of eq. (6)."""
         from icrl_dist.methods.dpt_loss import batch_loss
 
         return batch_loss(model, batch)
@@ -111,6 +112,6 @@ class DPT(Method):
         from icrl_dist.models.dpt import Transitions
 
         with torch.inference_mode():
-            *context, asked, seen = (torch.from_numpy(a).to(model.low.device) for a in (*transitions, queries, prefix))
-            logits: torch.Tensor = model(Transitions(*context), asked, seen)
+            *context, states, lengths = (torch.from_numpy(a).to(model.low.device) for a in (*transitions, queries, prefix))
+            logits: torch.Tensor = model(Transitions(*context), states, lengths)
             return logits.double().softmax(dim=-1).cpu().numpy()

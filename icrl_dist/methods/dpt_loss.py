@@ -11,7 +11,7 @@ from icrl_dist.training.batches import TrainingBatch
 
 
 def batch_loss(model: PretrainedTransformer, batch: TrainingBatch) -> Float[Tensor, ""]:
-    """Eq. (1) over every (prefix, query) pair of a batch, and with windows eq. (6), every label counting the same."""
+    """Eq. (1) over all (prefix, query) pairs of a batch; with windows also eq. (6).  Every label has the same weight."""
     device = model.low.device
 
     def put(array: object) -> Tensor:
@@ -21,9 +21,10 @@ def batch_loss(model: PretrainedTransformer, batch: TrainingBatch) -> Float[Tens
     cache = model.encode(context)
     total = model.action_head.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
     if batch.windows is not None:
-        states, taken, gained, labels = batch.windows
-        followed = model.decide_windows(Windows(put(states), put(taken), put(gained)), cache, put(batch.window_prefix))
+        states, actions, rewards, labels = batch.windows
+        windows = Windows(put(states), put(actions), put(rewards))
+        outputs = model.decide_windows(windows, cache, put(batch.window_prefix))
         count = states.shape[1] * states.shape[2]
         share = count / (count + batch.prefix.shape[1])
-        total = (1 - share) * total + share * model.action_head.loss(followed, put(labels))
+        total = (1 - share) * total + share * model.action_head.loss(outputs, put(labels))
     return total

@@ -1,4 +1,4 @@
-"""``method = "experts"``: only the SAC experts of ICAG's variations are trained and kept, for later runs."""
+"""``method = "experts"``: trains the SAC experts of ICAG's variations, and no model; later runs find them in the cache."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from icrl_dist.problems import registry
 
 
 class Experts(ICAG):
-    """Collects what ICAG collects, and fits nothing."""
+    """Collects the data of ICAG, and fits nothing."""
 
     name = "experts"
     trains = False
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         if not isinstance(registry.of(run).contexts(run).payload, ExpertHistories):
-            yield "method", run.method, f"{run.problem} is pretrained without experts: use dpt, icag or icaa"
+            yield "method", run.method, f"{run.problem} does not use SAC experts: use dpt, icag or icaa"
 
     def phases(self, run: Run) -> tuple[Phase, ...]:
         return (Phase("pretrain", 0, 0, run.optim.learning_rate),)
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
-        """Nothing is drawn, because the phase has no steps."""
+        """Raises ValueError: the phase has no steps, so there are no batches."""
         raise ValueError("method 'experts' trains no model")

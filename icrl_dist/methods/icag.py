@@ -9,10 +9,10 @@ from icrl_dist.types import Task, Variation
 
 
 class ICAG(DPT):
-    """DPT's data, model and loss, over tasks x adversaries; labels by eq. (5)."""
+    """DPT over tasks x adversaries, with the labels of eq. (5)."""
 
     name = "icag"
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """K variations, phi_0 first; in DAgger rounds those of D_pre again."""
+        """K variations, phi_0 first; DAgger rounds use those of D_pre."""
         return registry.training_variations(run, index, task, round)

@@ -1,4 +1,4 @@
-"""What methods ask for: jobs of pretraining contexts and of rollouts."""
+"""The jobs of a phase: pretraining contexts or rollouts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Choose = Callable[[int, Task], tuple[Variation, ...]]
 def pretraining_contexts(run: Run, phase: Phase, choose: Choose) -> tuple[Job, ...]:
     """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
 
-    All methods and all K share the same ``pretrain.contexts`` episodes.
+    The variations divide ``pretrain.contexts`` episodes among them, so all methods and all K get the same number.
     """
     problem = registry.of(run)
     chosen = [choose(i, task) for i, task in enumerate(problem.split.train)]
@@ -31,7 +31,7 @@ def pretraining_contexts(run: Run, phase: Phase, choose: Choose) -> tuple[Job, .
 
 
 def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], trials: int, payload: Payload) -> tuple[Job, ...]:
-    """Jobs of ``stream.job_tasks`` tasks each, given the K variations of every task."""
+    """Jobs of ``stream.job_tasks`` tasks each; ``chosen`` holds the K variations of every task."""
     jobs = []
     for first in range(0, len(chosen), run.stream.job_tasks):
         group = chosen[first : first + run.stream.job_tasks]
@@ -54,14 +54,15 @@ def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], tri
 
 
 def rollouts(run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployment) -> tuple[Job, ...]:
-    """T^j is deployed in every variation, from the start of test episodes, without labels."""
+    """Jobs that deploy T^j in every variation, without labels; episodes start as test episodes do."""
     return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule))
 
 
 def dagger_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment]) -> tuple[Job, ...]:
-    """T^j makes a history in every training variation, started as at test; its queries are labelled as those of D_pre.
+    """Jobs that deploy T^j in every training variation and label query states as in D_pre.
 
-    The jobs of one round take the deployment rules in turn, because each rule makes histories of its own kind.
+    Episodes start as test episodes do.  Jobs take the deployment rules in turn, because each rule gives
+    another kind of history.
     """
     payload = LabelledRollouts(run.context.max, rules[0], registry.of(run).labelling(run))
     jobs = grouped(run, phase, _at_test_start(run, choose), run.dagger.trials, payload)

@@ -14,5 +14,5 @@ def names() -> tuple[str, ...]:
 
 def of(run: Run) -> Method:
     """A new method object for a run.  Raises ConfigError, with the nearest name, for an unknown method."""
-    made: Method = plugins.find("methods", run.method)()
-    return made
+    method: Method = plugins.find("methods", run.method)()
+    return method

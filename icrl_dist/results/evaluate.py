@@ -1,4 +1,4 @@
-"""Agents deployed on tasks that were never trained on, beside the problem's references."""
+"""Deployment of agents and of the problem's references on held-out tasks."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from icrl_dist.config.run import Deployment, Run
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
 from icrl_dist.problems import registry
 from icrl_dist.results.statistics import mean_and_error
-from icrl_dist.rollout.episode import DataPolicy, deploy_offline, deploy_online, episode
+from icrl_dist.rollout.episode import OfflinePolicy, deploy_offline, deploy_online, episode
 from icrl_dist.types import Identity, Task, Variation
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Returns of one agent at one disturbance, and the exact optimum of the same variations where it is known."""
+    """Returns of one agent under adversaries of one strength, and the optimum of the same variations where it is known."""
 
     agent: str
     p: float
     returns: Float[np.ndarray, "tasks seeds episodes"]
     optimum: Float[np.ndarray, " tasks"] | None
-    """Expected return of the optimal policy in each task's variation, by value iteration; None in a continuous game."""
+    """Expected return of the optimal policy in each task's variation; None for a problem without exact answers."""
     ceiling: bool = False
-    """The agent knows the task, so other returns are also shown as a share of its returns."""
+    """The agent is given the task, so other returns are also shown as a share of its returns."""
     broken: int = 0
-    """Episodes that ended early because the simulation broke down: they count with what they had earned by then."""
+    """Episodes that ended early because the simulation diverged; their return up to that step counts."""
 
     def last(self, episodes: int) -> float:
         """Mean return over the last episodes."""
         return float(self.returns[:, :, -episodes:].mean())
 
     def first_over(self, oracle: Result, episodes: int) -> float:
-        """Mean return over the first episodes (or all, if there are fewer), as a share of the oracle's in the same ones."""
+        """Mean return over the first episodes (or all, if there are fewer), as a share of the oracle's in these episodes."""
         return round(float(self.returns[:, :, :episodes].mean() / oracle.returns[:, :, :episodes].mean()), 4)
 
     def episode_of(self, oracle: Result, share: float) -> int | None:
-        """First episode, from 1, whose mean return is this share of the oracle's over all episodes; None if none is."""
+        """First episode, from 1, whose mean return is at least this share of the oracle's mean over all episodes; or None."""
         good = self.returns.mean(axis=(0, 1)) >= share * oracle.returns.mean()
         return int(good.argmax()) + 1 if good.any() else None
 
@@ -62,7 +62,7 @@ class Result:
 
 
 def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple[Variation, ...]:
-    """Every evaluated task (or these) under its test adversary of strength p, with the start of test episodes."""
+    """Every evaluated task (or each of ``tasks``) under its test adversary of strength p; starts are those of test episodes."""
     problem = registry.of(run)
     chosen = problem.evaluated if tasks is None else tasks
     return tuple(
@@ -72,9 +72,8 @@ def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple
 
 
 def in_context(trained: TrainedModel, deploy: Deployment | None = None) -> MakePolicy:
-    """The model, deployed by this rule or the one that it was trained for."""
-    of = trained
-    return lambda rows, env: of.method.policy(of.model, len(rows), of.run.context, deploy)
+    """The model as a policy, deployed by this rule; None: the rule that it was trained for."""
+    return lambda rows, env: trained.method.policy(trained.model, len(rows), trained.run.context, deploy)
 
 
 def online(
@@ -83,9 +82,9 @@ def online(
     progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
     tasks: Sequence[Task] | None = None,
 ) -> list[Result]:
-    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, with the same draws for all.
+    """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, with the same draws for all agents.
 
-    On the evaluated tasks, or those given.
+    ``tasks``: where to deploy; None: the evaluated tasks.
     """
     problem, results = registry.of(run), []
     for level, p in enumerate(run.evaluate.p):
@@ -109,7 +108,8 @@ def online(
 def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
     """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
 
-    Of every model and every reference that takes in data of others.  Only for a problem with exact answers.
+    Deploys every model, and every reference that accepts data of other policies.  Only for a problem with
+    exact answers.
     """
     problem, results = registry.of(run), []
     assert problem.exact is not None
@@ -127,13 +127,13 @@ def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | N
             policies: dict[str, Policy] = {name: in_context(one, deploy)(rows, env) for name, one in models.items()}
             policies |= {name: one.make(rows, env) for name, one in references.items()}
             for name, policy in policies.items():
-                if _takes_data(policy):
+                if _accepts_data(policy):
                     ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
                     results.append(Result(f"{name}, {source} data", p, ran.returns.reshape(shape), optimum))
     return results
 
 
-def _takes_data(policy: Policy) -> TypeGuard[DataPolicy]:
+def _accepts_data(policy: Policy) -> TypeGuard[OfflinePolicy]:
     return hasattr(policy, "append")
 
 

@@ -1,4 +1,4 @@
-"""A run folder's agents on held-out tasks: who is compared, and what is kept of it."""
+"""Evaluation of a run folder's models on held-out tasks, beside references: reports, figures and tables."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from icrl_dist.types import Variation
 
 
 def models(what: Path) -> dict[str, TrainedModel]:
-    """The newest model and, in a run folder, the T^0 that it grew from."""
+    """The newest model and, in a run folder with adapted versions, T^0; by the name that tables show."""
     newest = load_checkpoint(checkpoint_file(what))
     version = newest.manifest["version"]
     found = {f"T^{version} ({newest.manifest['method']})": trained(newest)}
@@ -42,7 +42,7 @@ def models(what: Path) -> dict[str, TrainedModel]:
 
 
 def calibrate(what: Path, display: Display) -> Checkpoint:
-    """The newest checkpoint with what its model expects to happen, which is learned now if it was not before."""
+    """The newest checkpoint with its outcome readout, which is fitted now if it is missing."""
 
     def progress(episodes: int) -> None:
         event = {"event": "progress", "stage": "evaluate", "phase": "calibrating surprise"}
@@ -51,19 +51,20 @@ def calibrate(what: Path, display: Display) -> Checkpoint:
     return calibrated(load_checkpoint(checkpoint_file(what)), progress)
 
 
-def keep_calibrated(folder: Path, display: Display) -> None:
-    """Calibrate a run's newest checkpoint, which is written anew only if it was not calibrated before."""
-    made = calibrate(folder, display)
+def save_calibrated(folder: Path, display: Display) -> None:
+    """Calibrate the newest checkpoint of a run; the file is written only if it was not calibrated before."""
+    calibrated = calibrate(folder, display)
     file = checkpoint_file(folder)
-    if made.part("outcomes") and not load_checkpoint(file).part("outcomes"):
-        save_checkpoint(file, made)
+    if calibrated.part("outcomes") and not load_checkpoint(file).part("outcomes"):
+        save_checkpoint(file, calibrated)
 
 
 def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment | None = None) -> str:
-    """The name of a report, without its ending: the suite, the agent and the settings, so that other settings have another.
+    """File name of a report without its suffix.  It holds the suite, the agent and the settings, so no two share a name.
 
-    Such as ``online-T2-1a2b3c4d-paper-uniform-p0_0.2-40episodes-2seeds``: T^2, whose weights have that
-    digest.  A checkpoint file's own name comes before; more than ten probabilities are named by a digest.
+    Example: ``online-T2-1a2b3c4d-paper-uniform-p0_0.2-40episodes-2seeds`` for T^2, with the first digits of
+    its weights digest.  The report of a checkpoint file begins with the name of that file; a long list of
+    strengths p is replaced by its SHA-256.
     """
     manifest = load_checkpoint(checkpoint_file(what)).manifest
     settings = run.evaluate
@@ -71,24 +72,22 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     if len(levels) > 60:
         levels = hashlib.sha256(levels.encode()).hexdigest()[:16]
     agent = f"T{manifest['version']}-{str(manifest.get('weights_digest', ''))[:8]}"
-    by = deploy or methods.of(run).deployment(run)
-    named = "" if what.is_dir() else f"{what.stem[:60]}-"
-    return f"{suite}-{named}{agent}-{by}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
+    rule = deploy or methods.of(run).deployment(run)
+    prefix = "" if what.is_dir() else f"{what.stem[:60]}-"
+    return f"{suite}-{prefix}{agent}-{rule}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
 
 
 def online(
     run: Run, what: Path, display: Display, deploy: Deployment | None = None
 ) -> tuple[list[evaluate.Result], dict[str, Any]]:
-    """Online returns of the folder's models, a random policy, the exact agents and the oracle; the newest model first.
+    """Online returns of the folder's models, the newest first, and of the problem's references.
 
-    In a continuous game experts stand in for the exact agents, where there are any on this machine.
-
-    Deployed by ``deploy``, or by the better rule that they were trained for; if that is not
-    Algorithm 1, the newest is deployed by it too.  And the newest's surprise at the end, by p,
-    if it was calibrated.
+    Models are deployed by ``deploy``; None: by the rule that they were trained for.  If that rule is not
+    Algorithm 1, the newest model is deployed by Algorithm 1 as well.  The second result is the OOD score
+    of the newest model after the last episode, by p; empty if it was not calibrated.
     """
     found, problem = models(what), registry.of(run)
-    made = {name: evaluate.in_context(model, deploy) for name, model in found.items()}
+    policies = {name: evaluate.in_context(model, deploy) for name, model in found.items()}
     newest, model = next(iter(found.items()))
     scores: list[Surprise] = []
     if outcomes := outcomes_of(load_checkpoint(checkpoint_file(what))):
@@ -97,14 +96,14 @@ def online(
             scores.append(Surprise(outcomes, model.spec, len(rows)))
             return model.method.policy(model.model, len(rows), run.context, deploy, scores[-1].observe)
 
-        made[newest] = scored
+        policies[newest] = scored
     if (deploy or model.method.deployment(run)) != "paper":
-        made[f"{newest}, Algorithm 1"] = evaluate.in_context(model, "paper")
-    agents: dict[str, MakePolicy | Reference] = {**made, **problem.references(run)}
+        policies[f"{newest}, Algorithm 1"] = evaluate.in_context(model, "paper")
+    agents: dict[str, MakePolicy | Reference] = {**policies, **problem.references(run)}
     if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
         display.report({"event": "note", "text": missing})
     results = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
-    return results, {f"{p:g}": _spread(one.now()) for p, one in zip(run.evaluate.p, scores, strict=False)}
+    return results, {f"{p:g}": _spread(one.score()) for p, one in zip(run.evaluate.p, scores, strict=False)}
 
 
 def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
@@ -112,7 +111,7 @@ def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
 
 
 def check_suite(run: Run, suite: str) -> None:
-    """Raises ConfigError if the run's problem or method lacks a part that the suite needs."""
+    """Raises ConfigError if the run's problem or method does not support the suite."""
     problem, method = registry.of(run), methods.of(run)
     if suite == "offline" and problem.exact is None:
         raise ConfigError(f"--suite offline: {run.problem} has no exact answers for expert data; use --suite online")
@@ -121,14 +120,14 @@ def check_suite(run: Run, suite: str) -> None:
 
 
 def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
-    """Offline returns of the folder's models, given random and expert data."""
+    """Offline returns of the folder's models and of references, given random and expert data."""
     return evaluate.offline(run, models(what), deploy)
 
 
 def show_online(
-    run: Run, report: Path, results: list[evaluate.Result], surprised: dict[str, Any], console: Console
+    run: Run, report: Path, results: list[evaluate.Result], scores: dict[str, Any], console: Console
 ) -> dict[str, Any]:
-    """Print the table, keep the rows as ``report``.json and the figure as ``report``.png; returns the rows with its path."""
+    """Print the table; write the rows to ``report``.json and the figure to ``report``.png.  Returns both, and summaries."""
     rows = [result.row() for result in results]
     adapted = _adaptation(results)
     title = f"{run.method.upper()} on {registry.of(run).title(len(results[0].returns))}, {run.evaluate.seeds} seeds"
@@ -137,17 +136,17 @@ def show_online(
     console.print(returns_table(results, f"Return by online episode: {title}"))
     for one in results:
         if one.broken:
-            told = f"{one.agent}, p = {one.p:g}: the simulation broke down in {one.broken} of {one.returns.size} episodes; "
-            console.print(told + "they count with what they had earned by then", highlight=False, markup=False)
-    for p, one in surprised.items():
-        told = f"surprise at the end, p = {p}: median {one['median']:.2f}, above 1 in {one['above_1']:.0%}"
-        console.print(told, highlight=False, markup=False)
+            text = f"{one.agent}, p = {one.p:g}: the simulation diverged in {one.broken} of {one.returns.size} episodes; "
+            console.print(text + "their return up to that step counts", highlight=False, markup=False)
+    for p, score in scores.items():
+        text = f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
+        console.print(text, highlight=False, markup=False)
     console.print(f"figure {figure}", highlight=False, markup=False)
-    return {**adapted, "surprise": surprised, "rows": rows, "figure": str(figure)}
+    return {**adapted, "surprise": scores, "rows": rows, "figure": str(figure)}
 
 
 def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:
-    """How soon the newest model acts well, by p, beside the oracle: see ``Result.first_over`` and ``Result.episode_of``."""
+    """How fast the newest model adapts, by p: ``Result.first_over`` and ``Result.episode_of`` relative to the oracle."""
     oracle = {result.p: result for result in results if result.ceiling and result.optimum is not None}
     if not oracle:
         return {}
@@ -159,21 +158,21 @@ def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | i
 
 
 def show_experts(folder: Path, console: Console) -> dict[str, Any]:
-    """Print what each expert's first and last recorded episode returned; returns the rows."""
+    """Print the returns of the first and the last recorded episode of each expert; returns the rows."""
     data = Dataset(folder / "dataset", readonly=True)
     rows = []
     for key in data.variations("pretrain", 0):
         trials = data.trials(key)
-        told = {name: round(value, 4) for name, value in trials[0].variation.task.params if isinstance(value, float)}
+        params = {name: round(value, 4) for name, value in trials[0].variation.task.params if isinstance(value, float)}
         kind, ends = trials[0].variation.adversary.kind, (trials[0], trials[-1])
-        rows.append({"task": told, "adversary": kind, "returns": [round(trial.episode_return, 2) for trial in ends]})
+        rows.append({"task": params, "adversary": kind, "returns": [round(trial.episode_return, 2) for trial in ends]})
     data.close()
     console.print(experts_table(rows))
     return {"experts": rows}
 
 
 def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
-    """The newest model beside the exact posterior, on training and on held-out tasks."""
+    """Comparison of the newest model with the exact posterior, on training and on held-out tasks."""
     model = trained(load_checkpoint(checkpoint_file(what)))
     suite = registry.of(run).posterior
     decide = functools.partial(model.method.distributions, model.model)
@@ -198,7 +197,7 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
 
 
 def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Console) -> dict[str, Any]:
-    """Print the tables, keep everything as ``report``.json and the figure as ``report``.png; returns all but the curves."""
+    """Print the tables; write ``report``.json and the figure ``report``.png.  Returns the report without its curves."""
     problem = registry.of(run)
     title = f"{run.method.upper()} beside the exact posterior: {problem.title(len(problem.evaluated))}"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
@@ -216,7 +215,7 @@ def _goals(heldout: bool) -> str:
 
 
 def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str, float, int], None]:
-    """Shows every episode of ``agents`` at every p as one step."""
+    """A progress callback that displays every episode of every agent at every p as one step."""
     total, done = agents * len(run.evaluate.p) * run.evaluate.episodes, 0
 
     def progress(agent: str, p: float, episodes: int) -> None:

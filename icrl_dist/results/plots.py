@@ -1,4 +1,4 @@
-"""Figures, drawn from result rows only."""
+"""Figures of evaluations.  They use only the rows of a report."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-COLOURS = ("#1f6feb", "#8957e5", "#d29922", "#2da44e")
+COLORS = ("#1f6feb", "#8957e5", "#d29922", "#2da44e")
 _EXACT = (
     ("#8c959f", (0, (1, 1.2))),
     ("#8c959f", "-."),
@@ -17,13 +17,13 @@ _EXACT = (
 )
 _GOALS = {"kl_nats": ("goals trained on", "#2da44e"), "kl_heldout": ("goals never trained on", "#cf222e")}
 _GAPS = ("paper_gap_train", "paper_gap")
-_LAWS = {"": "own adversaries", "_any": "any adversary"}
+_PRIORS = {"": "own adversaries", "_any": "any adversary"}
 
 
 def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Path:
-    """Return per online episode, one panel for each p (Figures 3b and 3d); exact agents in grey, the oracle a line.
+    """Return per online episode, one panel for each p (Figures 3b and 3d); exact agents are gray, the oracle is a line.
 
-    ``rows`` are those of ``evaluate.Result.row``.  Returns ``path``.
+    ``rows``: of ``evaluate.Result.row``.  Returns ``path``.
     """
     pyplot = _pyplot()
     from matplotlib.ticker import MaxNLocator
@@ -35,15 +35,15 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
     for axis, p in zip(axes[0], levels, strict=True):
         here = [row for row in rows if row["p"] == p]
         episodes = range(1, len(here[0]["episodes"]) + 1)
-        for (colour, dashes), row in zip(_EXACT, [r for r in here if _is_exact(r)], strict=False):
-            axis.plot(episodes, row["episodes"], color=colour, linestyle=dashes, label=row["agent"], linewidth=1.2)
+        for (color, dashes), row in zip(_EXACT, [r for r in here if _is_exact(r)], strict=False):
+            axis.plot(episodes, row["episodes"], color=color, linestyle=dashes, label=row["agent"], linewidth=1.2)
         learned = [r for r in here if r["agent"] != "oracle" and not _is_exact(r)]
-        for colour, row in zip(itertools.cycle(COLOURS), learned, strict=False):
+        for color, row in zip(itertools.cycle(COLORS), learned, strict=False):
             error = [e or 0.0 for e in row["standard_error"]]
             low = [m - e for m, e in zip(row["episodes"], error, strict=True)]
             high = [m + e for m, e in zip(row["episodes"], error, strict=True)]
-            axis.plot(episodes, row["episodes"], color=colour, label=row["agent"], linewidth=1.8)
-            axis.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
+            axis.plot(episodes, row["episodes"], color=color, label=row["agent"], linewidth=1.8)
+            axis.fill_between(episodes, low, high, color=color, alpha=0.2, linewidth=0)
         if here[0]["optimum"] is not None:
             axis.axhline(here[0]["optimum"], color="black", linewidth=0.8, label="oracle (knows the goal)")
         axis.set_title("no disturbance" if p == 0 else f"{_disturbed(here)} = {p:g}", fontsize=10)
@@ -62,28 +62,28 @@ def _disturbed(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:
-    """T_theta beside the exact posterior: KL by prefix, probabilities, and online return.  Returns ``path``.
+    """T_theta compared with the exact posterior: KL by prefix, probabilities and online return.  Returns ``path``.
 
-    ``report`` is what ``heldout.posterior`` returns.
+    ``report``: the result of ``heldout.posterior``.
     """
     pyplot = _pyplot()
     figure, axes = pyplot.subplots(2, 3, figsize=(14, 8), layout="constrained")
-    for row, (name, (goals, colour)) in zip(axes, _GOALS.items(), strict=True):
+    for row, (name, (goals, color)) in zip(axes, _GOALS.items(), strict=True):
         row[0].sharey(row[1])
-        for axis, (law, meaning) in zip(row, _LAWS.items(), strict=False):
-            _by_prefix(axis, report[f"{name}{law}_curves"]["by_prefix"])
+        for axis, (prior, meaning) in zip(row, _PRIORS.items(), strict=False):
+            _by_prefix(axis, report[f"{name}{prior}_curves"]["by_prefix"])
             axis.set_title(f"{goals}; {meaning}", fontsize=10)
             axis.set(xlabel="transitions in the context", ylabel="KL(exact || model), nats")
         points = report[f"{name}_any_curves"]["agreement"]
-        axes[0][2].plot(points["exact"], points["model"], "o-", color=colour, markersize=4, label=goals)
+        axes[0][2].plot(points["exact"], points["model"], "o-", color=color, markersize=4, label=goals)
     axes[0][2].plot([0, 1], [0, 1], color="black", linewidth=0.8)
     axes[0][2].set_title("probabilities of actions; any adversary", fontsize=10)
     axes[0][2].set(xlabel="exact probability", ylabel="the model's, on average")
-    for shift, (name, (goals, colour)) in zip((-0.15, 0.15), zip(_GAPS, _GOALS.values(), strict=True), strict=True):
+    for shift, (name, (goals, color)) in zip((-0.15, 0.15), zip(_GAPS, _GOALS.values(), strict=True), strict=True):
         at = [100 * row["gap"] for row in report[name].values()]
         error = [[100 * abs(row[side] - row["gap"]) for row in report[name].values()] for side in ("low", "high")]
         axes[1][2].bar(
-            [i + shift for i in range(len(at))], at, 0.28, yerr=error, color=colour, alpha=0.8, capsize=3, label=goals
+            [i + shift for i in range(len(at))], at, 0.28, yerr=error, color=color, alpha=0.8, capsize=3, label=goals
         )
     axes[1][2].axhline(0, color="black", linewidth=0.8)
     axes[1][2].set_xticks(range(len(report["paper_gap"])), [f"p = {p}" for p in report["paper_gap"]])
@@ -99,7 +99,7 @@ def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:
 
 
 def _by_prefix(axis: Any, curves: Sequence[Mapping[str, Any]], width: int = 5) -> None:
-    """KL against the prefix's length, averaged over ``width`` lengths or more; dashed where actions are overridden."""
+    """KL by the length of the prefix, averaged over ``width`` or more lengths; dashed lines where p > 0."""
     kinds = list(dict.fromkeys(curve["kind"] for curve in curves))
     for curve in curves:
         kl = curve["kl"]
@@ -107,7 +107,7 @@ def _by_prefix(axis: Any, curves: Sequence[Mapping[str, Any]], width: int = 5) -
         pieces = [(a, b, kl[a:b]) for a, b in zip(starts, (*starts[1:], len(kl)), strict=True)]
         label, style = f"{curve['kind']}, p = {curve['p']:g}", "--" if curve["p"] else "-"
         x, y = [(a + b - 1) / 2 for a, b, _ in pieces], [sum(piece) / len(piece) for _, _, piece in pieces]
-        axis.plot(x, y, style, color=COLOURS[kinds.index(curve["kind"])], label=label)
+        axis.plot(x, y, style, color=COLORS[kinds.index(curve["kind"])], label=label)
     axis.set_ylim(bottom=0)
 
 

@@ -1,4 +1,4 @@
-"""The suite ``posterior``: a model beside the exact posterior (Theorem E.3), in decisions and in return."""
+"""The suite ``posterior``: online return of a model relative to the exact agent (Theorem E.3)."""
 
 from __future__ import annotations
 
@@ -25,19 +25,22 @@ def gaps(
     goals: Sequence[Task],
     progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
 ) -> dict[str, Any]:
-    """By p: how far the online return of an agent is from the exact agent's under Algorithm 1, as a share of it.
+    """By p: online return of a policy relative to that of the exact agent under Algorithm 1; see ``gap``.
 
-    Both have the same goals, adversaries and draws; the mean is over all episodes.
+    Both have the same goals, adversaries and draws.
     """
     exact = registry.of(run).exact
-    assert exact is not None, "only a problem with exact answers has this suite"
+    assert exact is not None, "``heldout.check_suite`` refuses problems without exact answers"
     agents = {"model": act, "exact": exact.agent(run, "paper")}
     results = evaluate.online(run, agents, progress, goals)
     return {f"{model.p:g}": gap(model, exact, run.seed) for model, exact in zip(results[::2], results[1::2], strict=True)}
 
 
 def gap(model: Result, exact: Result, seed: int) -> dict[str, float]:
-    """Ratio of mean returns less 1, with its 95% bootstrap interval: goals, and of each its seeds, drawn anew in pairs."""
+    """Ratio of mean returns minus 1, with a 95% bootstrap interval over goals and, within each goal, seeds, in pairs.
+
+    Raises ConfigError if the exact agent's mean return is not above 0.
+    """
     one, two = (r.returns.mean(axis=2) for r in (model, exact))
     goals, seeds = one.shape
     rng = generator(seed, RandomKey.POSTERIOR_SUITE)

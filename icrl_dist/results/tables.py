@@ -14,8 +14,8 @@ from icrl_dist.results.evaluate import Result
 def returns_table(results: Sequence[Result], title: str) -> Table:
     """Mean return by online episode, one row per agent and p.
 
-    The last column is the return of the last episodes as a fraction of the best reference that is
-    present: the oracle, a scripted policy, the experts or, without any of them, the exact optimum.
+    The last column is the return of the last episodes as a share of the first reference that is a ceiling
+    (oracle, scripted policy or experts), or of the exact optimum if there is none.
     """
     episodes = results[0].returns.shape[2]
     shown = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes]
@@ -26,14 +26,14 @@ def returns_table(results: Sequence[Result], title: str) -> Table:
     for e in shown:
         table.add_column(f"ep {e}", justify="right")
     table.add_column(f"last {last}", justify="right")
-    present = [r.agent for r in results if r.ceiling]
-    best = present[0] if present else "oracle" if results[0].optimum is not None else ""
+    ceiling_agents = [r.agent for r in results if r.ceiling]
+    best = ceiling_agents[0] if ceiling_agents else "oracle" if results[0].optimum is not None else ""
     if best:
         table.add_column(f"of {best}", justify="right")
     ceilings = {r.p: r.last(last) for r in results if r.agent == best}
     for result in results:
         mean = result.returns.mean(axis=(0, 1))
-        if not present and result.optimum is not None:
+        if not ceiling_agents and result.optimum is not None:
             ceilings[result.p] = float(np.mean(result.optimum))
         cells = [f"{mean[e - 1]:.1f}" for e in shown]
         first = results[max(0, results.index(result) - 1)].p == result.p and results.index(result) > 0
@@ -52,7 +52,7 @@ def _share(value: float, ceiling: float) -> str:
 
 
 def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Returns of each expert's first and last recorded episode, one row per variation."""
+    """Return of each expert's first and last recorded episode, one row per variation."""
     table = Table(title="SAC experts: return of the first and of the last recorded episode", title_justify="left")
     for name in ("task", "adversary", "first", "last"):
         table.add_column(name, justify="left" if name in ("task", "adversary") else "right")
@@ -65,7 +65,7 @@ def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 def kl_table(report: Mapping[str, Any], suffix: str, title: str) -> Table:
     """Divergence from the exact posterior under one prior, one row per kind of context and p, and their mean.
 
-    ``suffix`` names the prior in the keys of ``report``.
+    ``suffix``: the part of the report's keys that stands for the prior.
     """
     table = Table(title=title, title_justify="left")
     for name in ("goals", "context", "p", "KL", "+-", "goal met", "not met", "met in"):

@@ -1,1 +1,1 @@
-"""Deploy a policy in a batch of environments (Algorithm 1)."""
+"""Deployment of policies in batches of environments (Algorithm 1)."""

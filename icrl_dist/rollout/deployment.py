@@ -1,4 +1,4 @@
-"""T_theta deployed in a batch of environments: by Algorithm 1, or committed (zeta of eq. 6)."""
+"""T_theta deployed in a batch of environments: by Algorithm 1, or with action windows (zeta of eq. 6)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Tra
 
 
 def default_deployment(model: ModelConfig) -> Deployment:
-    """``committed`` for a model that is trained on action windows."""
+    """``committed`` for a model that is trained on action windows, else ``paper``."""
     return "committed" if model.window > 1 else "paper"
 
 
 class InContextPolicy:
     """T_theta(. | s, D_on): the context is frozen within an episode and grows at its end.
 
-    Lines 10 to 17 of Algorithm 1.  A context that outgrows ``context.max`` drops its oldest
-    whole episodes and is encoded anew, for kept keys have seen what was dropped.
+    Lines 10 to 17 of Algorithm 1.  A context longer than ``context.max`` drops its oldest episodes and
+    is encoded again, because the cached keys of later transitions depend on the dropped ones.
     """
 
     def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
@@ -38,7 +38,7 @@ class InContextPolicy:
         return self._deployed.length
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
-        """The actions that these uniform numbers in [0, 1) pick: one a row, or one a component."""
+        """The actions that the uniform numbers in [0, 1) select: one number per row, or one per component."""
         return self.model.action_head.act(self._decide(observation), u)
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
@@ -46,28 +46,28 @@ class InContextPolicy:
         return self._decide(observation).softmax(-1).cpu().numpy()
 
     def distribution(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]:
-        """T_theta(. | s, D) at any states s, D being the context of environment ``row`` as the next decision sees it.
+        """T_theta(. | s, D) at any states s, with the context D that environment ``row`` will have at its next decision.
 
-        Every state stands alone: what the agent did last (zeta) is not told.  Nothing changes: later
-        actions are as if nobody had asked.
+        The action window (zeta) is not an input, so each state is a query of its own.  The policy does not
+        change: later actions are the same with and without this call.
         """
         (queries,) = self._tensors(states)
-        arrived = Transitions(*self._tensors(*(column[None] for column in self._stacked(self._arrived(), row))))
-        outputs = self._deployed.decide_row(row, queries, arrived)
+        new = Transitions(*self._tensors(*(column[None] for column in self._stacked(self._not_encoded(), row))))
+        outputs = self._deployed.decide_row(row, queries, new)
         return outputs.softmax(-1).cpu().numpy()
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
         """D of ``distribution``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
-        taken_up = zip(*([c[row].cpu().numpy() for c in episode] for episode in self._episodes), strict=True)
-        columns = [np.concatenate(column) for column in taken_up] or self._stacked([], row)
+        ended = zip(*([c[row].cpu().numpy() for c in episode] for episode in self._episodes), strict=True)
+        columns = [np.concatenate(column) for column in ended] or self._stacked([], row)
         return tuple(np.concatenate(both) for both in zip(columns, self._stacked(self._running(), row), strict=True))
 
     def _running(self) -> list[tuple[np.ndarray, ...]]:
-        """What of the running episode is in the context."""
+        """The transitions of the running episode that belong to the context."""
         return []
 
-    def _arrived(self) -> list[tuple[np.ndarray, ...]]:
-        """What of it the decoder has not been told yet."""
+    def _not_encoded(self) -> list[tuple[np.ndarray, ...]]:
+        """Those of them that the decoder has not encoded yet."""
         return []
 
     def _stacked(self, steps: list[tuple[np.ndarray, ...]], row: int) -> list[np.ndarray]:
@@ -93,13 +93,13 @@ class InContextPolicy:
             self._deployed.state = None
         self._pending.append((observation, action, next_observation, reward))
         if done:
-            self._end(self._episode())
+            self._add_own(self._ended_episode())
 
-    def _end(self, episode: Transitions) -> None:
-        """Take up an episode of one's own."""
+    def _add_own(self, episode: Transitions) -> None:
+        """Add an episode of this policy to the context."""
         self._add(episode)
 
-    def _episode(self) -> Transitions:
+    def _ended_episode(self) -> Transitions:
         """The episode that has just ended."""
         columns = [np.stack(column, axis=1) for column in zip(*self._pending, strict=True)]
         self._pending = []
@@ -116,14 +116,14 @@ class InContextPolicy:
         self._add(Transitions(*self._tensors(observations, actions, next_observations, rewards)))
 
     def _add(self, episode: Transitions) -> None:
-        if not self._remember(episode):
+        if not self._add_to_context(episode):
             self._deployed.append(episode)
 
     def _tensors(self, *columns: np.ndarray) -> Iterator[torch.Tensor]:
         return (torch.from_numpy(np.array(column)).to(self.model.low.device) for column in columns)
 
-    def _remember(self, episode: Transitions) -> bool:
-        """Add an episode to those of the context; true if others were dropped for it, and all was encoded anew."""
+    def _add_to_context(self, episode: Transitions) -> bool:
+        """Add an episode to the context; True if older ones were dropped and the whole context was encoded again."""
         kept = [] if self._config.keep == "last" else list(self._episodes)
         total = sum(e.actions.shape[1] for e in kept) + episode.actions.shape[1]
         while kept and total > self._config.max:
@@ -136,33 +136,33 @@ class InContextPolicy:
 
 
 class CommittedPolicy(InContextPolicy):
-    """T_theta(. | s, D_on, zeta): every transition joins the context at once, and a guess once acted on is kept.
+    """T_theta(. | s, D_on, zeta): every transition joins the context at once, and the agent's own action window is an input.
 
-    zeta is what the agent did last in this episode, as if the optimal policy had done it (eq. 6):
-    what T_theta has begun to do it goes on with.  It lets go of a guess by itself when the guess
-    proves wrong, because it also trained on windows that wrong guesses led (``pretrain.decoy_fraction``).
+    zeta holds the agent's last transitions in this episode, as if the optimal policy had acted (eq. 6).
+    Therefore T_theta continues to act on the same hypothesis of the task.  It gives up a wrong hypothesis,
+    because some training windows hold actions of another task's policy (``pretrain.decoy_fraction``).
     """
 
     def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
         super().__init__(model, batch, context, watch)
-        self._read = 0  # of self._pending, what is in the context already
+        self._encoded = 0  # number of the transitions in self._pending that the decoder has encoded
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
-        for step in self._pending[self._read : -1]:  # it was not asked for an action since
+        for step in self._pending[self._encoded : -1]:  # observed since the last decision; the newest follows below
             self._deployed.append(self._one(step))
-        arrived = self._one(self._pending[-1]) if self._read < len(self._pending) else None
-        self._read = len(self._pending)
+        newest = self._one(self._pending[-1]) if self._encoded < len(self._pending) else None
+        self._encoded = len(self._pending)
         past = self._pending[1 - self.model.config.window :]
         nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
         columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
-        states, taken, _, gained = (np.stack(column, axis=1)[:, None] for column in columns)
-        return self._deployed.decide_window(Windows(*self._tensors(states, taken, gained)), arrived)
+        states, actions, _, rewards = (np.stack(column, axis=1)[:, None] for column in columns)
+        return self._deployed.decide_window(Windows(*self._tensors(states, actions, rewards)), newest)
 
     def _running(self) -> list[tuple[np.ndarray, ...]]:
         return self._pending
 
-    def _arrived(self) -> list[tuple[np.ndarray, ...]]:
-        return self._pending[self._read :]
+    def _not_encoded(self) -> list[tuple[np.ndarray, ...]]:
+        return self._pending[self._encoded :]
 
     def _one(self, step: tuple[np.ndarray, ...]) -> Transitions:
         return Transitions(*self._tensors(*(column[:, None] for column in step)))
@@ -171,10 +171,10 @@ class CommittedPolicy(InContextPolicy):
         spec = self.model.spec
         return np.zeros(rows, np.int64) if spec.discrete else np.zeros((rows, spec.actions), np.float32)
 
-    def _end(self, episode: Transitions) -> None:
-        read, self._read = self._read, 0
-        if not self._remember(episode):
-            self._deployed.append(Transitions(*(column[:, read:] for column in episode)))
+    def _add_own(self, episode: Transitions) -> None:
+        encoded, self._encoded = self._encoded, 0
+        if not self._add_to_context(episode):
+            self._deployed.append(Transitions(*(column[:, encoded:] for column in episode)))
 
 
 def in_context(
@@ -184,16 +184,16 @@ def in_context(
     deploy: Deployment | None = None,
     watch: Watch | None = None,
 ) -> InContextPolicy:
-    """T_theta deployed by this rule, or by the better one that it was trained for.
+    """T_theta deployed by this rule; None: the rule of ``default_deployment``.
 
-    ``watch`` is told of every decision once its outcome is observed.
+    ``watch`` is called after every decision with the decision and its outcome.
 
-    Raises ConfigError for ``committed`` if it was not trained on windows.
+    Raises ConfigError for ``committed`` if the model was not trained on action windows.
     """
     rule = deploy or default_deployment(model.config)
     if rule == "committed" and model.config.window == 1:
         raise ConfigError(
-            "deploy 'committed': this agent never trained on windows (model.window = 1); "
+            "deploy 'committed': this agent was not trained on action windows (model.window = 1); "
             "deploy it by 'paper', or train with model.window, pretrain.windows and optim.windows"
         )
     return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context, watch)

@@ -1,4 +1,4 @@
-"""Algorithm 1 in a whole batch of environments: episodes online, and offline given a dataset."""
+"""Algorithm 1 in a batch of environments: online episodes, and offline episodes given a dataset."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Episodes:
     rewards: Float32[np.ndarray, "B H"]
     adversary: Int16[np.ndarray, "B H"] | Float32[np.ndarray, "B H F"]
     diverged: Bool[np.ndarray, " B"] | None = None
-    """Rows whose simulation diverged, so that nothing may be learned from them; None for a problem that cannot diverge."""
+    """Rows whose simulation diverged: their episodes are not used for training.  None for a problem that cannot diverge."""
 
     @property
     def returns(self) -> Float[np.ndarray, " B"]:
@@ -30,7 +30,7 @@ class Episodes:
 
 
 def episode(env: Batch, policy: Policy, rngs: Sequence[np.random.Generator]) -> Episodes:
-    """One episode; all draws of row b, those of the policy included, come from ``rngs[b]``."""
+    """One episode; all draws of row b, also those of the policy, come from ``rngs[b]``."""
     observation = env.reset(rngs)
     shape = (env.spec.horizon, 1 if env.spec.discrete else env.spec.actions)
     noise = np.stack([rng.random(shape) for rng in rngs], axis=1)
@@ -54,13 +54,13 @@ def episode(env: Batch, policy: Policy, rngs: Sequence[np.random.Generator]) -> 
 
 
 def deploy_online(env: Batch, policy: Policy, trials: Iterable[Sequence[np.random.Generator]]) -> Iterator[Episodes]:
-    """Lines 9 to 17: one episode a trial, the context growing from nothing."""
+    """Lines 9 to 17: one episode per trial; the context starts empty and grows."""
     for rngs in trials:
         yield episode(env, policy, rngs)
 
 
-class DataPolicy(Policy, Protocol):
-    """A policy that also takes in episodes of other policies."""
+class OfflinePolicy(Policy, Protocol):
+    """A policy whose context also accepts episodes of other policies."""
 
     def append(
         self,
@@ -74,9 +74,9 @@ class DataPolicy(Policy, Protocol):
 
 
 def deploy_offline(
-    env: Batch, policy: DataPolicy, dataset: Sequence[Episodes], rngs: Sequence[np.random.Generator]
+    env: Batch, policy: OfflinePolicy, dataset: Sequence[Episodes], rngs: Sequence[np.random.Generator]
 ) -> Episodes:
-    """Lines 3 to 7: one episode given D_off, which other policies collected before."""
+    """Lines 3 to 7: one episode given D_off, which other policies collected."""
     for data in dataset:
         actions = data.actions.astype(np.int64) if env.spec.discrete else data.actions
         policy.append(data.observations[:, :-1], actions, data.observations[:, 1:], data.rewards)

@@ -32,7 +32,7 @@ class RandomPolicy(DiscretePolicy):
         return np.broadcast_to(self._uniform, (len(observation), len(self._uniform)))
 
     def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
+        """Does nothing: the policy does not learn."""
 
 
 class RandomVectorPolicy:
@@ -43,4 +43,4 @@ class RandomVectorPolicy:
         return (2 * u - 1).astype(np.float32)
 
     def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
+        """Does nothing: the policy does not learn."""

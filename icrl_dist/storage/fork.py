@@ -1,4 +1,4 @@
-"""Forks: a run that begins with another's weights and data, and remembers whose they are."""
+"""Forks: a run that starts with the weights and data of another run, and records the origin of each."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _FILE = "fork.json"
 
 @dataclass(frozen=True)
 class Lineage:
-    """Which numbers the data of each version was asked for with: the run's own, or an ancestor's."""
+    """The settings that the data of each version was collected with: the run's own, or an ancestor's."""
 
     own: Run
     ancestors: tuple[tuple[int, Run], ...] = ()
-    """The newest version that each ancestor made, and its numbers; oldest first."""
+    """The newest version that each ancestor trained, and its settings; oldest first."""
 
     def run_of(self, version: int) -> Run:
-        """The numbers that the data and the fit of this version come from."""
+        """The settings of the run that collected the data of this version and fitted it."""
         return next((run for newest, run in self.ancestors if version <= newest), self.own)
 
     @classmethod
@@ -44,49 +44,54 @@ class Lineage:
             fields = json.loads(path.read_text())
             return cls(run, tuple((int(item["version"]), parse(item["run"], str(path))) for item in fields["ancestors"]))
         except (KeyError, TypeError, ValueError) as error:
-            raise StoreError(f"{path}: not a fork's record ({error}); restore it, or fork anew") from None
+            raise StoreError(f"{path}: not the record of a fork ({error}); restore the file, or make the fork again") from None
 
 
 def parse_source(text: str) -> tuple[Path, int]:
-    """``RUN_DIR@ROUND``, or ``RUN_DIR`` for its newest version.  Raises ConfigError if there is no such checkpoint."""
+    """Run folder and version of ``RUN_DIR@ROUND``, or of ``RUN_DIR`` (its newest version).
+
+    Raises ConfigError if there is no such checkpoint.
+    """
     name, _, round_ = text.rpartition("@")
     folder = Path(name or text)
     if name and not (round_.isascii() and round_.isdigit()):
-        raise ConfigError(f"--from {text}: write RUN_DIR@ROUND, ROUND a number: the version T^ROUND to begin with")
+        raise ConfigError(f"--from {text}: write RUN_DIR@ROUND, where ROUND is the number of the version T^ROUND to start from")
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"--from {text}: {folder} holds no run")
     newest = newest_version(folder)
     version = int(round_) if name else newest
     if version < 0 or not version_file(folder, version).is_file():
-        raise ConfigError(f"--from {text}: {folder} holds the versions up to {newest}; name one of them")
+        found = f"versions 0 to {newest}; name one of them" if newest >= 0 else "no checkpoint yet; train that run first"
+        raise ConfigError(f"--from {text}: {folder} holds {found}")
     return folder, version
 
 
 def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
-    """Give ``folder`` the weights T^0 .. T^version of another run and the data they were fitted to.
+    """Put the weights T^0 to T^version of another run, and the data that they were fitted to, into ``folder``.
 
-    Files are shared, not copied, where the file system can.  Raises ConfigError if the runs do
-    not fit together, StoreError if the data is not what the checkpoint names.
+    Files are linked, not copied, if the file system supports it.  Raises ConfigError if the runs differ in what
+    a fork may not change, StoreError if the digest of the data is not the one in the checkpoint.
     """
     parent = load(str(theirs / "run.toml"))
-    _same(parent, run, f"--from {theirs}@{version}")
+    _check_same(parent, run, f"--from {theirs}@{version}")
     manifest: Mapping[str, Any] = load_checkpoint(version_file(theirs, version)).manifest
     if "dataset_digest" not in manifest:
-        raise ConfigError(f"--from {theirs}@{version}: its checkpoint names no data: it is of an older version of icrl-dist")
+        problem = "its checkpoint, of an older version of icrl-dist, holds no dataset digest; train that run again"
+        raise ConfigError(f"--from {theirs}@{version}: {problem}")
     lineage = Lineage.of(theirs, parent)
     ancestors = [(newest, a) for newest, a in lineage.ancestors if newest < version] + [(version, lineage.run_of(version))]
 
-    def keep(identity: Identity) -> bool:
+    def is_needed(identity: Identity) -> bool:
         return identity.next_version <= version
 
-    adopt(theirs / "dataset", folder / "dataset", keep)
+    adopt(theirs / "dataset", folder / "dataset", is_needed)
     store = Dataset(folder / "dataset")
     digest = store.digest(version)
     store.close()
     if digest != manifest["dataset_digest"]:
         raise StoreError(
-            f"{theirs}: its data of T^{version} ({digest[:16]}) is not what the checkpoint was fitted to "
-            f"({manifest['dataset_digest'][:16]}): `icrl-dist train --resume` that run first, which collects what is missing"
+            f"{theirs}: the data of T^{version} (digest {digest[:16]}) is not the data that the checkpoint was fitted to "
+            f"({manifest['dataset_digest'][:16]}): run `icrl-dist train --resume` on that run first; it collects missing data"
         )
     for older in range(version + 1):
         _link(version_file(theirs, older), version_file(folder, older))
@@ -100,15 +105,15 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
     atomic_write(folder / _FILE, lambda file: file.write(json.dumps(record, indent=1).encode()))
 
 
-def _same(parent: Run, run: Run, what: str) -> None:
-    """Raises ConfigError, naming every number that differs, if the runs have another problem, split, method or model."""
-    owner = plugins.find("problems", run.problem)
+def _check_same(parent: Run, run: Run, what: str) -> None:
+    """Raises ConfigError, with every setting that differs, if the runs differ in problem, split, method or model."""
+    problem = plugins.find("problems", run.problem)
     differing = [
         (name, getattr(parent, name), getattr(run, name))
         for name in ("method", "problem")
         if getattr(parent, name) != getattr(run, name)
     ]
-    sections = {"model": ()} if differing else {"model": (), owner.section: owner.free_in_forks}
+    sections = {"model": ()} if differing else {"model": (), problem.section: problem.free_in_forks}
     for section, free in sections.items():
         before, after = parent.section(section), run.section(section)
         differing += [
@@ -118,7 +123,9 @@ def _same(parent: Run, run: Run, what: str) -> None:
         ]
     if differing:
         named = ", ".join(f"{name} = {after!r} (parent: {before!r})" for name, before, after in differing)
-        raise ConfigError(f"{what}: {named}: a fork has its parent's problem, split, method and model; begin a new run instead")
+        raise ConfigError(
+            f"{what}: {named}: a fork has the problem, split, method and model of its parent; start a new run instead"
+        )
 
 
 def _link(source: Path, target: Path) -> None:

@@ -1,1 +1,1 @@
-"""Training batches, the fit, and its optimizers."""
+"""Training batches, the fit and its optimizers."""

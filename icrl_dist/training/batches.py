@@ -1,4 +1,4 @@
-"""Contexts D, and how trajectories of one variation become training examples (D, s_query, a*)."""
+"""Training batches: examples (D, s_query, a*) from the trajectories of each variation, with action windows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ K = TypeVar("K", bound=Hashable)
 
 
 class LabelledWindows(NamedTuple):
-    """R windows of L states, what was done and gained in them (zeta of eq. 6), and the labels; or of each of B contexts."""
+    """R action windows of L states with actions and rewards (zeta of eq. 6), and labels; in a batch, R of each context."""
 
     states: Float32[np.ndarray, "*B R L S"]
-    taken: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
-    gained: Float32[np.ndarray, "*B R L"]
+    actions: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
+    rewards: Float32[np.ndarray, "*B R L"]
     labels: Float32[np.ndarray, "*B R L A"]
 
     @classmethod
@@ -28,28 +28,28 @@ class LabelledWindows(NamedTuple):
         cls,
         length: int,
         states: Float32[np.ndarray, "N S"],
-        taken: Integer[np.ndarray, " N"] | Float32[np.ndarray, "N A"],
-        gained: Float32[np.ndarray, " N"],
+        actions: Integer[np.ndarray, " N"] | Float32[np.ndarray, "N A"],
+        rewards: Float32[np.ndarray, " N"],
         labels: Float32[np.ndarray, "N A"],
     ) -> LabelledWindows:
-        """What happened in a row as windows of this length; what is left at the end is not used."""
-        whole = len(taken) // length * length
-        columns = states, _actions(taken), gained, labels
-        return cls(*(c[:whole].reshape(-1, length, *c.shape[1:]) for c in columns))
+        """Consecutive steps as windows of ``length`` steps; the remainder at the end is not used."""
+        used = len(actions) // length * length
+        columns = states, _actions(actions), rewards, labels
+        return cls(*(c[:used].reshape(-1, length, *c.shape[1:]) for c in columns))
 
 
 def _actions(actions: np.ndarray) -> np.ndarray:
-    """As a model takes them: numbers as int64, vectors as they are."""
+    """Actions as inputs of a model: discrete ones as int64, vectors unchanged."""
     return actions if actions.dtype == np.float32 else actions.astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """What one variation offers to learn from: episodes for contexts, labelled queries.
+    """Training data of one variation: episodes for contexts, labelled queries and action windows.
 
-    Any query of a variation goes with any context of it, for its label depends on (tau, phi)
-    alone.  ``history`` says that a context must be the episodes from the first on, in order,
-    as the deployed agent met them; otherwise it is any of the episodes in any order.
+    Any query can be paired with any context, because a label depends on (tau, phi) alone.
+    ``history``: a context holds the first episodes in order, as in deployment; otherwise it
+    holds any episodes in any order.
     """
 
     actions: Int64[np.ndarray, "E H"] | Float32[np.ndarray, "E H A"]
@@ -69,7 +69,7 @@ class Examples:
         history: bool = False,
         windows: LabelledWindows | None = None,
     ) -> Examples:
-        """Raises ValueError without an episode or without a label."""
+        """The examples of these episodes and labels.  Raises ValueError without an episode or without a label."""
         if not episodes or not len(queries):
             raise ValueError(f"examples need an episode and a label, got {len(episodes)} and {len(queries)}")
         return cls(
@@ -84,39 +84,41 @@ class Examples:
 
     @property
     def nbytes(self) -> int:
+        """Size of all arrays in bytes."""
         own = (self.actions, self.observations, self.rewards, self.queries, self.labels)
         return sum(array.nbytes for array in (*own, *(self.windows or ())))
 
 
-class Shelf(Generic[K]):
-    """Examples that are read when they are needed; the last used stay in memory, up to ``budget`` bytes."""
+class ExamplesCache(Generic[K]):
+    """Reads examples when they are needed; keeps the most recently used in memory, up to ``budget`` bytes."""
 
     def __init__(self, budget: int, read: Callable[[K], Examples]) -> None:
         self._budget, self._read = budget, read
-        self._kept: OrderedDict[K, Examples] = OrderedDict()
+        self._cached: OrderedDict[K, Examples] = OrderedDict()
         self.nbytes = 0
 
     def put(self, key: K, examples: Examples) -> None:
-        """Keep what was read anyway, as long as there is room."""
-        self._kept[key] = examples
+        """Add examples; removes the least recently used ones beyond the budget."""
+        self._cached[key] = examples
         self.nbytes += examples.nbytes
-        while self.nbytes > self._budget and len(self._kept) > 1:
-            _, oldest = self._kept.popitem(last=False)
+        while self.nbytes > self._budget and len(self._cached) > 1:
+            _, oldest = self._cached.popitem(last=False)
             self.nbytes -= oldest.nbytes
 
     def get(self, key: K) -> Examples:
-        if key in self._kept:
-            self._kept.move_to_end(key)
+        """The examples of this key; read if they are not in memory."""
+        if key in self._cached:
+            self._cached.move_to_end(key)
         else:
             self.put(key, self._read(key))
-        return self._kept[key]
+        return self._cached[key]
 
 
-class Shelved(Sequence[Examples], Generic[K]):
-    """A row of examples on a shelf."""
+class CachedExamples(Sequence[Examples], Generic[K]):
+    """The examples of some keys of a cache, as a sequence."""
 
-    def __init__(self, shelf: Shelf[K], keys: Sequence[K]) -> None:
-        self._shelf, self._keys = shelf, keys
+    def __init__(self, cache: ExamplesCache[K], keys: Sequence[K]) -> None:
+        self._cache, self._keys = cache, keys
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -125,16 +127,16 @@ class Shelved(Sequence[Examples], Generic[K]):
     def __getitem__(self, index: int) -> Examples: ...
 
     @overload
-    def __getitem__(self, index: slice) -> Shelved[K]: ...
+    def __getitem__(self, index: slice) -> CachedExamples[K]: ...
 
-    def __getitem__(self, index: int | slice) -> Examples | Shelved[K]:
+    def __getitem__(self, index: int | slice) -> Examples | CachedExamples[K]:
         if isinstance(index, slice):
-            return Shelved(self._shelf, self._keys[index])
-        return self._shelf.get(self._keys[index])
+            return CachedExamples(self._cache, self._keys[index])
+        return self._cache.get(self._keys[index])
 
 
-class Offered(Protocol):
-    """Examples of many variations in a row, each perhaps read from the disk when it is asked for."""
+class ExamplesSequence(Protocol):
+    """Examples of many variations; an item may be read from disk when it is accessed."""
 
     def __len__(self) -> int: ...
 
@@ -143,20 +145,20 @@ class Offered(Protocol):
 
 @dataclass(frozen=True)
 class Pool:
-    """Examples of many variations, and the share of the training batches that come from them."""
+    """Examples of many variations, and the share of training batches that are drawn from them."""
 
     share: float
-    examples: Offered
+    examples: ExamplesSequence
     episodes: int
-    """Episodes in a context, at most."""
+    """Most episodes in a context."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingBatch:
-    """B contexts of up to T transitions, zero-padded at the end, and N queries and R windows of each.
+    """B contexts of up to T transitions, zero-padded at the end, with N queries and R action windows each.
 
-    Padding needs no mask: context tokens see only earlier ones, and ``prefix`` never
-    reaches beyond a context's real length.
+    Padding needs no mask: tokens attend only to earlier ones, and ``prefix`` is at most the length of
+    a context without its padding.
     """
 
     observations: Float32[np.ndarray, "B T S"]
@@ -178,11 +180,11 @@ def draw(
     transitions: int = 0,
     windows: int = 0,
 ) -> TrainingBatch:
-    """A training batch: random variations, random contexts of them, random prefixes, queries and windows.
+    """A training batch: random variations, and random contexts, prefixes, queries and windows of each.
 
-    A batch comes from one pool, drawn by share, and its contexts have the same drawn number of
-    episodes (at most what the variation has), so little is padding.  It has ``batch`` contexts,
-    or as many as make up ``transitions`` if that is above 0 and those are fewer.
+    A batch comes from one pool, drawn by share.  All of its contexts have the same random number of
+    episodes (at most those of the variation), so there is little padding.  It has ``batch`` contexts,
+    or fewer if ``transitions`` is above 0: then at most that many transitions, but at least one context.
     """
     shares = np.array([pool.share for pool in pools])
     pool = pools[int(rng.choice(len(pools), p=shares / shares.sum()))]
@@ -201,11 +203,11 @@ def draw(
             out[b, : len(row[column])] = row[column]
         return out
 
-    asked, labels, prefix = (np.stack([row[column] for row in rows]) for column in (4, 5, 6))
-    made = TrainingBatch(padded(0), padded(1), padded(2), padded(3), asked, labels, prefix)
+    query_states, labels, prefix = (np.stack([row[column] for row in rows]) for column in (4, 5, 6))
+    made = TrainingBatch(padded(0), padded(1), padded(2), padded(3), query_states, labels, prefix)
     if windows:
         drawn = [_windows(rng, examples, length, windows) for examples, length in zip(chosen, lengths, strict=True)]
-        columns = (np.stack(column) for column in zip(*(of for of, _ in drawn), strict=True))
+        columns = (np.stack(column) for column in zip(*(cut for cut, _ in drawn), strict=True))
         made = replace(made, windows=LabelledWindows(*columns), window_prefix=np.stack([prefix for _, prefix in drawn]))
     return made
 
@@ -228,9 +230,12 @@ def _context(rng: np.random.Generator, examples: Examples, count: int, queries: 
 
 
 def _windows(rng: np.random.Generator, examples: Examples, length: int, count: int) -> tuple[LabelledWindows, np.ndarray]:
-    """Random windows, and a random prefix of the context for each.  Raises ValueError if there are none."""
-    of = examples.windows
-    if of is None or not len(of.states):
-        raise ValueError("optim.windows: these examples have none; datasets without windows cannot train model.window")
-    chosen = rng.integers(0, len(of.states), size=count)
-    return LabelledWindows(*(column[chosen] for column in of)), rng.integers(0, length + 1, size=count)
+    """Random windows, and a random prefix of the context for each.  Raises ValueError if there are no windows."""
+    found = examples.windows
+    if found is None or not len(found.states):
+        raise ValueError(
+            f"optim.windows = {count}: the dataset holds no action windows; "
+            "set optim.windows = 0, or collect a dataset with pretrain.windows"
+        )
+    chosen = rng.integers(0, len(found.states), size=count)
+    return LabelledWindows(*(column[chosen] for column in found)), rng.integers(0, length + 1, size=count)

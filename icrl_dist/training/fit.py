@@ -1,4 +1,4 @@
-"""Supervised pretraining: the optimizer, one step, and a fit."""
+"""Supervised training: the optimizer, the learning-rate schedule and the fit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Optimizer:
             self._parts.append((optimizers.Muon(matrices, weight_decay=0.0), config.muon))
 
     def step(self, learning_rate: float) -> None:
-        """Change the weights by their gradients, and forget those."""
+        """Update the weights with their gradients, and clear the gradients."""
         for part, factor in self._parts:
             for group in part.param_groups:
                 group["lr"] = learning_rate * factor
@@ -34,7 +34,7 @@ class Optimizer:
             part.zero_grad(set_to_none=True)
 
     def state(self) -> dict[str, Tensor]:
-        """What it remembers of earlier gradients, by name."""
+        """The optimizer state (moments of the gradients) by name."""
         return {
             f"{number}/{index}/{name}": value
             for number, (part, _) in enumerate(self._parts)
@@ -42,23 +42,23 @@ class Optimizer:
             for name, value in state.items()
         }
 
-    def load(self, remembered: Mapping[str, Tensor]) -> None:
-        """The inverse of ``state``.  Raises ValueError for another optimizer's."""
+    def load(self, stored: Mapping[str, Tensor]) -> None:
+        """The inverse of ``state``.  Raises ValueError for the state of another optimizer."""
         groups = [part.state_dict()["param_groups"] for part, _ in self._parts]
         places = {(number, index) for number, (group,) in enumerate(groups) for index in group["params"]}
         states: dict[tuple[int, int], dict[str, Tensor]] = {}
-        for key, value in remembered.items():
+        for key, value in stored.items():
             first, second, name = key.split("/")
             states.setdefault((int(first), int(second)), {})[name] = value
         if states and set(states) != places:
-            raise ValueError(f"it remembers {len(states)} parameters in other places than these {len(places)}")
+            raise ValueError(f"it holds the state of {len(states)} parameters, not of these {len(places)}")
         for number, (part, _) in enumerate(self._parts):
-            own = {index: state for (of, index), state in states.items() if of == number}
+            own = {index: state for (group, index), state in states.items() if group == number}
             part.load_state_dict({"state": own, "param_groups": groups[number]})
 
 
 def rate(step: int, steps: int, warmup: int) -> float:
-    """Learning-rate factor: a linear rise, then a cosine from 1 to a tenth."""
+    """Learning-rate factor: linear warmup, then cosine decay from 1 to 0.1."""
     if step < warmup:
         return (step + 1) / warmup
     done = (step - warmup) / max(1, steps - warmup)
@@ -77,9 +77,9 @@ def fit(
 ) -> float:
     """Minimize a loss for ``steps`` steps at peak rate ``learning_rate``; ``loss(step)`` draws the data of a step.
 
-    A step depends on its number, the weights and the optimizer alone, so a fit stopped after
-    ``first`` steps goes on as if it had never stopped.  Returns the mean loss of the last
-    tenth.  Raises FloatingPointError if the loss stops being a number.
+    A step depends only on its number, the weights and the optimizer state, so a fit that continues
+    after ``first`` steps gives the same result as one without a stop.  Returns the mean loss of the
+    last tenth of the steps.  Raises FloatingPointError if the loss is not finite.
     """
     model.train()
     warmup = min(config.warmup, max(1, steps // 10))

@@ -1,7 +1,8 @@
-"""torch's optimizers, without torch's compiler.
+"""torch's optimizers without the import of torch's compiler.
 
-Methods that the compiler shall leave alone import it to say so, when they are first called:
-as many seconds as the import of torch itself, and 70 MB, in every process that learns.
+torch wraps some methods of its optimizers to exclude them from compilation; at the first call these
+wrappers import the compiler, which takes as long as the import of torch itself, and 70 MB, in every
+process that trains.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ _Kind = TypeVar("_Kind", bound=Optimizer)
 
 
 def _uncompiled(kind: type[_Kind]) -> type[_Kind]:
-    """The optimizer with those methods that torch wrapped."""
+    """The optimizer with these methods unwrapped."""
     for name in ("add_param_group", "state_dict", "load_state_dict", "zero_grad"):
         setattr(kind, name, inspect.unwrap(getattr(kind, name)))
     setattr(kind, "step", torch.no_grad()(inspect.unwrap(kind.step)))  # noqa: B010

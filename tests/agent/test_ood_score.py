@@ -94,15 +94,15 @@ def test_the_running_surprise_keeps_the_longest_window_and_no_more():
     spec = SPECS[0]
     model = OutcomeModel.fit(spec, decisions(spec, 200, seed=0), decisions(spec, 120, seed=1))
     running = Surprise(model, spec, B)
-    np.testing.assert_array_equal(running.now(), np.zeros(B))
+    np.testing.assert_array_equal(running.score(), np.zeros(B))
     for one in decisions(spec, 30, seed=3, noise=3.0):
         running.observe(*one)
-    assert running.now().min() > 3
+    assert running.score().min() > 3
     calm = decisions(spec, WINDOWS[-1], seed=4)
     for one in calm:
         running.observe(*one)
-    np.testing.assert_allclose(running.now(), model.surprise(np.stack([model.loss(spec, one) for one in calm], axis=1)))
-    assert np.median(running.now()) < 1
+    np.testing.assert_allclose(running.score(), model.surprise(np.stack([model.loss(spec, one) for one in calm], axis=1)))
+    assert np.median(running.score()) < 1
 
 
 def test_a_change_of_a_constant_of_training_gives_a_high_surprise():

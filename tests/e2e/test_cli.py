@@ -194,7 +194,7 @@ def test_a_stopped_evaluation_prints_the_command_that_resumes(monkeypatch, tmp_p
         pytest.fail("the signal was ignored")
 
     monkeypatch.setattr(train, "train_inline", lambda *_: {})
-    monkeypatch.setattr(heldout, "keep_calibrated", stopped)
+    monkeypatch.setattr(heldout, "save_calibrated", stopped)
     assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
     assert (

@@ -10,7 +10,7 @@ from icrl_dist.config.run import ConfigError, validate
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import cache
-from icrl_dist.experts.cache import LED, History
+from icrl_dist.experts.cache import WINDOW_EPISODES, History
 from icrl_dist.experts.sac import batched
 from icrl_dist.experts.train import ExpertPolicy, ScriptedPolicy
 from icrl_dist.methods import registry as methods
@@ -95,7 +95,7 @@ def windowed(run):
 def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_another_task(windowed):
     job = jobs_of(windowed)[0]
     sent = do(windowed, job)
-    found = [cache.any_kept(v, HORIZON, windowed.sac, windowed.seed) for v in job.variations]
+    found = [cache.load_any(v, HORIZON, windowed.sac, windowed.seed) for v in job.variations]
     policies = [ExpertPolicy([history] * 4, windowed.sac) for history in found]
     unused, led = np.zeros((4, 2)), {False: 0, True: 0}
     for t in sent:
@@ -110,7 +110,9 @@ def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_anoth
             decoy = np.abs(taken[n] - labels[n]).max() > 1e-4
             led[bool(decoy)] += 1
             np.testing.assert_allclose(taken[n], (other if decoy else own).act(states[n], unused), atol=1e-5)
-            places = [(g, h) for g in range(LED) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states[n]).all()]
+            places = [
+                (g, h) for g in range(WINDOW_EPISODES) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states[n]).all()
+            ]
             assert bool(places) != decoy, "four states in a row of an episode that its own expert led, or of another"
             if places:
                 g, h = places[0]
@@ -132,7 +134,7 @@ def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed
     draw = method.data(run, method.phases(run)[0], data)
     torch.manual_seed(0)
     model = method.build(registry.of(run).spec, run)
-    taken = draw(np.random.default_rng(0)).windows.taken
+    taken = draw(np.random.default_rng(0)).windows.actions
     assert taken.shape == (8, 2, 4, 2) and taken.dtype == np.float32
 
     def loss(step):

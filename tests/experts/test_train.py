@@ -33,7 +33,7 @@ def test_contexts_are_episodes_of_the_training_and_labels_are_actions_of_its_exp
     job = jobs_of(run)[0]
     sent = do(run, job)
     assert [t.identity for t in sent] == list(job.identities())
-    found = [cache.any_kept(v, HORIZON, run.sac, run.seed) for v in job.variations]
+    found = [cache.load_any(v, HORIZON, run.sac, run.seed) for v in job.variations]
     for t in sent:
         row = job.variations.index(t.variation)
         history = found[row]
@@ -86,7 +86,7 @@ def test_a_method_takes_the_experts_that_another_method_trained_and_ends_with_th
 
 
 def test_a_history_delivers_at_most_the_episodes_of_its_training_and_keeps_all_of_them_if_all_are_needed(run, monkeypatch):
-    monkeypatch.setattr(cache, "KEPT", 6)
+    monkeypatch.setattr(cache, "RECORDED_EPISODES", 6)
     many = dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, contexts=8 * 30))
     job = jobs_of(many)[0]
     assert job.trials == EPISODES
@@ -95,7 +95,7 @@ def test_a_history_delivers_at_most_the_episodes_of_its_training_and_keeps_all_o
     few = jobs_of(run)[0]
     assert few.trials == 3
     do(run, few)
-    assert len(cache.kept(few.variations[0], HORIZON, run.sac, run.seed, "lockstep").rewards) == 6
+    assert len(cache.load(few.variations[0], HORIZON, run.sac, run.seed, "lockstep").rewards) == 6
 
 
 def test_every_number_that_decides_a_history_is_part_of_its_key(run, monkeypatch):
@@ -149,11 +149,11 @@ def test_episodes_that_diverged_are_left_out(run, monkeypatch, always):
     monkeypatch.setattr(DMCProblem, "batch", lambda problem, variations: Breaking(real(problem, variations), always))
     job = jobs_of(run)[0]
     if always:
-        with pytest.raises(RuntimeError, match="breaks down in every episode"):
+        with pytest.raises(RuntimeError, match="diverges in every episode"):
             do(run, job)
         return
     do(run, job)
-    lengths = [len(cache.any_kept(v, HORIZON, run.sac, run.seed).rewards) for v in job.variations]
+    lengths = [len(cache.load_any(v, HORIZON, run.sac, run.seed).rewards) for v in job.variations]
     assert lengths == [EPISODES, EPISODES - 2, EPISODES, EPISODES - 2]
 
 

@@ -130,7 +130,7 @@ def test_the_source_of_a_fork_is_checked(parent, tmp_path):
     assert parse_source(f"{parent[0]}@1") == (parent[0], 1)
     assert parse_source(str(parent[0])) == (parent[0], 2)
     for text, message in (
-        (f"{parent[0]}@7", "holds the versions up to 2"),
+        (f"{parent[0]}@7", "holds versions 0 to 2"),
         (f"{parent[0]}@x", "RUN_DIR@ROUND"),
         (f"{tmp_path}@0", "holds no run"),
     ):

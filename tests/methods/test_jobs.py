@@ -42,13 +42,13 @@ def test_the_plan_of_phases_asks_the_method_once_a_phase(small_run: Run, tmp_pat
 
     method = Counting()
     store = Dataset(tmp_path / "dataset")
-    plan = PhasePlan(small_run, Lineage(small_run), store, method, {})
+    plan = PhasePlan(small_run, Lineage(small_run), store, method)
     for _ in range(3):
         for phase in plan.phases:
-            assert not plan.whole(phase)
+            assert not plan.is_complete(phase)
             assert plan.incomplete(phase) == list(plan.ask(phase)) == list(methods.of(small_run).ask(small_run, phase))
             assert plan.ask(phase) is plan.ask(phase)
-        plan.look_again()
+        plan.recheck()
     assert plan.next(-1) == plan.phases[0]
     assert asked == dict.fromkeys(plan.phases, 1) and len(asked) == 3
     store.close()

@@ -69,7 +69,7 @@ def test_the_game_is_paused_without_viewers(small_run):
     [
         ([], "play: name a run folder or a checkpoint file, or --pretrained darkroom"),
         (["here", "--pretrained", "darkroom"], "play: name a run folder"),
-        (["--pretrained", "lightroom"], "no agent of that name is shipped; there are darkroom"),
+        (["--pretrained", "lightroom"], "no agent of that name in the package; there are darkroom"),
         (["nowhere"], "nowhere: no such run folder or checkpoint"),
         (["--pretrained", "darkroom", "--web", "99999"], "--web 99999: a port must be 0 (any free port) to 65535"),
         (["--pretrained", "darkroom", "--host", "nowhere.invalid"], "name an address of this machine"),

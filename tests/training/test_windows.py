@@ -99,9 +99,9 @@ def test_training_draws_windows_of_the_contexts_variation():
         assert batch.windows.states.shape == (8, 3, LENGTH, 2)
         for row in range(8):
             mark = batch.actions[row, 0]
-            assert (batch.windows.taken[row] == mark).all() and (batch.windows.labels[row] == mark).all()
+            assert (batch.windows.actions[row] == mark).all() and (batch.windows.labels[row] == mark).all()
             assert ((batch.windows.states[row] // 1) == mark).all()
-            np.testing.assert_array_equal(batch.windows.gained[row], batch.windows.states[row, :, :, 0])
+            np.testing.assert_array_equal(batch.windows.rewards[row], batch.windows.states[row, :, :, 0])
         chosen |= set(np.round(batch.windows.states[:, :, 0, 0] % 1 * 10).astype(int).ravel().tolist())
         prefixes |= set(batch.window_prefix.ravel().tolist())
     assert chosen == {0, 1, 2, 3} and prefixes == set(range(3 * HORIZON + 1))
@@ -121,6 +121,6 @@ def test_own_trials_are_cut_into_windows_that_do_not_cross_episodes(run):
     assert len(of.states) == len(expected)
     for n, (t, h) in enumerate(expected):
         np.testing.assert_array_equal(of.states[n], t.observations[h : h + LENGTH])
-        np.testing.assert_array_equal(of.taken[n], t.actions[h : h + LENGTH])
-        np.testing.assert_array_equal(of.gained[n], t.rewards[h : h + LENGTH])
+        np.testing.assert_array_equal(of.actions[n], t.actions[h : h + LENGTH])
+        np.testing.assert_array_equal(of.rewards[n], t.rewards[h : h + LENGTH])
         np.testing.assert_array_equal(of.labels[n].argmax(axis=1), t.actions[h : h + LENGTH])

@@ -1,1 +1,1 @@
-"""Agents that come with the package, by name."""
+"""The agent files of the package; ``agent.loading.SHIPPED`` lists their names."""

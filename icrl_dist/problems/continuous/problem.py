@@ -109,7 +109,7 @@ def experts_of(problem: Problem, run: Run) -> MakePolicy | None:
     from icrl_dist.experts import cache
     from icrl_dist.experts.train import ExpertPolicy
 
-    asked = {task: cache.any_kept(Variation(task), problem.horizon, run.sac, run.seed) for task in problem.evaluated}
+    asked = {task: cache.load_any(Variation(task), problem.horizon, run.sac, run.seed) for task in problem.evaluated}
     found = {task: history for task, history in asked.items() if history is not None}
     if len(found) < len(asked):
         return None
@@ -123,7 +123,7 @@ def missing_experts(problem: Problem, run: Run, what: str) -> str:
     if not run.sac.cache:
         return "no SAC expert stands beside the models: with sac.cache = '' none is kept"
     missing = [
-        task for task in problem.evaluated if cache.any_kept(Variation(task), problem.horizon, run.sac, run.seed) is None
+        task for task in problem.evaluated if cache.load_any(Variation(task), problem.horizon, run.sac, run.seed) is None
     ]
     if not missing:
         return ""

@@ -105,7 +105,7 @@ class SACExperts(DisturbanceExperts):
         return f"SAC, {config.steps:,} steps, {'-'.join(map(str, config.hidden))}"
 
     def _kept(self, variation: Variation, config: SACConfig) -> History | None:
-        return cache.any_kept(variation, domains.spec(variation.task).horizon, config, 0)
+        return cache.load_any(variation, domains.spec(variation.task).horizon, config, 0)
 
     def _trained(self, variations: tuple[Variation, ...], config: SACConfig, report: Report) -> list[History]:
         """Undisturbed experts, one per variation, from the cache or newly trained; without a cache they are missing."""

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 
-from icrl_dist.experts.cache import own_seed
-from icrl_dist.experts.delivery import delivered, labelled, lead, scripted
+from icrl_dist.experts.cache import expert_seed
 from icrl_dist.experts.payloads import ScriptedContexts
-from icrl_dist.experts.train import assembled
+from icrl_dist.experts.train import make_histories
+from icrl_dist.experts.trajectories import history_trajectories, scripted_actions, window_episodes, with_labels
 from icrl_dist.interfaces import Problem, Progress, no_progress
 from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.rollout.recorder import Recorder
@@ -49,13 +49,14 @@ def scripted_context(job: Job, problem: Problem, worker: str, progress: Progress
         for step in range(env.spec.horizon):
             recorder.step(_actions(problem, env.truth, leads, step))  # type: ignore[attr-defined]
         progress(f"{count * (trial + 1)} of {count * job.trials} episodes of the scripted policy")
-    columns = labelled(recorder.columns(), problem, None)
+    columns = with_labels(recorder.columns(), problem, None)
     if payload.labelling.windows:
-        led = lead(env, problem, None, [own_seed(variation, job.seed) for variation in job.variations], range(count))
+        seeds = [expert_seed(variation, job.seed) for variation in job.variations]
+        led = window_episodes(env, problem, None, seeds, range(count))
     else:
         led = {name: column[:, :0] for name, column in columns.items() if name != "adversary"}
-    found = assembled(job, job.variations, columns, led, np.zeros((count, 0), np.float32), progress)
-    yield from delivered(job, problem, payload.labelling, found, worker, None)
+    found = make_histories(job, job.variations, columns, led, np.zeros((count, 0), np.float32), progress)
+    yield from history_trajectories(job, problem, payload.labelling, found, worker, None)
 
 
 class Lead(NamedTuple):
@@ -93,6 +94,6 @@ def _lapses(rng: np.random.Generator, steps: int, actions: int) -> tuple[Bool[np
 def _actions(problem: Problem, truth: Float64[np.ndarray, "B S"], leads: list[Lead], step: int) -> Float32[np.ndarray, "B A"]:
     """What each row's leader does at this step."""
     told = np.concatenate([truth[:, :-3], np.stack([one.goals[step] for one in leads])], axis=1)
-    noisy = np.clip(scripted(problem, told) + np.stack([one.noise[step] for one in leads]), -1.0, 1.0)
+    noisy = np.clip(scripted_actions(problem, told) + np.stack([one.noise[step] for one in leads]), -1.0, 1.0)
     lapsed = np.array([one.lapsed[step] for one in leads])[:, None]
     return np.where(lapsed, np.stack([one.instead[step] for one in leads]), noisy).astype(np.float32)

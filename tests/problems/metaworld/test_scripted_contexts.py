@@ -7,7 +7,7 @@ import pytest
 
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.config.sections import AdversaryConfig
-from icrl_dist.experts import delivery
+from icrl_dist.experts import trajectories
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
@@ -96,7 +96,7 @@ def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_g
 
 
 def test_the_same_job_gives_the_same_bytes_with_action_windows(run, monkeypatch):
-    monkeypatch.setattr(delivery, "LED", 1)
+    monkeypatch.setattr(trajectories, "WINDOW_EPISODES", 1)
     model = dataclasses.replace(run.model, window=4)
     run = dataclasses.replace(run, model=model, pretrain=dataclasses.replace(run.pretrain, windows=3, contexts=4))
     job = dataclasses.replace(job_of(run), tasks=1, variations=job_of(run).variations[:2])
