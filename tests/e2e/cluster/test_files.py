@@ -47,6 +47,6 @@ def test_all_sources_of_the_package_are_copied_to_the_nodes():
     project = tomllib.loads((simulated_nodes.ROOT / "pyproject.toml").read_text())
     sources = {source for source in shipped()["file_mounts"].values() if not source.startswith("~")}
     assert sources == {"pyproject.toml", "constraints.txt", project["project"]["readme"]} | {
-        package.split(".")[0] for package in project["tool"]["setuptools"]["packages"]
+        package.removesuffix("*") for package in project["tool"]["setuptools"]["packages"]["find"]["include"]
     }
     assert all((simulated_nodes.ROOT / source).exists() for source in sources)
