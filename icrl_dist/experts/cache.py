@@ -72,7 +72,7 @@ def training_episodes(horizon: int, config: SACConfig) -> int:
 
 
 def recorded_episodes(horizon: int, config: SACConfig, trials: int = 1) -> int:
-    """Number of episodes in a history of which a job needs ``trials``; see ``RECORDED_EPISODES``."""
+    """Number of episodes in a history for a job of ``trials`` trials; see ``RECORDED_EPISODES``."""
     episodes = training_episodes(horizon, config)
     return episodes if trials > RECORDED_EPISODES else min(RECORDED_EPISODES, episodes)
 

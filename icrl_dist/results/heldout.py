@@ -1,4 +1,4 @@
-"""Evaluation of a run folder's models on held-out tasks, beside references: reports, figures and tables."""
+"""Evaluation of a run folder's models on held-out tasks, compared with references: reports, figures and tables."""
 
 from __future__ import annotations
 
@@ -199,13 +199,13 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
 def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Console) -> dict[str, Any]:
     """Print the tables; write ``report``.json and the figure ``report``.png.  Returns the report without its curves."""
     problem = registry.of(run)
-    title = f"{run.method.upper()} beside the exact posterior: {problem.title(len(problem.evaluated))}"
+    title = f"{run.method.upper()} compared with the exact posterior: {problem.title(len(problem.evaluated))}"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
     figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
     for prior, meaning in problem.posterior.priors.items():
         console.print(kl_table(found, prior, f"KL(exact || model) in nats, where {meaning}"))
     adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
-    console.print(gap_table(found, f"Online return by Algorithm 1 beside the exact agent's: {adversary}"))
+    console.print(gap_table(found, f"Online return by Algorithm 1 compared with the exact agent's: {adversary}"))
     console.print(f"figure {figure}", highlight=False, markup=False)
     return {key: value for key, value in found.items() if not key.endswith("_curves")} | {"figure": str(figure)}
 

@@ -123,9 +123,7 @@ def _check_same(parent: Run, run: Run, what: str) -> None:
         ]
     if differing:
         named = ", ".join(f"{name} = {after!r} (parent: {before!r})" for name, before, after in differing)
-        raise ConfigError(
-            f"{what}: {named}: a fork has the problem, split, method and model of its parent; start a new run instead"
-        )
+        raise ConfigError(f"{what}: {named}: a fork has its parent's problem, split, method and model; start a new run instead")
 
 
 def _link(source: Path, target: Path) -> None:

@@ -71,7 +71,7 @@ def test_nothing_is_trained_that_is_in_the_cache(run, trained, caplog):
     for damage in (whole[: len(whole) // 2], b"nothing"):
         file.write_bytes(damage)
         assert digests(do(run, job)) == first
-    assert trained == [4, 1, 1] and "made anew" in caplog.text and file.read_bytes() == whole
+    assert trained == [4, 1, 1] and "is made again" in caplog.text and file.read_bytes() == whole
 
 
 def test_a_method_takes_the_experts_that_another_method_trained_and_ends_with_the_same_bytes(run, trained, tmp_path):

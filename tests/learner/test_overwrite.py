@@ -76,7 +76,7 @@ def test_an_empty_out_is_the_current_folder_and_refused(run, capsys, monkeypatch
 def test_without_a_gpu_the_earlier_run_is_restored(run, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     before = files(run.parent)
-    assert "no GPU is seen" in refused(capsys, 1, *words(run, "--overwrite", "--learner.device", "cuda"))
+    assert "torch finds no GPU" in refused(capsys, 1, *words(run, "--overwrite", "--learner.device", "cuda"))
     assert files(run.parent) == before
 
 
