@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from icrl_dist.types import NULL, Adversary
 
 ALPHA_RANGE = (0.05, 2.0)
-"""Range of the uniform prior of each Dirichlet parameter; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
+"""Range of each Dirichlet parameter's uniform prior; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
 
 
 def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:

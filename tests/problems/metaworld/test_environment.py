@@ -165,7 +165,7 @@ def test_what_is_no_task_is_refused(settings, said):
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match=r"17 inputs.*this game has 39"):
+    with pytest.raises(ValueError, match=r"17 inputs.*this problem has 39"):
         registry.batch([Variation(TASK, network_adversary.network(0, 17, 9))])
     with pytest.raises(ValueError, match="null and network"):
         registry.batch([Variation(TASK, Adversary.of("uniform", p=0.1))])
