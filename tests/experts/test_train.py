@@ -357,7 +357,7 @@ def test_stretches_are_cut_from_episodes_that_experts_led_some_of_them_another_t
 
 def test_nobody_can_be_misled_in_a_job_of_one_task(stretched):
     alone = dataclasses.replace(stretched, stream=dataclasses.replace(stretched.stream, job_tasks=1))
-    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: 0, or a stream\.job_tasks that leaves none"):
+    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or a stream\.job_tasks with at least two"):
         validate(alone, "x")
     validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, decoy_fraction=0.0)), "x")
 

@@ -36,5 +36,5 @@ class ControlConfig:
     read; do not set it."""
     forces: Literal["paper", "qarl"] = "paper"
     """DeepMind Control: the bodies and the size of the adversary's forces, from Table 2 or from QARL's code."""
-    disturbance: Annotated[float, Interval(ge=0, le=0.1), Remedy("0 to 0.1 metres")] = 0.01
+    disturbance: Annotated[float, Interval(ge=0, le=0.1), Remedy("use 0 to 0.1 meters")] = 0.01
     """Meta-World: meters by which an adversary of strength 1 moves a component of the observation."""

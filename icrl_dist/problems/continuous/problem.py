@@ -121,12 +121,12 @@ def missing_experts(problem: Problem, run: Run, what: str) -> str:
     from icrl_dist.experts import cache
 
     if not run.sac.cache:
-        return "no SAC expert stands beside the models: with sac.cache = '' none is kept"
+        return "tables show no SAC expert: with sac.cache = '' experts are not stored; set it"
     missing = [
         task for task in problem.evaluated if cache.any_kept(Variation(task), problem.horizon, run.sac, run.seed) is None
     ]
     if not missing:
         return ""
-    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this machine"
+    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this node"
     train = f"icrl-dist train experts-{what} --out OTHER"
-    return f"no SAC expert stands beside the models: {where}; `{train}` trains them"
+    return f"tables show no SAC expert: {where}; `{train}` trains them"

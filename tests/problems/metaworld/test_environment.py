@@ -154,7 +154,7 @@ def test_a_simulation_that_breaks_down_stands_still_without_reward_and_the_next_
         ({"goal": (0.0, 0.85)}, r"goal=\(0\.0, 0\.85\) lies outside"),
         ({"horizon": 501}, "horizon=501: expected 1 to 500"),
         ({"goal_shown": 2}, "goal_shown=2"),
-        ({"disturbance": 1.0}, r"disturbance=1\.0: expected 0 to 0\.1 metres"),
+        ({"disturbance": 1.0}, r"disturbance=1\.0: expected 0 to 0\.1 meters"),
         ({"goal_show": 1}, r"no parameter 'goal_show'.*did you mean 'goal_shown'"),
     ],
 )
