@@ -159,7 +159,7 @@ def _from_tables(tables: dict[str, Any], source: str) -> Run:
         raise ConfigError(f"{source}: {error}") from None
 
 
-_FORMER_NAMES = {
+_RENAMED = {
     "practice": "dagger",
     "model.stretch": "model.window",
     "pretrain.stretches": "pretrain.windows",
@@ -172,7 +172,7 @@ _FORMER_NAMES = {
 
 def _refuse_former_names(tables: dict[str, Any], source: str) -> None:
     """Refuse former names: raises ConfigError with the present name."""
-    for old, new in _FORMER_NAMES.items():
+    for old, new in _RENAMED.items():
         section, _, key = old.partition(".")
         table = tables.get(section)
         if (not key and section in tables) or (isinstance(table, dict) and key in table):
