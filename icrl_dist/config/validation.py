@@ -34,7 +34,7 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
     """Incompatible values that no problem or method allows."""
     icaa, horizon, train = run.icaa, problem.horizon, problem.train_count
     if run.pretrain.contexts < train:
-        yield "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})"
+        yield "pretrain.contexts", run.pretrain.contexts, f"use at least one per training task ({train})"
     if icaa.context_trials >= icaa.trials:
         yield "icaa.context_trials", icaa.context_trials, "must be below icaa.trials"
     for where, windows in (("pretrain.windows", run.pretrain.windows), ("optim.windows", run.optim.windows)):
@@ -45,7 +45,7 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
     if run.model.width % run.model.heads:
         yield "model.heads", run.model.heads, "must divide model.width"
     if run.context.max < horizon:
-        yield "context.max", run.context.max, "must hold at least one episode"
+        yield "context.max", run.context.max, "must be at least one episode ({horizon} steps)"
     if run.dagger.rounds and problem.labeller is None:
         yield "dagger.rounds", run.dagger.rounds, "only a problem with exact answers can label new histories"
     yield from _address_objections(run)

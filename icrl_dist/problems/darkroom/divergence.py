@@ -63,7 +63,7 @@ class Divergence:
     p: float
     exact: Float64[np.ndarray, "B T A"]
     model: Float64[np.ndarray, "B T A"]
-    met: Bool[np.ndarray, "B T"]
+    reached: Bool[np.ndarray, "B T"]
     """Whether the goal was reached in the prefix."""
 
     @property
@@ -114,9 +114,9 @@ def divergences(
             context = contexts(kind, rows, act, rng.spawn(CONTEXTS))
             query = rng.integers(0, room.size**2, size=(CONTEXTS, 1 + EPISODES * room.horizon))
             decided = model_decisions(decide, context, query, room.size)
-            met = np.pad(context.rewards.cumsum(axis=1) > 0, ((0, 0), (1, 0)))
+            reached = np.pad(context.rewards.cumsum(axis=1) > 0, ((0, 0), (1, 0)))
             exact = (exact_decisions(h, optimal, context, query) for h, optimal in zip(priors, labels, strict=True))
-            one, other = (Divergence(kind, p, probs, decided, met) for probs in exact)
+            one, other = (Divergence(kind, p, probs, decided, reached) for probs in exact)
             yield one, other
 
 
@@ -177,7 +177,7 @@ def summary(found: Sequence[Divergence]) -> dict[str, Any]:
     for one in found:
         each = one.kl.mean(axis=1)
         error = float(each.std(ddof=1) / np.sqrt(len(each)))
-        rows.append({"kind": one.kind, "p": one.p, **_split([one]), "standard_error": error, "met": float(one.met.mean())})
+        rows.append({"kind": one.kind, "p": one.p, **_split([one]), "standard_error": error, "met": float(one.reached.mean())})
     spread = float(np.sqrt(sum(row["standard_error"] ** 2 for row in rows)) / len(rows))
     whole = {"" if name == "kl" else f"_{name}": value for name, value in _split(found).items()}
     return {**whole, "_standard_error": spread, "_cells": rows}
@@ -185,8 +185,8 @@ def summary(found: Sequence[Divergence]) -> dict[str, Any]:
 
 def _split(found: Sequence[Divergence]) -> dict[str, Any]:
     kl = np.concatenate([one.kl.ravel() for one in found])
-    met = np.concatenate([one.met.ravel() for one in found])
-    parts = {"kl": np.ones_like(met), "goal_met": met, "goal_unmet": ~met}
+    reached = np.concatenate([one.reached.ravel() for one in found])
+    parts = {"kl": np.ones_like(reached), "goal_met": reached, "goal_unmet": ~reached}
     return {name: float(kl[chosen].mean()) if chosen.any() else None for name, chosen in parts.items()}
 
 

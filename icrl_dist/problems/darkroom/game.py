@@ -1,4 +1,4 @@
-"""The game of ``icrl-dist play``: a Dark RoomPosterior in which a person acts as the adversary of a live agent.
+"""The game of ``icrl-dist play``: a Dark Room in which a person acts as the adversary of a live agent.
 
 The person moves the goal and overrides actions, one by one or at random.  The agent observes
 neither, and its weights never change.

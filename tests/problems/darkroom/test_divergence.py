@@ -265,12 +265,12 @@ def test_the_divergence_of_a_uniform_model_equals_a_slow_loop(run: Run, monkeypa
     monkeypatch.setattr(divergence, "contexts", lambda *given: asked.append(real(*given)) or asked[-1])
     found = list(measured(run, Uniform(registry.of(run).spec, run.model).eval(), heldout=False))
     for (one, other), context in zip(found, asked, strict=True):
-        assert one.kl.shape == one.met.shape == (5, 17)
+        assert one.kl.shape == one.reached.shape == (5, 17)
         for b, t in itertools.product(range(5), range(17)):
-            assert one.met[b, t] == other.met[b, t] == any(context.rewards[b, :t] > 0)
+            assert one.reached[b, t] == other.reached[b, t] == any(context.rewards[b, :t] > 0)
             slow = sum(p * math.log(p / 0.2) for p in one.exact[b, t].tolist() if p > 0)
             assert one.kl[b, t] == pytest.approx(slow)
-    assert {bool(m) for one, _ in found for m in one.met.ravel()} == {False, True}
+    assert {bool(m) for one, _ in found for m in one.reached.ravel()} == {False, True}
 
 
 def made(kind: str, p: float, kl: list[list[float]], met: list[list[bool]]) -> Divergence:
