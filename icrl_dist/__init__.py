@@ -1,7 +1,7 @@
 """Robust in-context reinforcement learning, distributed.
 
-``load_agent`` a trained model and deploy it; ``make`` a variation environment to deploy it
-in; ``oracle`` knows the exact answers of Dark Room.
+``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in;
+``oracle`` computes exact solutions of Dark Room.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 
 __all__ = ["NULL", "Adversary", "InContextAgent", "Method", "Problem", "Task", "Variation", "load_agent", "make", "oracle"]
 
-_HOME = {
+_MODULES = {
     "InContextAgent": "icrl_dist.agent.in_context_agent",
     "load_agent": "icrl_dist.agent.loading",
     "Method": "icrl_dist.interfaces",
@@ -35,9 +35,9 @@ _HOME = {
 
 
 def __getattr__(name: str) -> object:
-    """The public names, imported when first asked for: most commands need no torch."""
+    """Import a public name at its first use, because most commands need no torch."""
     if name == "oracle":
         return importlib.import_module("icrl_dist.problems.darkroom.solver")
-    if name in _HOME:
-        return getattr(importlib.import_module(_HOME[name]), name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'icrl_dist' has no attribute {name!r}")

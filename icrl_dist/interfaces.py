@@ -1,18 +1,20 @@
 """The five interfaces of the system: ``Problem``, ``Method``, ``Policy``, ``Batch`` and ``Link``.
 
+They refer to each other and are read together, so they stand in one file although it is longer than others.
+
 The loop of a rollout worker (``actors/worker.py``)::
 
     run = ask("hello")
     problem, method = problems.of(run), methods.of(run)
     while (job := ask("lease")) is not None:
         for trajectory in collect.do(job, problem, method, weights):
-            send(encode(trajectory))              # kept until the learner has stored it
+            send(encode(trajectory))              # sent again until the learner has stored it
 
 The loop of the central learner (``learner/service.py``)::
 
     for phase in method.phases(run):
         scheduler.open(method.ask(run, phase))    # workers lease these jobs
-        while not scheduler.done(phase):          # ingest stores what they send
+        while not scheduler.done(phase):          # ingest stores the trajectories that arrive
             wait()
         draw = method.data(run, phase, dataset)
         for step in range(phase.steps):
@@ -20,8 +22,8 @@ The loop of the central learner (``learner/service.py``)::
             optimizer.step()
         publish(weights(model))                   # the policy version of the next round
 
-Everything else knows a problem or a method only through these interfaces.  A problem or a method of
-another package is found through the entry point groups ``icrl_dist.problems`` and ``icrl_dist.methods``.
+All other code uses a problem or a method only through these interfaces.  Problems and methods, also those
+of other packages, are found through the entry point groups ``icrl_dist.problems`` and ``icrl_dist.methods``.
 """
 
 from __future__ import annotations
@@ -48,18 +50,18 @@ if TYPE_CHECKING:
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
 Actions = Int64[np.ndarray, " B"] | Float32[np.ndarray, "B A"]
-"""Actions in B environments: numbers, or vectors in [-1, 1]."""
+"""Actions in B environments: integers for discrete actions, else vectors in [-1, 1]."""
 
 Progress = Callable[..., None]
-"""``progress(text, note=False, reached=0)``: called during work that takes long.
+"""``progress(text, note=False, reached=0)``: called repeatedly during long work.
 
-A ``note`` deserves a line of its own.  ``reached`` is how far the work is: a worker that repeats the work
-after a crash and gets further than before is not to blame for the crash.
+``note``: show the text on a line of its own.  ``reached``: how far the work is.  If a worker crashes and
+its repetition of the work gets further than before, the crash does not count as a failure of the job.
 """
 
 
 def no_progress(text: str, note: bool = False, reached: int = 0) -> None:
-    """Report nothing."""
+    """A ``Progress`` that does nothing."""
 
 
 class Batch(Protocol):
@@ -73,15 +75,15 @@ class Batch(Protocol):
         ...
 
     def step(self, actions: Int[np.ndarray, " B"] | Float32[np.ndarray, "B A"]) -> Step:
-        """Act in every row.  Raises RuntimeError past the horizon."""
+        """Execute one action in every row.  Raises RuntimeError past the horizon."""
         ...
 
 
 class Policy(Protocol):
-    """Acts in B environments at once and learns of them from ``observe`` alone."""
+    """Acts in B environments at once; ``observe`` is its only source of information about them."""
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
-        """The actions that the uniform numbers ``u`` in [0, 1) select: one number a row, or one a component."""
+        """Actions sampled with the uniform numbers ``u`` in [0, 1): one number per row, or one per component."""
         ...
 
     def observe(
@@ -92,17 +94,17 @@ class Policy(Protocol):
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None:
-        """Take in one transition of every environment."""
+        """Receive one transition of every environment."""
         ...
 
 
 MakePolicy = Callable[[Sequence[Variation], Batch], Policy]
-"""A policy for these variations, which act in this batch of environments."""
+"""``make(variations, batch)``: a policy that acts in this batch, whose rows are these variations."""
 
 Watch = Callable[..., object]
 """Called after every decision of an in-context policy with the decision and its outcome.
 
-Arguments: the model's final state (B, D), observation, action, reward, next observation.
+Arguments: the model's final hidden state (B, D), observation, action, reward, next observation.
 """
 
 
@@ -114,13 +116,13 @@ class LabelledQueries(NamedTuple):
     taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     """Actions at the last R query states, which form action windows."""
     gained: Float32[np.ndarray, " R"]
-    """Reward that each of these actions brought."""
+    """Reward after each of these actions."""
     origin: str
-    """Where the labels come from: see ``Trajectory.origin``."""
+    """Source of the labels: see ``Trajectory.origin``."""
 
 
 Labeller = Callable[[Sequence[Identity], Sequence[np.random.Generator]], list[LabelledQueries]]
-"""Draws query states for each of these trajectories, with its own generator, and labels them."""
+"""``labeller(identities, rngs)``: query states of each trajectory, drawn with its own generator, and their labels."""
 
 
 @dataclass(frozen=True)
@@ -128,33 +130,33 @@ class Contexts:
     """How a problem collects the contexts of the pretraining dataset."""
 
     payload: Payload
-    """What the collecting jobs carry."""
+    """Payload of the collecting jobs."""
     most_trials: int | None = None
-    """Most episodes that one variation can give; None for any number."""
+    """Maximum number of episodes per variation; None for no limit."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """An agent that stands beside the models in every table."""
+    """An agent that tables compare the models with."""
 
     make: MakePolicy
     ceiling: bool = False
-    """It knows the task: returns are also shown as a share of this agent's."""
+    """Whether it is given the task: tables then also show returns as a share of this agent's return."""
 
 
 JobFunction = Callable[[Job, "Problem", str, Progress], Iterator[Trajectory]]
-"""``function(job, problem, worker, progress)``: does a job and yields each trajectory when its episode ends."""
+"""``do(job, problem, worker, progress)``: does a job and yields each trajectory when its episode ends."""
 
 
 class JobKind(NamedTuple):
-    """One kind of job that needs no model: its payload and the function that does it."""
+    """A kind of job that needs no model: the type of its payload, and the function that does it."""
 
     payload: type[Payload]
     do: JobFunction
 
 
 class ExactAnswers(Protocol):
-    """Exact answers for variations: a part of problems that can be solved."""
+    """Exact solutions of variations, for problems that can be solved."""
 
     def optimum(self, variations: Sequence[Variation]) -> Float64[np.ndarray, " M"]:
         """Expected undiscounted return of the optimal policy from the start of a test episode."""
@@ -167,28 +169,30 @@ class ExactAnswers(Protocol):
         ...
 
     def agent(self, run: Run, rule: str) -> MakePolicy:
-        """The exact agent that acts by posterior sampling (Theorem E.3), deployed by this rule."""
+        """The exact agent: posterior sampling (Theorem E.3) without a network, deployed by this rule."""
         ...
 
 
 class BeliefReader(Protocol):
-    """Reads what an in-context policy's distributions imply about the task of one variation."""
+    """Computes the belief about the task of one variation that an in-context policy's action distributions imply."""
 
     def message(self, policy: Any, row: int) -> dict[str, Any]:
-        """Fields of a ``belief`` message of the monitor plane (docs/tap.md)."""
+        """Fields of a ``belief`` message of the monitor plane (docs/tap.md) for environment ``row`` of the policy."""
         ...
 
 
 MakeBehavior = Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
+"""See ``Problem.behavior``."""
 MakeDrawing = Callable[[np.ndarray, np.ndarray, Mapping[str, Any], int], dict[str, Any]]
+"""See ``Problem.drawing``."""
 
 
 class Problem(abc.ABC):
     """A family of tasks with its adversaries, made from one section of a run file.
 
-    It owns the split into training and test tasks, the environments, the adversaries, where labels
-    come from, and which agents stand beside a model.  A part that a problem does not have is None:
-    callers ask for the part, never for the name.
+    It defines the split into training and test tasks, the environments, the adversaries, the source of
+    labels, and the reference agents.  An optional part that a problem lacks is None: callers check for
+    the part, never for the name of the problem.
     """
 
     section: ClassVar[str]
@@ -196,27 +200,27 @@ class Problem(abc.ABC):
     Config: ClassVar[type]
     """Frozen dataclass of that section; every field has a default."""
     Labelling: ClassVar[type]
-    """Frozen dataclass: what a job needs to label query states; see ``labelling``."""
+    """Frozen dataclass of the settings by which a job labels query states; see ``labelling``."""
     template: ClassVar[str] = ""
     """Packaged run file that problems of this class share, if any: ``dmc`` for ``dmc.toml`` and ``dmc-laptop.toml``."""
     free_in_forks: ClassVar[tuple[str, ...]] = ()
-    """Fields of the section that a fork may change: they decide neither the tasks nor their split."""
+    """Fields of the section that a fork may change, because neither the tasks nor their split depend on them."""
     job_kinds: ClassVar[Mapping[str, JobKind]] = {}
     """Kinds of jobs that only this problem has."""
     earns_in_contexts: ClassVar[bool] = True
-    """Whether the episodes of pretraining contexts should have returns above 0; if not, zeros are no alert."""
+    """Whether episodes of pretraining contexts should have returns above 0; if False, returns of 0 raise no alert."""
 
     def __init__(self, name: str, config: Any) -> None:
-        """``name`` as in a run file; ``config``: its section."""
+        """``name``: as in a run file; ``config``: the section of the run file, an instance of ``Config``."""
         self.name, self.config = name, config
 
     @abc.abstractmethod
     def spec_of(self, task: Task) -> Spec:
-        """Shape of a task's observations and actions.  Raises ValueError for an impossible task."""
+        """Spec of a task's observations and actions.  Raises ValueError for an impossible task."""
 
     @abc.abstractmethod
     def make_split(self) -> Split:
-        """The tasks to train on and the tasks to test on, by the section alone; see ``split``."""
+        """Compute the training and test tasks, from the section alone; use ``split``, which keeps the result."""
 
     @abc.abstractmethod
     def batch(self, variations: Sequence[Variation]) -> Batch:
@@ -228,11 +232,14 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
-        """An adversary that was never trained on, of a strength above 0 (``evaluate.p``)."""
+        """An adversary for tests, not among those of training.
+
+        ``strength``: a number above 0 from ``evaluate.p``; ``prior``: ``evaluate.prior``.
+        """
 
     @abc.abstractmethod
     def labelling(self, run: Run) -> Any:
-        """The ``Labelling`` of this run's jobs."""
+        """The settings by which this run's jobs label query states: an instance of ``Labelling``."""
 
     @abc.abstractmethod
     def contexts(self, run: Run) -> Contexts:
@@ -240,47 +247,47 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def references(self, run: Run) -> dict[str, Reference]:
-        """The agents beside a model, by the name that tables show, in the tables' order."""
+        """The reference agents by the name that tables show, in the tables' order."""
 
-    # Optional parts.  A problem that has a part overrides the property.
+    # Optional parts: a problem that has a part overrides the property.
 
     @property
     def exact(self) -> ExactAnswers | None:
-        """Exact answers."""
+        """Exact solutions of variations."""
         return None
 
     @property
     def labeller(self) -> Callable[[Job, Any], Labeller] | None:
-        """``labeller(job, labelling)`` labels any new history of the job's variations."""
+        """``labeller(job, labelling)``: a labeller for new trajectories of the job's variations."""
         return None
 
     @property
     def behavior(self) -> MakeBehavior | None:
-        """``behavior(names, rngs, env)``: one named behavior policy a row, for pretraining contexts."""
+        """``behavior(names, rngs, env)``: one named behavior policy per row, for pretraining contexts."""
         return None
 
     @property
     def scripted(self) -> Callable[[Float[np.ndarray, "N T"]], Float32[np.ndarray, "N A"]] | None:
-        """A scripted policy of the true states, which ``Batch.truth`` gives."""
+        """``scripted(truth)``: a hand-written policy of the true states, which the batch's attribute ``truth`` holds."""
         return None
 
     @property
     def belief(self) -> Callable[[Variation], BeliefReader] | None:
-        """What an in-context policy believes of a variation's task, for live views."""
+        """``belief(variation)``: computes an in-context policy's belief about the task, for live views."""
         return None
 
     @property
     def drawing(self) -> MakeDrawing | None:
         """``drawing(states, adversary, task, every)``: an episode as numbers that live views draw (docs/tap.md).
 
-        ``states``: every ``every``-th observation; ``adversary``: the adversary's action or strength at each;
-        ``task``: its parameters.  Raises ValueError for an episode that cannot be drawn.
+        ``states``: every ``every``-th observation; ``adversary``: the adversary's action or strength at each of
+        them; ``task``: the task's parameters.  Raises ValueError for an episode that cannot be drawn.
         """
         return None
 
     @property
     def message_optimum(self) -> Callable[[Mapping[str, Any], Mapping[str, Any]], float | None] | None:
-        """``message_optimum(task, adversary)``: optimal return of a variation from a monitor message's fields."""
+        """``message_optimum(task, adversary)``: optimal return of the variation that a monitor message describes."""
         return None
 
     @property
@@ -290,7 +297,7 @@ class Problem(abc.ABC):
 
     @property
     def game(self) -> Any:
-        """What ``icrl-dist play`` plays."""
+        """The interactive environment of ``icrl-dist play``."""
         return None
 
     @property
@@ -300,7 +307,7 @@ class Problem(abc.ABC):
 
     @functools.cached_property
     def split(self) -> Split:
-        """The tasks to train on and the tasks to test on."""
+        """The training tasks and the test tasks."""
         return self.make_split()
 
     @functools.cached_property
@@ -310,7 +317,7 @@ class Problem(abc.ABC):
 
     @property
     def horizon(self) -> int:
-        """Steps an episode, H."""
+        """Steps per episode, H."""
         return self.spec.horizon
 
     @property
@@ -320,41 +327,44 @@ class Problem(abc.ABC):
 
     @property
     def evaluated(self) -> tuple[Task, ...]:
-        """The tasks of online evaluation: those that were never trained on."""
+        """The tasks of online evaluation; by default the test tasks."""
         return self.split.test
 
     def at_test_start(self, task: Task) -> Task:
-        """The task with the start that test episodes have."""
+        """The task with the initial state of test episodes."""
         return task
 
     def resolved(self) -> Any:
-        """The section with what its symbolic values come to written beside them, so that later tables cannot change a run.
+        """The section with the numbers of its symbolic values (such as ``drop:0.25``) stored beside them.
 
-        Raises ConfigError for a value that cannot be resolved.
+        So a table that changes later does not change the run.  Raises ConfigError for a value that cannot be resolved.
         """
         return self.config
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
-        """What is impossible in a run of this problem: the key, its value, the remedy."""
+        """The values that a run of this problem cannot have: key, value, remedy."""
         yield from ()
 
     def missing_reference(self, run: Run, what: str) -> str:
-        """Why an agent that should stand beside the models does not, and the remedy; empty if none is missing."""
+        """Why a reference agent is missing from the tables, and the remedy; empty if none is missing.
+
+        ``what``: the run that the remedy's command names.
+        """
         return ""
 
     def title(self, tasks: int) -> str:
-        """The evaluated tasks in words, for titles: ``20 held-out goals of a 10x10 Dark Room``."""
+        """Description of the evaluated tasks for titles: ``20 held-out goals of a 10x10 Dark Room``."""
         return f"{tasks} held-out tasks of {self.name}"
 
     def manifest(self) -> dict[str, Any]:
-        """What a checkpoint says of the problem and its split, as plain values."""
-        plain = [[dict(task.params) for task in part] for part in (self.split.train, self.split.test)]
-        return {"train_tasks": plain[0], "test_tasks": plain[1]}
+        """Entries of a checkpoint's manifest about the problem and its split, as JSON values."""
+        train, test = ([dict(task.params) for task in part] for part in (self.split.train, self.split.test))
+        return {"train_tasks": train, "test_tasks": test}
 
 
 @dataclass(frozen=True)
 class Phase:
-    """Collect, then fit: one pass through the learner's loop."""
+    """One pass through the learner's loop: collect, then fit."""
 
     stage: str
     round: int
@@ -365,7 +375,7 @@ class Phase:
 
     @property
     def policy_version(self) -> int:
-        """Version of the weights that act: T^j in round j of ``adapt``, none (-1) in ``pretrain``."""
+        """Version of the weights that collect: j in round j of ``adapt``; -1, no weights, in ``pretrain``."""
         return self.round if self.stage == "adapt" else -1
 
     @property
@@ -379,14 +389,14 @@ VariationKey = tuple[str, int, int, int]
 
 
 class TrajectoryDataset(Protocol):
-    """The trajectories collected so far."""
+    """The trajectories that a run has collected so far."""
 
     def variations(self, stage: str, round: int) -> Sequence[VariationKey]:
         """The variations of one stage and round, in canonical order."""
         ...
 
     def trials(self, key: VariationKey) -> list[Trajectory]:
-        """The trajectories of one variation, in order of trial."""
+        """The trajectories of one variation, ordered by trial."""
         ...
 
 
@@ -395,31 +405,31 @@ Draw = Callable[[np.random.Generator], Any]
 
 
 class Weighted(Protocol):
-    """Where a job finds the weights that it names."""
+    """Source of models by policy version."""
 
     def at(self, version: int) -> tuple[torch.nn.Module, str]:
-        """The model of exactly this policy version, and its weights digest; waits until it is there."""
+        """The model of exactly this policy version, and its weights digest.  Blocks until it is available."""
         ...
 
 
 class Method(abc.ABC):
-    """An in-context method: what it collects, what it learns from, its model, loss and deployed policy.
+    """An in-context method: its phases and jobs, its training batches, model, loss and deployed policy.
 
-    One object serves one run; it may cache what it computed from the run's own data.
+    One object serves one run; it may cache results that it computed from the run's data.
     """
 
     name: ClassVar[str]
     section: ClassVar[str] = ""
-    """Name of its own section in a run file; empty if it has none."""
+    """Name of its section in a run file; empty if it has none."""
     Config: ClassVar[type | None] = None
     """Frozen dataclass of that section; every field has a default."""
     trains: ClassVar[bool] = True
     """Whether it trains a model that can be deployed."""
     shows_states: ClassVar[bool] = False
-    """Whether its policy calls ``watch`` with the model's final states, from which the out-of-distribution score is read."""
+    """Whether its policy calls ``watch`` with the model's final hidden states, which the OOD score is computed from."""
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
-        """What is impossible in a run of this method: the key, its value, the remedy."""
+        """The values that a run of this method cannot have: key, value, remedy."""
         yield from ()
 
     @abc.abstractmethod
@@ -428,11 +438,11 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def ask(self, run: Run, phase: Phase) -> tuple[Job, ...]:
-        """The jobs of a phase."""
+        """The jobs that collect the data of a phase."""
 
     @abc.abstractmethod
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
-        """What draws the training batches of a phase."""
+        """A function that draws the training batches of a phase."""
 
     @abc.abstractmethod
     def build(self, spec: Spec, run: Run) -> torch.nn.Module:
@@ -440,21 +450,21 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def loss(self, model: Any, batch: Any) -> torch.Tensor:
-        """The loss of one batch, on the model's device."""
+        """The loss of one training batch, on the model's device."""
 
     @abc.abstractmethod
     def policy(
         self, model: Any, batch: int, context: ContextConfig, deploy: Deployment | None = None, watch: Watch | None = None
     ) -> Policy:
-        """The model deployed in ``batch`` environments, its weights as they are now.
+        """The model deployed in ``batch`` environments, with its present weights.
 
-        ``deploy``: the deployment rule, or None for the one that the model was trained for.
-        Raises ConfigError for a rule that it was not trained for.
+        ``deploy``: the deployment rule; None for the rule that the model was trained for.
+        Raises ConfigError for a rule that the model was not trained for.
         """
 
     @abc.abstractmethod
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """The variations of training task number ``index`` in a round."""
+        """The variations of training task ``task``, whose number is ``index``, in a round."""
 
     def deployment(self, run: Run) -> Deployment:
         """The deployment rule that a model of this run was trained for."""
@@ -467,13 +477,14 @@ class Method(abc.ABC):
         queries: Float32[np.ndarray, "B N S"],
         prefix: Int64[np.ndarray, "B N"],
     ) -> Float64[np.ndarray, "B N A"] | None:
-        """Distributions over discrete actions at query states, each given its own prefix of the transitions.
+        """Distributions over discrete actions at query states, each conditioned on its own prefix of the transitions.
 
-        ``transitions``: observations (B, T, S), actions (B, T), next observations, rewards (B, T).  None for a
-        method whose model cannot be queried so.
+        ``transitions``: observations (B, T, S), actions (B, T), next observations (B, T, S), rewards (B, T);
+        ``prefix``: number of transitions that each query is conditioned on.  Returns None if the method's model
+        does not support such queries.
         """
         return None
 
     def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> dict[str, float]:
-        """How good the labels are that the model made itself in a phase; empty where it made none, or nobody can tell."""
+        """Quality of the labels that the model made itself in a phase; empty if it made none or quality is unknown."""
         return {}

@@ -1,7 +1,7 @@
-"""The values that cross every boundary of the system: frozen, numpy only.
+"""The values that all parts of the system exchange: tasks, adversaries, trajectories, weights, jobs.
 
-A *game* (section 3.1 of the paper) closed with a fixed adversary is a *variation
-environment* (section 4.1).  Everything that names one, or that came out of one, is here.
+All are frozen and use numpy only.  A task with a fixed adversary is a *variation environment*
+(section 4.1 of the paper).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def _params(values: Mapping[str, object]) -> Params:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Named:
-    """A kind and its parameters: data, not a class, so that any wire can carry it."""
+    """A kind and its parameters: plain data, so that it can be sent and stored."""
 
     kind: str
     params: Params = ()
@@ -77,7 +77,7 @@ class _Named:
 
 
 class Task(_Named):
-    """An MDP tau: the game's name (``kind``) and its parameters.
+    """An MDP tau: the problem's name (``kind``) and its parameters.
 
     ``Task.of("darkroom", size=10, horizon=100, goal=(3, 4))``.
     """
@@ -105,7 +105,7 @@ class Variation:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Split:
-    """The tasks of a problem: ``train`` to learn from, ``test`` never learned from."""
+    """The training tasks and the test tasks of a problem; methods train on ``train`` only."""
 
     train: tuple[Task, ...]
     test: tuple[Task, ...]
@@ -113,9 +113,9 @@ class Split:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Spec:
-    """What an agent needs to know of an environment's shape, and nothing else.
+    """Shape of an environment's observations and actions, and its horizon.
 
-    A checkpoint holds the spec it was trained for and refuses another.
+    A checkpoint contains the spec it was trained for and refuses environments with another.
     """
 
     low: tuple[float, ...]
@@ -125,7 +125,7 @@ class Spec:
     actions: int
     """Number of discrete actions, or the action's dimension if ``discrete`` is false."""
     horizon: int
-    """Steps an episode, H."""
+    """Steps per episode, H."""
     discrete: bool = True
 
     @property
@@ -135,7 +135,7 @@ class Spec:
 
 
 class Identity(NamedTuple):
-    """Which trajectory this is, the same everywhere: wire, ledger, seeds and leases."""
+    """Names a trajectory, in the same way everywhere: on the wire, in the index, in seeds and in leases."""
 
     stage: str
     round: int
@@ -144,16 +144,16 @@ class Identity(NamedTuple):
     trial: int
 
     def key(self) -> tuple[int, ...]:
-        """The identity as integers, for canonical order and as a seed's spawn key."""
+        """The identity as integers: the canonical order, and the spawn key of the trajectory's seeds."""
         return (STAGES.index(self.stage), self.round, self.task, self.variation, self.trial)
 
     @property
     def next_version(self) -> int:
-        """First version of the weights that is fitted to it: 0 for ``pretrain``, j + 1 for round j."""
+        """First policy version that is fitted to this trajectory: 0 for ``pretrain``, j + 1 for round j."""
         return self.round + 1 if self.stage == "adapt" else 0
 
     def rng(self, seed: int, *what: int) -> np.random.Generator:
-        """The generator of this trajectory's draws, or of some of them; which worker runs it makes no difference."""
+        """The random generator of this trajectory, or of the part ``what`` of its draws; it is the same on any worker."""
         return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*self.key(), *what)))
 
     def __str__(self) -> str:
@@ -161,7 +161,7 @@ class Identity(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Identity:
-        """The inverse of ``str``.  Raises ValueError naming the form expected."""
+        """The inverse of ``str``.  Raises ValueError with the expected form."""
         parts = text.split("/")
         if len(parts) != 5 or parts[0] not in STAGES or not all(p.isascii() and p.isdigit() for p in parts[1:]):
             raise ValueError(f"identity {text!r}: expected STAGE/ROUND/TASK/VARIATION/TRIAL, STAGE one of {STAGES}")
@@ -174,54 +174,53 @@ class Step(NamedTuple):
     observation: Float32[np.ndarray, "B S"]
     reward: Float32[np.ndarray, " B"]
     done: bool
-    """The horizon was reached: all environments of a batch end together."""
+    """Whether the horizon was reached: all environments of a batch end together."""
     adversary: Int16[np.ndarray, " B"] | Float32[np.ndarray, "B F"]
-    """The action the adversary put in the agent's place, or -1 where it did not; in a continuous game
-    its own action, 0 where there is none."""
+    """The action that the adversary executed instead of the agent's, or -1 where it did not override.  With
+    vector actions the adversary's own action, 0 where there is no adversary."""
     diverged: Bool[np.ndarray, " B"] | None = None
-    """Rows whose simulation has broken down in this episode: nothing of it may be learned from.
-    None for a game that cannot."""
+    """Rows whose simulation has broken down in this episode, which must not be used for training.
+    None if the environment cannot break down."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """An episode xi_n in one variation environment, and what its collector knew better.
+    """An episode xi_n in one variation environment, with labelled query states.
 
-    ``labels`` are written by whoever knows the right actions (an exact solver, an expert
-    network, nobody), so expert policies never travel.
+    The worker that collects it also computes the labels, so expert policies are never sent.
     """
 
     identity: Identity
     variation: Variation
     policy_version: int
-    """Version of the weights that acted; -1 for a policy without weights."""
+    """Version of the weights that selected the actions; -1 for a policy without weights."""
     weights_digest: str
-    """Digest of those weights; empty for a policy without weights."""
+    """SHA-256 of those weights; empty for a policy without weights."""
     worker: str
     actions: Int16[np.ndarray, " H"] | Float32[np.ndarray, "H A"]
-    """Numbers, or vectors in [-1, 1]."""
+    """Integers for discrete actions, else vectors in [-1, 1]."""
     observations: Float32[np.ndarray, "H+1 S"]
     rewards: Float32[np.ndarray, " H"]
     adversary: Int16[np.ndarray, " H"] | Float32[np.ndarray, "H F"]
-    """See ``Step.adversary``: numbers where actions are numbers, else vectors."""
+    """See ``Step.adversary``: integers for discrete actions, else vectors."""
     queries: Float32[np.ndarray, "Q S"]
-    """Query states s_query; none (Q = 0) if the collector knew no labels."""
+    """Query states s_query; none (Q = 0) if there are no labels."""
     labels: Float32[np.ndarray, "Q A"]
-    """A distribution over actions at each query state; of vectors, the right one."""
+    """A distribution over discrete actions at each query state; for vector actions the right action."""
     taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
-    """The actions taken at the last R query states, which lie in windows (zeta of eq. 6), one
-    after another; the first Q - R states stand alone."""
+    """Actions at the last R query states, which form action windows (zeta of eq. 6), one window after
+    another; the first Q - R query states belong to no window."""
     gained: Float32[np.ndarray, " R"]
-    """The reward that each of them brought."""
+    """Reward after each of these actions."""
     origin: str
-    """Where the labels came from: ``optimal``, ``heuristic``, ``expert`` or ``none``."""
+    """Source of the labels: ``optimal``, ``heuristic``, ``expert`` or ``none``."""
 
     @property
     def episode_return(self) -> float:
         return float(self.rewards.sum())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every array by name, in the one order used by wire, store and digest."""
+        """Every array by name, in the order of the wire format, the dataset and the digest."""
         return {name: getattr(self, name) for name in ARRAYS}
 
 
@@ -235,14 +234,14 @@ ARRAYS: dict[str, tuple[str, int]] = {
     "taken": ("<i2", 1),
     "gained": ("<f4", 1),
 }
-"""A trajectory's arrays: their dtype and number of dimensions."""
+"""A trajectory's arrays with discrete actions: dtype and number of dimensions."""
 VECTORS: dict[str, tuple[str, int]] = ARRAYS | dict.fromkeys(("actions", "adversary", "taken"), ("<f4", 2))
-"""The same where actions are vectors."""
+"""The same with vector actions."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """One version of T_theta's parameters; version j is the model T_theta^j."""
+    """The parameters of one policy version; version j is the model T^j."""
 
     version: int
     arrays: Mapping[str, Shaped[np.ndarray, "..."]]
@@ -251,25 +250,25 @@ class Weights:
 
 @dataclasses.dataclass(frozen=True)
 class Payload:
-    """What one kind of job needs beyond its variations; each kind has a subclass, decoded strictly."""
+    """Settings of one kind of job; each kind has its own subclass, which is decoded strictly."""
 
     kind: ClassVar[str] = ""
     """Name of the kind."""
     arrives_at_once: ClassVar[bool] = False
-    """Whether a job's first trajectory comes after hours of training, or from a cache immediately: then the
-    gap between two trajectories does not tell how long the next one takes."""
+    """Whether all trajectories of a job arrive together, after hours of training or immediately from a cache.
+    The time between two trajectories then does not predict when the next one arrives."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Job:
     """A fixed batch of work: all K variations of a few tasks, for a number of trials.
 
-    The batch is part of the job and not of the worker, so floating-point results do not
-    depend on how jobs are spread.
+    The job fixes the batch of environments, so floating-point results do not depend on which
+    worker does which job.
     """
 
     kind: str
-    """A function of ``jobs.py``: ``random_context``, ``train_expert``, ``scripted_context`` or ``adapt``."""
+    """Which function does the job: see ``collect.kinds``, and ``Problem.job_kinds``."""
     stage: str
     round: int
     task: int
@@ -279,22 +278,22 @@ class Job:
     trials: int
     """Episodes in each variation."""
     policy_version: int
-    """Weights version that must act; -1 for none."""
+    """Version of the weights that select the actions; -1 for a policy without weights."""
     seed: int
     payload: Payload = Payload()
-    """Further numbers that the kind needs, from the run's config."""
+    """Settings of this kind of job."""
     tasks: int = 1
-    """How many consecutive tasks."""
+    """Number of consecutive tasks."""
     first: int = 0
-    """Number of the first variation within its task, for a job that holds only some of one task's."""
+    """Number of the first variation within its task; above 0 in a job with only some variations of one task."""
 
     def rows(self) -> list[tuple[int, int]]:
-        """Number of the task, and of the variation within it, of each of ``variations``."""
+        """For each of ``variations`` the number of its task, and its own number within the task."""
         count = len(self.variations) // self.tasks
         return [(self.task + row // count, self.first + row % count) for row in range(len(self.variations))]
 
     def identities(self) -> Iterable[Identity]:
-        """Every trajectory this job will deliver."""
+        """The identities of all trajectories of this job."""
         for task, variation in self.rows():
             for trial in range(self.trials):
                 yield Identity(self.stage, self.round, task, variation, trial)
@@ -311,5 +310,5 @@ class Job:
 
     @property
     def label(self) -> str:
-        """The name for people: ``adapt/0/3``, or ``adapt/0/3/2`` if that one variation is all it holds."""
+        """The name as text: ``adapt/0/3``, or ``adapt/0/3/2`` for a job with a single variation."""
         return "/".join(map(str, self.name if len(self.variations) == 1 else self.name[:3]))

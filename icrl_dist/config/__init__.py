@@ -1,1 +1,1 @@
-"""Every number of a run: dataclasses, TOML, validation and the packaged run files."""
+"""The settings of a run: dataclasses, TOML, validation and the packaged run files."""

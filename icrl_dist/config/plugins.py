@@ -1,4 +1,4 @@
-"""Problems and methods by name: ours and those of other installed packages, through entry points.
+"""Find problems and methods of all installed packages by name, through entry points.
 
 A package adds a problem with one line in its ``pyproject.toml``::
 
@@ -30,7 +30,7 @@ def names(group: Group) -> tuple[str, ...]:
 
 @functools.cache
 def find(group: Group, name: str) -> Any:
-    """The class of this name.  Raises ConfigError, with the nearest name, if there is none or if it cannot be imported."""
+    """The class of this name.  Raises ConfigError if there is none (with the nearest name) or it cannot be imported."""
     kind = group.removesuffix("s")
     if name not in names(group):
         known = f"choose one of {', '.join(names(group))}"
@@ -43,7 +43,7 @@ def find(group: Group, name: str) -> Any:
 
 @functools.cache
 def sections(problem: str | None) -> dict[str, type]:
-    """The sections of a run file that a problem and the installed methods add: name and dataclass.
+    """The sections that a problem and the installed methods add to a run file: dataclass by name.
 
     With None the sections of all problems.  Raises ConfigError if two dataclasses share a section's name.
     """

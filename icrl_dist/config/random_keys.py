@@ -1,8 +1,8 @@
-"""The one registry of random streams that are not a trajectory's.
+"""Registry of all random streams of a run that do not belong to a trajectory.
 
-Every random draw comes from a generator that is keyed by a seed and a spawn key.  A trajectory's spawn
-key is its identity, which begins with the number of its stage (``types.STAGES``: below 100).  All other
-draws of a run begin with one of these keys, so no two streams share a key.
+Every random draw comes from a generator with a seed and a spawn key.  The spawn key of a trajectory is its
+identity, whose first number is that of its stage (``types.STAGES``: below 100).  The spawn key of any other
+stream begins with one of these keys, so no two streams share a spawn key.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 @enum.unique
 class RandomKey(enum.IntEnum):
-    """First number of a spawn key, one for each purpose."""
+    """First number of a spawn key; each purpose has its own."""
 
     SPLIT = 101
     """The split into training and test tasks."""
@@ -25,7 +25,7 @@ class RandomKey(enum.IntEnum):
     FIT = 104
     """Training batches: (policy version, step)."""
     OOD_CALIBRATION = 105
-    """Episodes that the out-of-distribution score is calibrated on: (task, row, episode)."""
+    """Calibration episodes of the out-of-distribution score: (task, row, episode)."""
     POSTERIOR_SUITE = 106
     """Contexts, queries and bootstrap of the comparison with the exact posterior."""
 

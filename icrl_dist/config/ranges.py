@@ -1,4 +1,4 @@
-"""Ranges that many numbers of a run share; each is written beside the field that it limits."""
+"""Number types with ranges, for the fields of a run file's sections."""
 
 from __future__ import annotations
 

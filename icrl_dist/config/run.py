@@ -1,9 +1,9 @@
-"""Every number of a run, with the section of the paper it comes from.
+"""The run file: all settings of a run, and how they are read.
 
-A run file is TOML with one table a section below; ``load`` reads it strictly (an unknown
-key, a wrong type or an impossible value is a ConfigError that names it) and the command
-line overrides it.  The problem and each method may add a section of their own.  Functions
-take the section they need, never the whole ``Run``, unless they need many.
+A run file is TOML with one table per section.  ``load`` reads it strictly: an unknown key, a wrong
+type or an impossible value raises ConfigError.  Command line options override it.  The problem and
+the methods may add sections.  A function takes the section that it needs; it takes the whole ``Run``
+only if it needs many sections.
 """
 
 from __future__ import annotations
@@ -42,16 +42,15 @@ __all__ = ["ConfigError", "Deployment", "Run", "dumps", "load", "override", "par
 
 @dataclass(frozen=True)
 class Run:
-    """One run: a method, a problem and every number."""
+    """The settings of one run."""
 
     method: str = "icag"
-    """Which method of section 4 pretrains the transformer: ``dpt``, ``icag`` or ``icaa``; ``experts``: none does,
-    only the SAC experts of a continuous problem are trained and kept, for later runs."""
+    """Method of section 4 that pretrains the transformer: ``dpt``, ``icag`` or ``icaa``.  ``experts`` trains no
+    transformer: it only trains and stores the SAC experts of a continuous problem, for later runs."""
     seed: Seed = 0
-    """Every random draw of the run is keyed by this and by the identity of the work."""
+    """Seed of every random draw of the run."""
     problem: str = "darkroom"
-    """The problem: ``darkroom``, ``metaworld-pick-place``, or one of DeepMind Control such as
-    ``dmc-cheetah-run``."""
+    """``darkroom``, ``metaworld-pick-place``, or a problem of DeepMind Control such as ``dmc-cheetah-run``."""
     sac: SACConfig = field(default_factory=SACConfig)
     adversary: AdversaryConfig = field(default_factory=AdversaryConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
@@ -66,13 +65,13 @@ class Run:
     alerts: AlertsConfig = field(default_factory=AlertsConfig)
 
     def section(self, name: str) -> Any:
-        """The section of this name, one of a problem or method included."""
+        """The section of this name; sections of the problem and of methods are included."""
         return getattr(self, name)
 
 
 @functools.cache
 def run_type(problem: str | None) -> type[Run]:
-    """``Run`` with the sections of this problem and of the installed methods; with None, of all problems.
+    """``Run`` with the sections of this problem (with None, of all problems) and of the installed methods.
 
     Raises ConfigError for a problem that is not installed.
     """
@@ -83,14 +82,14 @@ def run_type(problem: str | None) -> type[Run]:
 
 
 def make_run(problem: str = "darkroom", **fields: Any) -> Run:
-    """A run of this problem, its own section among ``fields``."""
+    """A run of this problem; ``fields``: its other settings, which may include the problem's section."""
     return run_type(problem)(problem=problem, **fields)
 
 
 def load(name_or_path: str) -> Run:
-    """The run file of this name among the packaged ones, or at this path; ``experts-NAME``: its experts alone.
+    """Read the packaged run file of this name, or the one at this path; ``experts-NAME``: with method ``experts``.
 
-    Raises ConfigError if there is none, or if any key or value in it is impossible.
+    Raises ConfigError if there is no such file, or if a key or value in it is impossible.
     """
     if name_or_path.startswith("experts-"):
         return replace(load(name_or_path.removeprefix("experts-")), method="experts")
@@ -121,7 +120,7 @@ def packaged_runs() -> list[str]:
 
 @functools.cache
 def _packaged() -> dict[str, tuple[str, str]]:
-    """Each name with its file, and with the problem if several problems share that file."""
+    """For each name its file, and its problem if several problems share the file (else an empty string)."""
     files = {file.name.removesuffix(".toml") for file in resources.files("icrl_dist.config.runs").iterdir()}
     templates = {name: plugins.find("problems", name).template for name in plugins.names("problems")}
     shared = {
@@ -135,7 +134,7 @@ def _packaged() -> dict[str, tuple[str, str]]:
 
 
 def parse(text: str, source: str) -> Run:
-    """The run that TOML ``text`` describes.  Raises ConfigError naming ``source`` and the key."""
+    """The run that TOML ``text`` describes.  Raises ConfigError with ``source`` and the key."""
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also a number or a nesting beyond Python's limits
@@ -144,7 +143,7 @@ def parse(text: str, source: str) -> Run:
 
 
 def _from_tables(tables: dict[str, Any], source: str) -> Run:
-    """The run that TOML tables describe.  Raises ConfigError naming ``source`` and the key."""
+    """The run that TOML tables describe.  Raises ConfigError with ``source`` and the key."""
     problem = tables.get("problem", Run.problem)
     try:
         kind = run_type(problem) if isinstance(problem, str) else Run
@@ -167,7 +166,7 @@ _RENAMED = {
     "pretrain.behaviours": "pretrain.behaviors",
     "optim.stretches": "optim.windows",
 }
-"""Former names of sections and keys."""
+"""Former names of sections and keys, and the present ones."""
 
 
 def _known(tables: dict[str, Any], kind: type[Run], source: str) -> dict[str, Any]:
@@ -186,9 +185,9 @@ def _known(tables: dict[str, Any], kind: type[Run], source: str) -> dict[str, An
 
 
 def override(run: Run, settings: Sequence[str], source: str) -> Run:
-    """The run with ``settings`` such as ``adversary.count=16`` in place; text needs no quotes.
+    """The run with ``settings`` such as ``adversary.count=16`` applied; strings need no quotes.
 
-    Raises ConfigError for a setting that is none, or that the run cannot have.
+    Raises ConfigError for a malformed setting, an unknown key or an impossible value.
     """
     tables = tomllib.loads(dumps(run))
     for setting in settings:

@@ -1,4 +1,4 @@
-"""The section ``[sac]`` of a run file: how SAC experts are trained."""
+"""The section ``[sac]`` of a run file: the training of SAC experts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WholeAboveZero = Annotated[int, Gt(0), Remedy("must be above 0")]
 
 @dataclass(frozen=True)
 class SACConfig:
-    """The experts: Table 1 of the paper; where it is silent or misprinted, QARL's code."""
+    """Training of the SAC experts: Table 1 of the paper, or QARL's code where the table has no value or a misprint."""
 
     hidden: Annotated[tuple[Annotated[int, Gt(0), _LAYERS], ...], MinLen(1), _LAYERS] = (256, 256, 256)
     """Widths of the hidden layers, ReLU, of the actor and of each of the two critics (Table 1)."""
@@ -27,23 +27,23 @@ class SACConfig:
     temperature_rate: AboveZero = 3e-4
     """Adam's learning rate for the logarithm of the temperature (Table 1)."""
     tau: Annotated[float, Gt(0), Le(1), Remedy("must be above 0 and at most 1")] = 0.005
-    """Share of the critics that the target critics take up at each update (Table 1)."""
+    """Weight of the critics in the moving average of the target critics, per update (Table 1)."""
     gamma: Annotated[float, Ge(0), Lt(1), Remedy("must be in [0, 1)")] = 0.9
-    """Discount a step (section 5)."""
+    """Discount per step (section 5)."""
     batch: WholeAboveZero = 256
-    """Transitions an update (Table 1)."""
+    """Transitions per update (Table 1)."""
     random_steps: Annotated[int, Ge(0), Remedy("must be at least 0")] = 3_000
     """Steps of uniformly random actions at the start (Table 1)."""
     warmup: Annotated[int, Ge(1), Remedy("must be at least 1")] = 5_000
     """Steps before the first update (Table 1)."""
     replay: WholeAboveZero = 1_000_000
-    """Transitions remembered, at most (Table 1)."""
+    """Capacity of the replay buffer, in transitions (Table 1)."""
     temperature: AboveZero = 5e-3
-    """The first temperature (QARL's code; Table 1's 5*10^3 has lost its sign).  The entropy that it
-    is tuned to is -A for A action components."""
+    """Initial temperature (QARL's code; Table 1 prints 5*10^3, without the minus sign).  The target entropy
+    is -A for A action components."""
     update_every: WholeAboveZero = 3
-    """Steps an update (QARL's code)."""
+    """Environment steps per update (QARL's code)."""
     steps: WholeAboveZero = 200_000
     """Environment steps of an expert's training."""
     cache: str = "~/.cache/icrl-dist/experts"
-    """Where histories and experts are kept, so that a later run need not train them again; empty: nowhere."""
+    """Folder that stores histories and experts for later runs; empty: they are not stored."""

@@ -1,4 +1,4 @@
-"""Sections of a run file that every problem and every method share, with ranges beside the fields."""
+"""The sections of a run file that do not depend on the problem."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from icrl_dist.stream.schema import Remedy
 Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online.
 
-``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition joins
-the context at once, and the agent reads its own recent actions as an action window (zeta of eq. 6).
+``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition enters
+the context immediately, and T_theta also reads the agent's last actions as an action window (zeta of eq. 6).
 """
 
-_NEVER = Remedy("must not be negative; 0 is never")
-_AlertShare = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0, 1]; 0 is never")]
+_NEVER = Remedy("must not be negative; 0 turns the alert off")
+_AlertShare = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0, 1]; 0 turns the alert off")]
 
 
 @dataclass(frozen=True)
 class AdversaryConfig:
-    """The disturbances of pretraining (appendix C.1)."""
+    """The adversaries of training tasks (appendix C.1)."""
 
     count: Annotated[int, Ge(1), Remedy("at least 1, the null adversary")] = 8
-    """K, adversaries a task, phi_0 among them (appendix D.1 settles on 8)."""
+    """K, adversaries per task including phi_0 (appendix D.1 chooses 8)."""
     p_max: Probability = 0.2
-    """An adversary overrides with probability p ~ U(0, p_max)."""
+    """Dark Room: an adversary overrides an action with probability p ~ U(0, p_max)."""
 
 
 @dataclass(frozen=True)
@@ -36,42 +36,42 @@ class PretrainConfig:
     """The pretraining dataset D_pre and the fit to it (sections 2 and 4.1)."""
 
     contexts: Positive = 80000
-    """Episodes in all, the same for every method and every K (appendix C.1); of a SAC expert's history
-    no more than its training has."""
+    """Total number of episodes, the same for every method and every K (appendix C.1).  A SAC expert's
+    history contributes at most the episodes of its training."""
     behaviors: Annotated[tuple[str, ...], MinLen(1), Remedy("name at least one")] = ("random",)
-    """Behavior policies that collect the contexts, in turn from episode to episode.  Dark Room:
-    ``random`` actions (the paper's); ``persistent`` walks, which mostly repeat the last action; walks
-    to random ``goals``, with a rest there; a ``sweep`` through cells not visited yet."""
+    """Behavior policies that collect the contexts; successive episodes use them in turn.  Dark Room:
+    ``random`` actions (as in the paper); ``persistent`` walks, which mostly repeat the last action; walks
+    to random ``goals``, with a rest at each; a ``sweep`` through cells that were not visited yet."""
     queries: Positive = 16
-    """Labelled query states an episode."""
+    """Labelled query states per episode."""
     windows: NotNegative = 0
-    """Windows of ``model.window`` states an episode, in which the optimal policy acts from a
-    random state on."""
+    """Action windows of ``model.window`` states per episode: in each the optimal policy acts, starting
+    from a random state."""
     decoy_fraction: Share = 0.3
-    """Share of the windows that are decoys: another training task's optimal policy acts, while labels are
-    this task's.  From them T_theta learns to give up a wrong guess of the task."""
+    """Share of the windows that are decoys: the optimal policy of another training task acts, and the labels
+    are those of this task.  Decoys teach T_theta to drop a wrong hypothesis about the task."""
     steps: Positive = 20000
     """Optimizer steps."""
 
 
 @dataclass(frozen=True)
 class DAggerConfig:
-    """DAgger rounds of DPT and ICAG: T^j collects histories, the optimal policy labels them.
+    """DAgger rounds of DPT and ICAG: T^j collects histories, and the optimal policy labels them.
 
-    No behavior policy explores as a deployed T_theta does, so contexts of behavior policies differ
-    from those at deployment.  In round j T^j is deployed in every training variation (Algorithm 1).
+    Contexts of behavior policies differ from those at deployment, because no behavior policy explores
+    as T_theta does.  Therefore in round j T^j is deployed in every training variation (Algorithm 1).
     """
 
     rounds: NotNegative = 0
-    """Rounds; 0 is the paper's ICAG."""
+    """Number of rounds; the paper's ICAG has 0."""
     trials: Positive = 20
-    """Episodes of a history; each round's contexts are its first few, up to all."""
+    """Episodes per history; a training context is a random number of its first episodes."""
     steps: Positive = 4000
-    """Optimizer steps a round."""
+    """Optimizer steps per round."""
     learning_rate: PositiveFloat = 1e-3
     """Peak learning rate of a round."""
     new_fraction: Share = 0.5
-    """Share of the batches that are histories; the rest come from D_pre."""
+    """Share of the training batches whose contexts are histories; the other batches come from D_pre."""
 
 
 @dataclass(frozen=True)
@@ -79,25 +79,24 @@ class ICAAConfig:
     """In-Context Adversarial Adaptation (Algorithm 3)."""
 
     rounds: NotNegative = 3
-    """J: rounds j = 0..J are collected and fine-tuned on, so J + 1 in all."""
+    """J: there are J + 1 rounds j = 0..J of collecting and fine-tuning."""
     trials: Positive = 40
     """N: each variation is rolled out for N + 1 trials."""
     context_trials: NotNegative = 20
-    """N_: the first N_ + 1 trials become contexts, labels come from strictly later ones."""
+    """N_: the first N_ + 1 trials become contexts; labels come from later trials only."""
     label_trials: Literal["later", "top_return", "improved"] = "later"
-    """``later``: every later trial (Algorithm 3); ``top_return``: the better half of them;
-    ``improved``: those with a higher return than the context trials had on average, so that a
-    variation in which nothing was learned gives no labels."""
+    """Trials that labels come from.  ``later``: every later trial (Algorithm 3); ``top_return``: the half of
+    them with the higher returns; ``improved``: those whose return exceeds the mean return of the context
+    trials, so that a variation in which the agent did not improve gives no labels."""
     context: Literal["trial", "history"] = "history"
-    """``history``: a context is trials 0 to n, what the deployed agent sees (Algorithm 1, line
-    16); ``trial``: any of the trials, and with optim.episodes = 1 one of them (Algorithm 3,
-    line 13)."""
+    """``history``: a context is trials 0 to n, as the deployed agent has it (Algorithm 1, line 16);
+    ``trial``: a context is any of the trials, a single one with optim.episodes = 1 (Algorithm 3, line 13)."""
     steps: Positive = 4000
-    """Fine-tuning steps a round."""
+    """Fine-tuning steps per round."""
     learning_rate: PositiveFloat = 1e-3
     """Peak learning rate of fine-tuning."""
     new_fraction: Share = 0.5
-    """Share of a fine-tuning batch that comes from self-labelled data; the rest from D^0."""
+    """Share of the fine-tuning batches that come from self-labelled data; the other batches come from D^0."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +106,15 @@ class ModelConfig:
     layers: Positive = 4
     """Attention layers."""
     heads: Positive = 1
-    """Attention heads a layer."""
+    """Attention heads per layer."""
     width: Positive = 32
     """Embedding size: 32 in Dark Room, 256 elsewhere."""
     fourier: NotNegative = 0
-    """Sine and cosine pairs added to each observation component; 0 gives the scaled values
-    only, which keep no gap between training and held-out goals (docs/decisions/008-contexts-first.md)."""
-    window: Annotated[int, Ge(1), Remedy("at least 1, which is none")] = 1
-    """States of a window: T_theta also reads what was done in the window so far (zeta of eq. 6), so
-    that a guess once acted on is kept.  1: none, as in the paper's experiments."""
+    """Sine and cosine pairs added to each observation component.  0: scaled values only, with which
+    training and held-out goals have similar returns (docs/decisions/008-contexts-first.md)."""
+    window: Annotated[int, Ge(1), Remedy("at least 1; 1 means no action windows")] = 1
+    """States per action window.  T_theta also reads the actions and rewards of the window so far (zeta of
+    eq. 6), so it can keep acting on one hypothesis.  1: no action windows, as in the paper's experiments."""
     dropout: Annotated[float, Ge(0), Lt(1), Remedy("a probability below 1")] = 0.0
     """Dropout on attention and feed-forward outputs."""
 
@@ -127,26 +126,26 @@ class OptimConfig:
     learning_rate: PositiveFloat = 1e-3
     """Peak learning rate."""
     muon: NotNegativeFloat = 0.0
-    """Learning rate of Muon, over AdamW's, for the matrices of attention and feed-forward layers;
-    the rest stays with AdamW.  0: AdamW for all, as in the paper."""
+    """Learning rate of Muon as a multiple of AdamW's, for the matrices of attention and feed-forward
+    layers; AdamW trains the other parameters.  0: AdamW trains all, as in the paper."""
     weight_decay: NotNegativeFloat = 1e-4
     """AdamW's decoupled weight decay."""
     beta2: Annotated[float, Ge(0), Lt(1), Remedy("must lie in [0, 1)")] = 0.999
-    """AdamW's memory of squared gradients; shorter (0.98) suits short fits at high rates."""
+    """AdamW's decay rate of the average of squared gradients; 0.98 suits short fits with high learning rates."""
     batch: Positive = 128
-    """Contexts a step."""
+    """Contexts per step."""
     transitions: NotNegative = 0
-    """Transitions a step, at most: of longer contexts fewer fit in; 0 for no limit."""
+    """Maximum number of transitions per step: a batch of long contexts has fewer contexts.  0: no limit."""
     queries: Positive = 32
-    """(prefix, query) pairs a context; each sees its own random prefix (eq. 1, many times)."""
+    """(prefix, query) pairs per context; each pair has its own random prefix (the loss of eq. 1)."""
     windows: NotNegative = 0
-    """Windows a context (``model.window``), each with its own random prefix."""
+    """Action windows per context (``model.window``), each with its own random prefix."""
     episodes: Positive = 4
-    """Episodes in a training context, at most; each step draws its own number."""
+    """Maximum number of episodes in a training context; each step draws the number at random."""
     warmup: NotNegative = 200
-    """Steps of linear warm-up; then the rate falls to a tenth along a cosine."""
+    """Steps of linear warm-up; then the learning rate falls to a tenth along a cosine."""
     clip: PositiveFloat = 1.0
-    """Largest gradient norm."""
+    """Maximum gradient norm; larger gradients are scaled down."""
 
 
 @dataclass(frozen=True)
@@ -154,9 +153,9 @@ class ContextConfig:
     """The context D at deployment (Algorithm 1)."""
 
     max: Positive = 4000
-    """Transitions a context may hold; beyond it the oldest whole episodes are dropped."""
+    """Maximum number of transitions in a context; above it the oldest whole episodes are dropped."""
     keep: Literal["all", "last"] = "all"
-    """``all``: every episode so far (Algorithm 1, line 16); ``last``: only the newest."""
+    """``all``: keep every episode (Algorithm 1, line 16); ``last``: keep only the newest."""
 
 
 @dataclass(frozen=True)
@@ -164,12 +163,13 @@ class EvaluateConfig:
     """Online evaluation on held-out tasks (section 5.1)."""
 
     episodes: Positive = 40
-    """Online episodes a task."""
+    """Online episodes per task."""
     p: Annotated[tuple[Probability, ...], MinLen(1), Remedy("name at least one override probability")] = (0.0, 0.2)
-    """Override probabilities that are tested; in a continuous game, strengths of its adversary, of
-    which 1 is ``control.strength``."""
+    """Override probabilities to test; in continuous problems strengths of the adversary, as multiples of
+    ``control.strength``."""
     prior: Literal["uniform", "unseen"] = "unseen"
-    """The test adversary's law: ``unseen`` Dirichlet priors, or ``uniform`` over the actions."""
+    """Distribution of the test adversary's actions: ``uniform``, or drawn from a Dirichlet prior that no
+    training adversary uses (``unseen``)."""
     seeds: Positive = 10
     """Independent evaluations of every task (the paper's 10 random seeds)."""
 
@@ -179,27 +179,27 @@ class StreamConfig:
     """The streams between workers and learner."""
 
     endpoint: str = "tcp/127.0.0.1:0"
-    """Where the learner listens; port 0 takes a free one.  Loopback unless you change it."""
+    """Address that the learner listens on; port 0 chooses a free port.  The default is loopback."""
     connect: str = ""
-    """Where workers and monitors reach the learner, if not where it listens: a proxy, a NAT, a
-    port forward."""
+    """Address at which workers and monitors reach the learner, if it is not ``endpoint``, such as that of a
+    proxy, a NAT or a port forward."""
     certificates: str = ""
-    """Folder with ca.pem, and ROLE.pem and ROLE.key for each role that this machine plays
-    (learner, worker, monitor); needed to listen anywhere but on this machine."""
+    """Folder with ca.pem, and ROLE.pem and ROLE.key for each role of this node (learner, worker, monitor);
+    required if the learner listens on an address that other nodes can reach."""
     job_tasks: Positive = 4
-    """Tasks a job: their variations are stepped as one batch.  Larger batches decide faster,
-    smaller ones spread better over workers; the digests depend on it."""
+    """Tasks per job: their variations are stepped as one batch.  Larger batches are faster per step, smaller
+    ones balance better over workers; the digests depend on it."""
     credits: Positive = 16
-    """W: trajectories a worker may have unanswered."""
+    """W: trajectories that a worker may have sent without a reply."""
     reply_timeout_s: PositiveFloat = 10.0
-    """A trajectory without a reply for so long is sent again."""
+    """Seconds after which a trajectory without a reply is sent again."""
     lease_s: PositiveFloat = 60.0
-    """The longest that a job's next trajectory may take; shorter once it has been measured."""
+    """Seconds that a job's next trajectory may take at most; the limit gets shorter after the first measurements."""
     max_message_bytes: Positive = 16 << 20
-    """A larger message is refused."""
+    """Maximum size of a message; a larger one is refused."""
     staleness: NotNegative = 0
-    """Rounds that collecting may run ahead of the fits: jobs may name weights up to so many
-    versions old (asynchronous mode).  Above 0, digests differ from run to run."""
+    """Rounds that collecting may be ahead of the fits: jobs may use weights that are up to this many
+    versions old (asynchronous mode).  Above 0, digests differ between runs."""
 
 
 @dataclass(frozen=True)
@@ -207,33 +207,33 @@ class LearnerConfig:
     """The learner process."""
 
     threads: NotNegative = 0
-    """Threads of a fit; 0 takes every core, for the workers wait meanwhile.  The weights
-    digest depends on it, so it is recorded."""
+    """CPU threads of a fit; 0 uses every core, because workers are idle during a fit.  The weights
+    digest depends on it, so the run folder records it."""
     restarts: NotNegative = 3
-    """Restarts of the learner, and of each worker in a row without progress, before the run
-    gives up."""
+    """Maximum number of restarts of the learner, and of successive restarts of a worker without progress;
+    then the run fails."""
     cache_mb: NotNegative = 1024
-    """Megabytes of the dataset that a fit keeps in memory; the rest is read when it is drawn."""
+    """Megabytes of the dataset that a fit keeps in memory; other trajectories are read when they are drawn."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """``auto`` takes a GPU where there is one; ``cpu`` or ``cuda`` decide."""
+    """Device of the fits; ``auto`` uses a GPU if there is one."""
     prometheus: str = ""
-    """HOST:PORT to serve the newest metrics at, for Prometheus, such as 127.0.0.1:9464; empty: nowhere."""
+    """HOST:PORT on which to serve the newest metrics for Prometheus, such as 127.0.0.1:9464; empty: off."""
 
 
 @dataclass(frozen=True)
 class AlertsConfig:
-    """Thresholds of alerts, which appear in live views, in ``metrics.jsonl`` and on the monitor plane.  0: never."""
+    """Thresholds of alerts, which appear in live views, in ``metrics.jsonl`` and on the monitor plane; 0 turns one off."""
 
     collapse: _AlertShare = 0.5
-    """The newest version returns less than this share of what the one before returned in the same
-    trials of the same variations."""
+    """Alert if the mean return of the newest policy version is below this share of that of the previous
+    version in the same trials of the same variations."""
     zero_episodes: Annotated[int, Ge(0), _NEVER] = 40
-    """The last so many episodes of a variation all returned 0."""
+    """Alert if this many successive episodes of a variation all returned 0."""
     silent_s: Annotated[float, Ge(0), _NEVER] = 5.0
-    """No heartbeat of a worker has arrived for so long, seconds."""
+    """Alert if no heartbeat of a worker has arrived for this many seconds."""
     ingest: _AlertShare = 0.5
-    """The learner stores less than this share of what the workers could send: during the rest of the last
-    ten seconds the workers waited for the learner."""
+    """Alert if the workers could send during less than this share of the last ten seconds, because they
+    waited for the learner for the rest."""
     labels: _AlertShare = 0.05
-    """From one round to the next, the share of self-made labels that are optimal falls by this much
-    (ICAA, in problems with exact answers)."""
+    """Alert if the share of self-made labels that are optimal falls by this much from one round to the next
+    (ICAA, in problems with exact solutions)."""

@@ -1,4 +1,4 @@
-"""TOML tables and frozen dataclasses: strict both ways, every complaint with a place and a remedy."""
+"""Convert dataclasses to TOML and back, strictly."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ __all__ = ["ConfigError", "build", "dumps", "nearest"]
 
 
 class ConfigError(ValueError):
-    """A value that a run cannot have: what, where, and the remedy, on one line."""
+    """An impossible setting.  The message is one line: where, the value, the remedy."""
 
 
 def dumps(config: object) -> str:
-    """A dataclass, two levels deep, as TOML that ``build`` reads back to an equal value."""
+    """A dataclass of at most two levels as TOML; ``build`` restores an equal value from it."""
     return tomli_w.dumps(schema.as_data(config))
 
 
 def build(cls: type, table: dict[str, Any], source: str) -> object:
-    """``cls`` from a TOML table.
+    """Make a ``cls`` from a TOML table.
 
-    Raises ConfigError, naming ``source``, for an unknown key, a wrong type or a value out of range.
+    Raises ConfigError, beginning with ``source``, for an unknown key, a wrong type or a value out of range.
     """
     try:
         return schema.read(cls, table)

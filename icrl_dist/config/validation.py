@@ -1,4 +1,4 @@
-"""Whether a run's numbers fit together: ranges beside the fields, then what several fields decide."""
+"""Check the settings of a run: first the range of each field, then whether fields are compatible."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Objection = tuple[str, object, str]
 
 
 def validate(run: Run, source: str) -> None:
-    """Raises ConfigError for values that are out of range, or that do not fit together."""
+    """Raises ConfigError for values that are out of range or incompatible."""
     try:
         schema.check(run)
         owner = plugins.find("problems", run.problem)
@@ -31,10 +31,10 @@ def validate(run: Run, source: str) -> None:
 
 
 def _objections(run: Run, problem: Any) -> Iterator[Objection]:
-    """What does not fit together, whatever the problem and the method."""
+    """Incompatible values that no problem or method allows."""
     icaa, horizon, train = run.icaa, problem.horizon, problem.train_count
     if run.pretrain.contexts < train:
-        yield "pretrain.contexts", run.pretrain.contexts, f"at least one a task ({train})"
+        yield "pretrain.contexts", run.pretrain.contexts, f"use at least one per training task ({train})"
     if icaa.context_trials >= icaa.trials:
         yield "icaa.context_trials", icaa.context_trials, "must be below icaa.trials"
     for where, windows in (("pretrain.windows", run.pretrain.windows), ("optim.windows", run.optim.windows)):
@@ -45,13 +45,13 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
     if run.model.width % run.model.heads:
         yield "model.heads", run.model.heads, "must divide model.width"
     if run.context.max < horizon:
-        yield "context.max", run.context.max, "must hold at least one episode"
+        yield "context.max", run.context.max, "must be at least one episode ({horizon} steps)"
     if run.dagger.rounds and problem.labeller is None:
         yield "dagger.rounds", run.dagger.rounds, "only a problem with exact answers can label new histories"
-    yield from _places(run)
+    yield from _address_objections(run)
 
 
-def _places(run: Run) -> Iterator[Objection]:
+def _address_objections(run: Run) -> Iterator[Objection]:
     host, _, port = run.learner.prometheus.rpartition(":")
     valid = bool(host and port.isascii() and port.isdigit() and 0 < int(port) < 65536)
     if run.learner.prometheus and not valid:

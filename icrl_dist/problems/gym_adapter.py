@@ -1,4 +1,4 @@
-"""A variation environment (tau, phi) behind gymnasium's interface."""
+"""A variation environment (tau, phi) as a ``gymnasium.Env``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Observation = np.ndarray[Any, np.dtype[np.float32]]
 Action = np.int64 | np.ndarray[Any, np.dtype[np.float32]]
-"""A number, or a vector in [-1, 1]."""
+"""An integer, or a vector in [-1, 1]."""
 
 
 Image = np.ndarray[Any, np.dtype[np.uint8]]
@@ -24,16 +24,16 @@ Image = np.ndarray[Any, np.dtype[np.uint8]]
 class VariationEnv(gymnasium.Env[Observation, Action]):
     """The MDP (S, A, P_{tau,phi}, R_{tau,phi}, gamma, rho_tau) of section 4.1.
 
-    An episode is truncated at the horizon, or where the simulation breaks down (``info["diverged"]``),
-    and never terminates.
+    An episode is truncated at the horizon or when the simulation breaks down (``info["diverged"]``); it is
+    never terminated.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - gymnasium declares it so
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - gymnasium's declaration
 
     def __init__(self, variation: Variation, batch: Batch, render_mode: str | None = None) -> None:
         """Raises ValueError for a ``render_mode`` other than ``rgb_array`` or None."""
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode {render_mode!r}: choose 'rgb_array', or None to draw nothing")
+            raise ValueError(f"render_mode {render_mode!r}: choose 'rgb_array', or None for no images")
         self.variation, self.render_mode = variation, render_mode
         self._batch = batch
         low, high = (np.array(bound, dtype=np.float32) for bound in (batch.spec.low, batch.spec.high))
@@ -62,7 +62,7 @@ class VariationEnv(gymnasium.Env[Observation, Action]):
     def render(self) -> Image | None:
         """The present state as an image ``(height, width, 3)``; None without a ``render_mode``.
 
-        Raises RuntimeError, with the remedy, if MuJoCo has no way to draw on this machine.
+        Raises RuntimeError, with the remedy, if MuJoCo cannot render on this node.
         """
-        drawing: Any = self._batch  # every game's batch can draw; what only steps need not
-        return None if self.render_mode is None else drawing.image(0)
+        batch: Any = self._batch  # ``Batch`` does not declare ``image``
+        return None if self.render_mode is None else batch.image(0)

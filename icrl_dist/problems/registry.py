@@ -1,4 +1,4 @@
-"""Problems by name, and variation environments: ``make`` one as a gymnasium.Env, ``batch`` many at once."""
+"""Find a problem by name, and create variation environments: ``make`` for one, ``batch`` for many."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icrl_dist.types import NULL, Adversary, Spec, Task, Variation
 
 
 def names() -> tuple[str, ...]:
-    """The names of all problems, sorted: the kinds of their tasks."""
+    """The names of all problems, sorted; they are the ``kind`` of their tasks."""
     return plugins.names("problems")
 
 
 @functools.lru_cache(maxsize=64)
 def problem(name: str, config: Any = None) -> Problem:
-    """The problem of this name, with this section of a run file or the default one.
+    """The problem of this name; ``config``: its section of a run file, by default with default values.
 
-    Raises ConfigError, with the nearest name, if there is none.
+    Raises ConfigError, with the nearest name, for an unknown name.
     """
     owner = plugins.find("problems", name)
     made: Problem = owner(name, owner.Config() if config is None else config)
@@ -31,12 +31,12 @@ def problem(name: str, config: Any = None) -> Problem:
 
 
 def of(run: Run) -> Problem:
-    """The problem of a run; its split is computed once."""
+    """The problem of a run.  Runs with equal sections share the object, so its split is computed once."""
     return problem(run.problem, run.section(plugins.find("problems", run.problem).section))
 
 
 def of_task(task: Task) -> Problem:
-    """The problem that a task belongs to.  Raises ValueError, with the nearest name, for an unknown one."""
+    """The problem of a task, with a default section.  Raises ValueError, with the nearest name, for an unknown one."""
     try:
         return problem(task.kind)
     except ConfigError as error:
@@ -52,15 +52,15 @@ def batch(variations: Sequence[Variation]) -> Batch:
 
 
 def spec(task: Task) -> Spec:
-    """Shape of the task's observations and actions."""
+    """Spec of the task's observations and actions."""
     return of_task(task).spec_of(task)
 
 
 def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
-    """One variation environment (tau, phi) as a ``gymnasium.Env``; ``render_mode`` ``rgb_array`` for images.
+    """One variation environment (tau, phi) as a ``gymnasium.Env``; ``render_mode="rgb_array"``: it can render images.
 
-    The adversary is part of the environment: the agent observes neither it nor its action,
-    except in ``info["adversary"]`` (see ``Step.adversary``).
+    The adversary is part of the environment: observations contain neither it nor its action, but
+    ``info["adversary"]`` has the action (see ``Step.adversary``).
     """
     return VariationEnv(variation, batch([variation]), render_mode)
 
@@ -68,14 +68,14 @@ def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
 def training_variations(run: Run, index: int, task: Task, round: int = 0) -> tuple[Variation, ...]:
     """The K training variations of task number ``index``, phi_0 first (Algorithm 2, line 7).
 
-    Every round of ICAA samples its adversaries anew (Algorithm 3, line 11).
+    Each round of ICAA samples new adversaries (Algorithm 3, line 11).
     """
     rng = generator(run.seed, RandomKey.TRAINING_ADVERSARIES, index, round)
     return tuple(Variation(task, one) for one in of(run).training_adversaries(rng, run.adversary))
 
 
 def test_adversary(run: Run, index: int, p: float, prior: str) -> Adversary:
-    """The disturbance of test task ``index`` at strength ``p``: never one that was trained on."""
+    """The adversary of test task number ``index`` with strength ``p``; it is not one of training."""
     if p == 0:
         return NULL
     return of(run).test_adversary(generator(run.seed, RandomKey.TEST_ADVERSARIES, index), p, prior)

@@ -20,7 +20,7 @@ from icrl_dist.config.run import dumps
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
-from icrl_dist.problems.darkroom.posterior import Room
+from icrl_dist.problems.darkroom.posterior import RoomPosterior
 from icrl_dist.stream import batching, monitor_messages, wire
 from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
@@ -213,9 +213,9 @@ def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monke
         messages = []
         network().subscribe(KEYS.monitor(topic), lambda key, payload: messages.append(wire.decode_message(payload)))
         read = []
-        real = Room.read
+        real = RoomPosterior.read
         with monkeypatch.context() as patched:
-            patched.setattr(Room, "read", lambda *arguments: read.append(real(*arguments)) or read[-1])
+            patched.setattr(RoomPosterior, "read", lambda *arguments: read.append(real(*arguments)) or read[-1])
             Worker(network(), "test", "w0").run()
         return [wire.trajectory_digest(t) for t in learner.stored], messages, read
 
@@ -269,7 +269,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
 
 def test_an_error_in_a_belief_does_not_fail_the_job(hub, small_run, monkeypatch, caplog):
     always(monkeypatch)
-    monkeypatch.setattr(Room, "read", lambda *arguments: 1 / 0)
+    monkeypatch.setattr(RoomPosterior, "read", lambda *arguments: 1 / 0)
     job = jobs_of(small_run, phase=1)[0]
     learner = ScriptedLearner(hub(), small_run, [job_message(job), STOP])
     hub().serve(KEYS.weights_latest, lambda query: query.reply(wire.encode_weights(weights(small_run, 0))))

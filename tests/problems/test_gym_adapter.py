@@ -101,7 +101,7 @@ def test_a_failed_rendering_is_one_line_with_the_remedy(
     env: Any = registry.make(make_variation(), "rgb_array")
     env.reset(seed=0)
     monkeypatch.setenv("MUJOCO_GL", back_end)
-    inner = env._batch._envs[0] if make_variation is noisy_pick_place else env._batch.game._envs[0].physics
+    inner = env._batch._envs[0] if make_variation is noisy_pick_place else env._batch.simulation._envs[0].physics
 
     def broken(*arguments: Any, **options: Any) -> None:
         raise OSError("no such\nlibrary")

@@ -203,7 +203,7 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
     assert main.main(["evaluate", str(folder), "--suite", "posterior", "--seeds", "2", "--episodes", "6", "--json"]) == 0
     printed = capsys.readouterr()
     answer = json.loads(printed.out.splitlines()[-1])
-    for name, prior in itertools.product(("kl_nats", "kl_heldout"), divergence.LAWS):
+    for name, prior in itertools.product(("kl_nats", "kl_heldout"), divergence.PRIORS):
         rows = answer[f"{name}{prior}_cells"]
         assert [(row["kind"], row["p"]) for row in rows] == [(kind, p) for p in (0.0, 0.2) for kind in divergence.KINDS]
         assert answer[f"{name}{prior}"] == pytest.approx(np.mean([row["kl"] for row in rows]))
@@ -218,7 +218,7 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
     assert {key: kept[key] for key in answer if key in kept}.items() <= answer.items()
     assert all(len(c["kl"]) == 17 for c in kept["kl_heldout_any_curves"]["by_prefix"])
     assert Path(answer["figure"]).read_bytes().startswith(b"\x89PNG")
-    assert all(meaning in printed.err for meaning in divergence.LAWS.values()) and f"{answer['kl_nats']:.4f}" in printed.err
+    assert all(meaning in printed.err for meaning in divergence.PRIORS.values()) and f"{answer['kl_nats']:.4f}" in printed.err
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,1 @@
-"""Parts that the problems with vectors of actions share."""
+"""Common parts of the problems with vector actions."""

@@ -1,4 +1,4 @@
-"""The section ``[control]`` of a run file, which DeepMind Control and Meta-World share."""
+"""The section ``[control]`` of a run file, for DeepMind Control and Meta-World."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from icrl_dist.stream.schema import Remedy
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """The continuous games (appendix C.2, C.3); without effect in Dark Room."""
+    """Tasks, adversaries and contexts of the continuous problems (appendices C.2, C.3)."""
 
     split_seed: Seed = 0
     """Seed of the split into training and test tasks."""
     train_tasks: Positive = 16
-    """m, tasks that are trained on.  DeepMind Control: the central 2x2, 4x4 or 6x6 of the 8x8 grid of
-    physical parameters (m = 16 in appendix C.3); Meta-World: the first of ML1's (15 in appendix C.2)."""
+    """m, number of training tasks.  DeepMind Control: the central 2x2, 4x4 or 6x6 of the 8x8 grid of
+    physical parameters (m = 16 in appendix C.3); Meta-World: the first tasks of ML1 (15 in appendix C.2)."""
     test_tasks: Positive = 5
-    """Tasks that are only tested: others of the grid, or ML1's next."""
+    """Number of test tasks: other tasks of the grid, or the next tasks of ML1."""
     horizon: NotNegative = 0
-    """Steps an episode; 0: the problem's own, 200 in DeepMind Control, 500 in Meta-World."""
+    """Steps per episode; 0: the problem's default, 200 in DeepMind Control, 500 in Meta-World."""
     strength: Annotated[float | str, Ge(0), Remedy("must not be negative, and be finite")] = 1.0
-    """Strength of a pretraining adversary: 1 is Table 2's largest force, or the full ``disturbance``.
-    ``drop:0.25``: the smallest at which the undisturbed experts lose a quarter of their return, as
-    ``icrl-dist bench disturbance --drop`` has measured it."""
+    """Strength of a training adversary: 1 is the largest force of ``forces``, or the full ``disturbance``.
+    ``drop:0.25``: the smallest strength at which experts that were trained undisturbed lose a quarter of
+    their return, as ``icrl-dist bench disturbance --drop`` measured it."""
     histories: Literal["sac", "scripted"] = "sac"
-    """What contexts are: episodes of SAC experts' trainings (appendix C.2), or, in Meta-World, of the
-    scripted policy, told the right goal and wrong ones by turns, with noise
-    (``problems.metaworld.scripted_contexts``)."""
+    """Source of contexts.  ``sac``: episodes of the trainings of SAC experts (appendix C.2); ``scripted``
+    (Meta-World): episodes of the scripted policy with noise, given right and wrong goals."""
     solved: str = ""
-    """What a drop came to when the run was read, as PROBLEM/FORCES/drop:SHARE=STRENGTH; not for you to set."""
+    """The strength of ``drop:SHARE``, as PROBLEM/FORCES/drop:SHARE=STRENGTH.  Stored when the run file is
+    read; do not set it."""
     forces: Literal["paper", "qarl"] = "paper"
-    """DeepMind Control: where and how hard an adversary pushes, by Table 2 or by QARL's code."""
-    disturbance: Annotated[float, Interval(ge=0, le=0.1), Remedy("0 to 0.1 metres")] = 0.01
-    """Meta-World: metres that an adversary of strength 1 moves a component of what is observed."""
+    """DeepMind Control: the bodies and the size of the adversary's forces, from Table 2 or from QARL's code."""
+    disturbance: Annotated[float, Interval(ge=0, le=0.1), Remedy("use 0 to 0.1 meters")] = 0.01
+    """Meta-World: meters by which an adversary of strength 1 moves a component of the observation."""

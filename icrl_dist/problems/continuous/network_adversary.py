@@ -1,4 +1,4 @@
-"""ICAG's adversary of the continuous games: a network with fixed random weights (appendix C.3)."""
+"""The adversary of the continuous problems: a network with fixed random weights (appendix C.3)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from jaxtyping import Float32
 from icrl_dist.types import NULL, Adversary, Spec
 
 HIDDEN = 64
-"""Units of its two hidden layers."""
-_GAIN = 3.0  # of the last layer: outputs that reach their bounds now and then, and change sign within an episode
+"""Units in each of the two hidden layers."""
+_GAIN = 3.0
+"""Scale of the last layer's weights: with it outputs sometimes reach their bounds and change sign within an episode."""
 
 
 def network(seed: int, inputs: int, outputs: int, strength: float = 1.0) -> Adversary:
-    """The adversary whose weights are drawn from ``seed``: observation to action, at most ``strength`` either way."""
+    """The adversary with weights drawn from ``seed``; it maps observations to actions in [-strength, strength]."""
     return Adversary.of("network", seed=seed, inputs=inputs, outputs=outputs, strength=strength)
 
 
@@ -26,7 +27,7 @@ def networks(rng: np.random.Generator, count: int, spec: Spec, outputs: int, str
 
 
 def weights(adversary: Adversary) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Weights and biases of the three layers in turn, rebuilt bit for bit from the seed."""
+    """Weights and biases of the three layers in turn, computed from the seed, always with the same bits."""
     inputs, outputs = int(adversary.number("inputs")), int(adversary.number("outputs"))
     rng = np.random.default_rng(int(adversary.number("seed")))
     layers: list[np.ndarray] = []
@@ -37,16 +38,16 @@ def weights(adversary: Adversary) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
 
 
 class Networks:
-    """The adversaries of B variations, each asked about its own row."""
+    """The adversaries of B variations, evaluated together."""
 
     def __init__(self, adversaries: Sequence[Adversary], spec: Spec, outputs: int) -> None:
-        """Raises ValueError for an adversary of another family, or made for other widths."""
+        """Raises ValueError for an adversary of another family, or with other numbers of inputs or outputs."""
         for one in adversaries:
             if one.kind not in ("null", "network"):
-                raise ValueError(f"adversary {one.kind!r}: a continuous game knows null and network")
+                raise ValueError(f"adversary {one.kind!r}: a continuous problem has null and network")
             if one.kind == "network" and (one["inputs"], one["outputs"]) != (spec.observation, outputs):
                 raise ValueError(
-                    f"adversary of {one['inputs']} inputs and {one['outputs']} outputs: this game has {spec.observation} "
+                    f"adversary of {one['inputs']} inputs and {one['outputs']} outputs: this problem has {spec.observation} "
                     f"observation components and {outputs} of disturbance; make it with network(seed, inputs, outputs)"
                 )
         self._rows = [row for row, one in enumerate(adversaries) if one.kind == "network"]
@@ -57,7 +58,7 @@ class Networks:
         self._middle, self._half = (low + high) / 2, (high - low) / 2
 
     def act(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B F"]:
-        """Each row's disturbance, 0 where there is no adversary."""
+        """The disturbance of each row; 0 in rows without an adversary."""
         out = np.zeros(self._shape, np.float32)
         if self._rows:
             x = ((observation[self._rows] - self._middle) / self._half)[:, None]

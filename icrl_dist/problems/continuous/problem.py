@@ -1,4 +1,4 @@
-"""What DeepMind Control and Meta-World share as problems: vectors of actions, network adversaries, SAC experts."""
+"""Base class of DeepMind Control and Meta-World: vector actions, network adversaries, SAC experts."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Run
 
 EXPERT, SCRIPTED = "SAC expert", "scripted expert"
-"""Names of references: experts of the undisturbed tasks, and a scripted policy of the true states."""
+"""Names of reference agents: experts trained in the undisturbed tasks, and a scripted policy of the true states."""
 
 
 class ContinuousProblem(Problem):
-    """A simulated problem whose actions are vectors, disturbed by a network of what is observed."""
+    """A simulated problem with vector actions; the adversary is a network whose input is the observation."""
 
     section = "control"
     Config = ControlConfig
@@ -41,7 +41,7 @@ class ContinuousProblem(Problem):
 
     @property
     def strength(self) -> float:
-        """Strength of a training adversary: the number given, or what a relative loss comes to."""
+        """Strength of a training adversary, as a number; see ``control.strength``."""
         return calibrated_strength.strength(self.config, self.name)
 
     @property
@@ -52,7 +52,7 @@ class ContinuousProblem(Problem):
         return networks(rng, config.count, self.spec, self.disturbances, self.strength)
 
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
-        """A network of another seed, of ``strength`` times ``control.strength``; ``prior`` has no effect."""
+        """A network with another seed and ``strength`` times ``control.strength``; ``prior`` has no effect."""
         return network(int(rng.integers(2**31)), self.spec.observation, self.disturbances, strength * self.strength)
 
     def labelling(self, run: Run) -> ExpertLabelling:
@@ -62,9 +62,9 @@ class ContinuousProblem(Problem):
         )
 
     def contexts(self, run: Run) -> Contexts:
-        """Histories of SAC experts: no more episodes than their training has."""
-        most = max(1, run.sac.steps // self.horizon)
-        return Contexts(ExpertHistories(run.sac, self.labelling(run)), most)
+        """Histories of SAC experts, with at most the episodes of their training."""
+        most_trials = max(1, run.sac.steps // self.horizon)
+        return Contexts(ExpertHistories(run.sac, self.labelling(run)), most_trials)
 
     def references(self, run: Run) -> dict[str, Reference]:
         return {"random": Reference(_random)}
@@ -81,20 +81,20 @@ class ContinuousProblem(Problem):
                 yield (
                     "control.strength",
                     of.strength,
-                    "write a number, or drop:SHARE, as in drop:0.25: the share of the undisturbed expert's return that is "
-                    "to be lost, above 0 and below 1",
+                    "write a number, or drop:SHARE, as in drop:0.25, where SHARE, above 0 and below 1, is the share of its "
+                    "return that the undisturbed expert loses",
                 )
         yield from self._own_objections(run)
         alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
         if run.pretrain.windows and run.pretrain.decoy_fraction and alone:
             remedy = (
-                f"0, or a stream.job_tasks that leaves none of the {count} tasks alone in a job: decoys need another's expert"
+                f"use 0, or a stream.job_tasks with at least two of the {count} tasks in every job: decoys need a second expert"
             )
             yield "pretrain.decoy_fraction", run.pretrain.decoy_fraction, remedy
 
     @abc.abstractmethod
     def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
-        """What this problem's simulator does not allow."""
+        """The values that this problem's simulator does not allow."""
 
     def manifest(self) -> dict[str, Any]:
         return {"split_seed": self.config.split_seed, **super().manifest()}
@@ -105,28 +105,28 @@ def _random(rows: Sequence[Variation], env: Batch) -> Policy:
 
 
 def experts_of(problem: Problem, run: Run) -> MakePolicy | None:
-    """The SAC experts of the evaluated tasks, undisturbed, if all of them are in the cache of this machine."""
+    """The SAC experts of the undisturbed evaluated tasks; None unless all of them are in the cache of this node."""
     from icrl_dist.experts import cache
     from icrl_dist.experts.train import ExpertPolicy
 
-    asked = {task: cache.load_any(Variation(task), problem.horizon, run.sac, run.seed) for task in problem.evaluated}
-    found = {task: history for task, history in asked.items() if history is not None}
-    if len(found) < len(asked):
+    stored = {task: cache.load_any(Variation(task), problem.horizon, run.sac, run.seed) for task in problem.evaluated}
+    found = {task: history for task, history in stored.items() if history is not None}
+    if len(found) < len(stored):
         return None
     return lambda rows, env: ExpertPolicy([found[row.task] for row in rows], run.sac)
 
 
 def missing_experts(problem: Problem, run: Run, what: str) -> str:
-    """Why no expert stands beside the models, and the command that trains them; empty if they are there."""
+    """Why tables show no expert, and the command that trains the missing ones; empty if all are in the cache."""
     from icrl_dist.experts import cache
 
     if not run.sac.cache:
-        return "no SAC expert stands beside the models: with sac.cache = '' none is kept"
+        return "tables show no SAC expert: with sac.cache = '' experts are not stored; set it"
     missing = [
         task for task in problem.evaluated if cache.load_any(Variation(task), problem.horizon, run.sac, run.seed) is None
     ]
     if not missing:
         return ""
-    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this machine"
+    where = f"{len(missing)} of the evaluated tasks have none in {run.sac.cache} on this node"
     train = f"icrl-dist train experts-{what} --out OTHER"
-    return f"no SAC expert stands beside the models: {where}; `{train}` trains them"
+    return f"tables show no SAC expert: {where}; `{train}` trains them"

@@ -1,4 +1,4 @@
-"""The override adversary of Dark Room (appendix C.1): its distribution, exactly, and its priors."""
+"""The override adversary of Dark Room (appendix C.1): its exact distribution, and its priors."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from jaxtyping import Float64
 from icrl_dist.types import NULL, Adversary
 
 ALPHA_RANGE = (0.05, 2.0)
-"""Prior of each Dirichlet parameter; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
+"""Range of each Dirichlet parameter's uniform prior; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
 
 
 def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     """q_b = P(argmax of x ~ Dirichlet(alpha) is b), to about 1e-9.
 
-    x is a normalised vector of independent Gamma(alpha_b), so
-    q_b = integral of f_b(t) * prod_{c != b} F_c(t) dt.  With t = exp(y) the integrand is
-    smooth and dies off at both ends, where the trapezoid rule converges exponentially.
+    x is a normalized vector of independent Gamma(alpha_b) variables, so
+    q_b = integral of f_b(t) * prod_{c != b} F_c(t) dt.  With t = exp(y) the integrand is smooth
+    and vanishes at both ends, so the trapezoid rule converges exponentially.
     """
-    from scipy.special import gammainc, gammaln  # takes a moment, which the command line should not wait for
+    from scipy.special import gammainc, gammaln  # imported here because it is slow and most commands do not need it
 
     a = np.asarray(alpha, dtype=np.float64)[:, None]
     y = np.linspace(-120.0, 7.0, 6001)[None, :]
@@ -45,9 +45,9 @@ def override_distribution(adversary: Adversary, actions: int) -> tuple[float, Fl
     if adversary.kind == "dirichlet":
         alpha = tuple(float(a) for a in adversary.vector("alpha"))
         if len(alpha) != actions or min(alpha) <= 0:
-            raise ValueError(f"adversary alpha={alpha}: expected {actions} numbers above 0, one an action")
+            raise ValueError(f"adversary alpha={alpha}: expected {actions} numbers above 0, one per action")
         return p, argmax_distribution(alpha)
-    raise ValueError(f"adversary {adversary.kind!r}: Dark Room knows null, uniform and dirichlet")
+    raise ValueError(f"adversary {adversary.kind!r}: Dark Room has null, uniform and dirichlet")
 
 
 def sample_dirichlet(rng: np.random.Generator, actions: int, p_max: float) -> Adversary:

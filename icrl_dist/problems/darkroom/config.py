@@ -13,20 +13,20 @@ from icrl_dist.stream.schema import Remedy
 
 @dataclass(frozen=True)
 class DarkRoomConfig:
-    """The room (appendix C.1)."""
+    """The rooms, their split, and their labels (appendix C.1)."""
 
     size: Annotated[int, Ge(2), Remedy("a room has at least 2 cells a side")] = 10
     """Side of the square room, in cells."""
     horizon: Annotated[int, Ge(1), Remedy("an episode has at least 1 step")] = 100
-    """Steps an episode, H."""
+    """Steps per episode, H."""
     train_fraction: Annotated[float, Gt(0), Lt(1), Remedy("use a share between 0 and 1")] = 0.8
-    """Share of the goals that is trained on; the rest is only tested (80/20 goals)."""
+    """Share of the goals that are training tasks; the other goals are test tasks."""
     split_seed: Seed = 0
     """Seed of the shuffle that splits the goals."""
     gamma: Annotated[float, Gt(0), Le(1), Remedy("a discount lies in (0, 1]")] = 0.99
-    """Discount of the optimal action values that labels come from."""
+    """Discount of the optimal action values that labels are computed from."""
     label_slack: NotNegativeFloat = 0.1
-    """A label is uniform over the actions whose value is within this of the best."""
+    """A label is uniform over the actions whose value is at most this much below the best value."""
     labels: Literal["soft", "sampled", "heuristic"] = "soft"
-    """``soft``: see label_slack; ``sampled``: one action drawn from it (eq. 1 to the letter);
-    ``heuristic``: the paper's "y first, then x" rule, optimal only without disturbance."""
+    """``soft``: the distribution that label_slack describes; ``sampled``: one action drawn from it (eq. 1);
+    ``heuristic``: the paper's "y first, then x" rule, which is optimal only without disturbance."""

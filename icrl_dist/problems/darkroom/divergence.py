@@ -1,7 +1,6 @@
-"""Where T_theta departs from the exact posterior (Theorem E.3), and what that costs in return.
+"""Divergence of T_theta's decisions from those of the exact posterior (Theorem E.3) in given contexts.
 
-Two measures: the divergence of its decisions from the Bayes-optimal ones in given contexts,
-and its online return beside the exact agent's, deployed by the same rule.
+``results/posterior.py`` adds the second measure of the suite: the difference in online return.
 """
 
 from __future__ import annotations
@@ -32,22 +31,23 @@ Decide = Callable[[Sequence[np.ndarray], Float32[np.ndarray, "B N S"], Int64[np.
 
 KINDS = ("random walk", "persistent walk", "on policy")
 LEVELS = (0.0, 0.2)
-LAWS = {"": "each goal has its own K adversaries", "_any": "any goal has any adversary"}
-"""What may be true of a context, by the suffix of the measure's name.
+PRIORS = {"": "each goal has its own K adversaries", "_any": "any goal has any adversary"}
+"""Priors over variations, by the suffix of the measure's name.
 
-The first is the law of D^0 (adversaries of ICAA's later rounds are others): the training
-variations as they are, in which no two goals share a disturbance, so one can betray the goal.
-By the second goals and adversaries are independent, as they are at test: every goal has the
-same few, drawn anew from the prior.
+The first is that of D^0 (later rounds of ICAA draw other adversaries): the training variations.
+Because no two goals share an adversary, the disturbance can reveal the goal.  In the second, goals and
+adversaries are independent, as in tests: every goal has the same adversaries, drawn from the prior.
 """
 CONTEXTS, EPISODES = 160, 2
-"""Contexts of each kind and p, and episodes a context."""
+"""Contexts of each kind and p, and episodes per context."""
 _ADVERSARIES = 16
+"""Approximate number of adversaries of the second prior: a multiple of K that is not smaller."""
 _CHUNK = 32
+"""Contexts per call of the model."""
 
 
 class RoomContext(NamedTuple):
-    """T transitions of each of B contexts: what ``Transitions`` holds, in numpy."""
+    """T transitions of each of B contexts, as in ``models.dpt.Transitions``, in numpy."""
 
     observations: Float32[np.ndarray, "B T S"]
     actions: Int64[np.ndarray, "B T"]
@@ -57,14 +57,14 @@ class RoomContext(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Divergence:
-    """The exact decision and the model's at one random cell, for every prefix of B contexts."""
+    """The exact and the model's action distribution at one random cell, for every prefix of B contexts."""
 
     kind: str
     p: float
     exact: Float64[np.ndarray, "B T A"]
     model: Float64[np.ndarray, "B T A"]
-    met: Bool[np.ndarray, "B T"]
-    """The goal was met in the prefix."""
+    reached: Bool[np.ndarray, "B T"]
+    """Whether the goal was reached in the prefix."""
 
     @property
     def kl(self) -> Float64[np.ndarray, "B T"]:
@@ -74,7 +74,7 @@ class Divergence:
 
 
 def training_variations(run: Run, heldout: bool) -> list[tuple[Variation, ...]]:
-    """The K variations of every training goal, as trained on; of every held-out one, numbered after them."""
+    """The K variations of each training goal; with ``heldout`` of each test goal, numbered after the training goals."""
     split = registry.of(run).split
     tasks = enumerate((*split.train, *split.test))
     groups = [registry.training_variations(run, i, task)[: _count(run)] for i, task in tasks]
@@ -86,12 +86,12 @@ def _count(run: Run) -> int:
 
 
 def levels(run: Run) -> tuple[float, ...]:
-    """The p of contexts: 0 only, if training knows no disturbance, for by its law no other context is possible."""
+    """The override probabilities of contexts: only 0 if training has no disturbance, because its prior allows no other."""
     return LEVELS if _count(run) > 1 and run.adversary.p_max > 0 else LEVELS[:1]
 
 
 def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
-    """What may be true, equally, by each of ``LAWS``: of the training goals, or for held-out contexts of all goals."""
+    """The equally likely variations of each of ``PRIORS``: those of training goals; for held-out contexts of all goals."""
     groups = training_variations(run, False) + (training_variations(run, True) if heldout else [])
     rng = generator(run.seed, RandomKey.POSTERIOR_SUITE)
     sets = range(-(-_ADVERSARIES // _count(run)) if _count(run) > 1 else 1)
@@ -103,10 +103,10 @@ def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
 def divergences(
     run: Run, config: DarkRoomConfig, decide: Decide, act: MakePolicy, heldout: bool
 ) -> Iterator[tuple[Divergence, Divergence]]:
-    """T_theta beside the exact posterior by each of ``LAWS``, in contexts of every kind and p."""
+    """Compare T_theta with the exact posterior under each of ``PRIORS``, in contexts of every kind and p."""
     room, groups = config, training_variations(run, heldout)
-    laws = hypotheses(run, heldout)
-    labels = [labels_of(h, room.labels, room.gamma, room.label_slack) for h in laws]
+    priors = hypotheses(run, heldout)
+    labels = [labels_of(h, room.labels, room.gamma, room.label_slack) for h in priors]
     for level, p in enumerate(levels(run)):
         for number, kind in enumerate(KINDS):
             rng = generator(run.seed, RandomKey.POSTERIOR_SUITE, int(heldout), level, number)
@@ -114,14 +114,14 @@ def divergences(
             context = contexts(kind, rows, act, rng.spawn(CONTEXTS))
             query = rng.integers(0, room.size**2, size=(CONTEXTS, 1 + EPISODES * room.horizon))
             decided = model_decisions(decide, context, query, room.size)
-            met = np.pad(context.rewards.cumsum(axis=1) > 0, ((0, 0), (1, 0)))
-            exact = (exact_decisions(h, known, context, query) for h, known in zip(laws, labels, strict=True))
-            one, other = (Divergence(kind, p, law, decided, met) for law in exact)
+            reached = np.pad(context.rewards.cumsum(axis=1) > 0, ((0, 0), (1, 0)))
+            exact = (exact_decisions(h, optimal, context, query) for h, optimal in zip(priors, labels, strict=True))
+            one, other = (Divergence(kind, p, probs, decided, reached) for probs in exact)
             yield one, other
 
 
 def _disturbed(rng: np.random.Generator, group: tuple[Variation, ...], p: float) -> Variation:
-    """A goal's variation without disturbance, or one of its others at strength p."""
+    """The undisturbed variation of a goal, or a random other one with override probability p."""
     if p == 0:
         return group[0]
     chosen = group[int(rng.integers(1, len(group)))]
@@ -129,7 +129,7 @@ def _disturbed(rng: np.random.Generator, group: tuple[Variation, ...], p: float)
 
 
 def contexts(kind: str, rows: Sequence[Variation], act: MakePolicy, rngs: Sequence[np.random.Generator]) -> RoomContext:
-    """Two episodes in each row: walks from random cells as in training, or deployed as at test."""
+    """Two episodes in each row: walks from random cells as in training, or the model deployed as in tests."""
     if kind == "on policy":
         rows = [Variation(v.task.replace(start=(0, 0)), v.adversary) for v in rows]
         env: Batch = DarkRoom(rows)
@@ -145,7 +145,7 @@ def contexts(kind: str, rows: Sequence[Variation], act: MakePolicy, rngs: Sequen
 def exact_decisions(
     h: Hypotheses, labels: Float32[np.ndarray, "M C A"], context: RoomContext, query: Int64[np.ndarray, "B N"]
 ) -> Float64[np.ndarray, "B N A"]:
-    """P(a* | cell ``query[b, t]``, the first t transitions of context b), all of ``h`` equally likely before."""
+    """P(a* | cell ``query[b, t]``, the first t transitions of context b), with a uniform prior over ``h``."""
     here, arrived = cell_numbers(context.observations, h.size), cell_numbers(context.next_observations, h.size)
     flat = np.full(len(h.p), -np.log(len(h.p)))
     result = []
@@ -159,7 +159,7 @@ def exact_decisions(
 def model_decisions(
     decide: Decide, context: RoomContext, query: Int64[np.ndarray, "B N"], size: int
 ) -> Float64[np.ndarray, "B N A"]:
-    """The model's distributions in the same places."""
+    """The model's distributions at the same cells and prefixes."""
     prefix = np.broadcast_to(np.arange(query.shape[1]), query.shape)
     result = []
     for first in range(0, len(query), _CHUNK):
@@ -169,15 +169,15 @@ def model_decisions(
 
 
 def summary(found: Sequence[Divergence]) -> dict[str, Any]:
-    """Mean divergence in nats, its standard error over contexts, its parts before and after the goal was met; by kind and p.
+    """Mean divergence in nats, before and after the goal was reached, and its standard error; also by kind and p.
 
-    The keys are what comes after the measure's name.
+    The keys are suffixes of the measure's name.
     """
     rows = []
     for one in found:
         each = one.kl.mean(axis=1)
         error = float(each.std(ddof=1) / np.sqrt(len(each)))
-        rows.append({"kind": one.kind, "p": one.p, **_split([one]), "standard_error": error, "met": float(one.met.mean())})
+        rows.append({"kind": one.kind, "p": one.p, **_split([one]), "standard_error": error, "met": float(one.reached.mean())})
     spread = float(np.sqrt(sum(row["standard_error"] ** 2 for row in rows)) / len(rows))
     whole = {"" if name == "kl" else f"_{name}": value for name, value in _split(found).items()}
     return {**whole, "_standard_error": spread, "_cells": rows}
@@ -185,13 +185,13 @@ def summary(found: Sequence[Divergence]) -> dict[str, Any]:
 
 def _split(found: Sequence[Divergence]) -> dict[str, Any]:
     kl = np.concatenate([one.kl.ravel() for one in found])
-    met = np.concatenate([one.met.ravel() for one in found])
-    parts = {"kl": np.ones_like(met), "goal_met": met, "goal_unmet": ~met}
+    reached = np.concatenate([one.reached.ravel() for one in found])
+    parts = {"kl": np.ones_like(reached), "goal_met": reached, "goal_unmet": ~reached}
     return {name: float(kl[chosen].mean()) if chosen.any() else None for name, chosen in parts.items()}
 
 
 def curves(found: Sequence[Divergence], bins: int = 10) -> dict[str, Any]:
-    """What the figure shows: divergence by prefix, and the model's mean probability of the actions by the exact one."""
+    """Data of the figure: divergence by prefix, and the model's mean probability as a function of the exact one."""
     exact = np.concatenate([one.exact.ravel() for one in found])
     model = np.concatenate([one.model.ravel() for one in found])
     place = np.minimum((exact * bins).astype(np.int64), bins - 1)
@@ -206,7 +206,7 @@ def curves(found: Sequence[Divergence], bins: int = 10) -> dict[str, Any]:
 class PosteriorSuite:
     """The comparison with the exact posterior, as ``Problem.posterior``."""
 
-    kinds, priors = KINDS, LAWS
+    kinds, priors = KINDS, PRIORS
     levels = staticmethod(levels)
     summary = staticmethod(summary)
     curves = staticmethod(curves)

@@ -1,9 +1,10 @@
-"""Agents that know the exact answers: what a perfectly pretrained T_theta earns, and the oracle.
+"""Agents without a network: the exact agent, which a perfectly pretrained T_theta equals, and the oracle.
 
-An exact agent knows the room and its row's adversary, not the goal.  It acts as Theorem E.3
-says, by a hypothesis sampled from the exact posterior; rules differ in when the posterior is
-updated and how long the hypothesis is kept.  None is ever drawn: the agent acts by the law
-of the hypothesis, given what it saw and did, so it needs no chance beyond the action's.
+An exact agent is given the room and the adversary of its row, but not the goal.  It samples a
+hypothesis from the exact posterior and acts optimally for it (Theorem E.3); rules differ in when the
+posterior is updated and how long a hypothesis is kept.  The agent draws no hypothesis: it samples the
+action from the mixture over hypotheses, given its past observations and actions, which has the same
+distribution.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ RULES: dict[Rule, str] = {
     "committed": "exact, committed",
     "zeta": f"exact, zeta of {ZETA}",
 }
-"""What tables and figures call the exact agent of each rule."""
+"""Name of the exact agent of each rule in tables and figures."""
 
 
 class ExactAgent(DiscretePolicy):
-    """The agent that Theorem E.3 promises: actions from the exact posterior, no network.
+    """Posterior sampling with the exact posterior (Theorem E.3).
 
-    ``paper``: Algorithm 1, a hypothesis a step, the posterior updated at an episode's end.
-    ``every step``: the same, updated at every transition.  ``windows``: updated at every
-    transition, but a hypothesis is kept for ``WINDOW`` steps, or to the episode's end.
-    ``committed``: a hypothesis is kept, from episode to episode, until a transition refutes it.
-    ``zeta``: the posterior, updated at every transition, given that the last ``ZETA`` actions of the
-    episode were right (eq. 6): what ``rollout.CommittedPolicy`` does.  Of these as many count as
-    some hypothesis agrees with, the last first.
+    ``paper``: Algorithm 1, a new hypothesis at each step, the posterior updated at the end of an episode.
+    ``every step``: the same, but updated at every transition.  ``windows``: updated at every
+    transition, but a hypothesis is kept for ``WINDOW`` steps or until the episode ends.
+    ``committed``: a hypothesis is kept, also across episodes, until a transition refutes it.
+    ``zeta``: updated at every transition and conditioned on the last ``ZETA`` actions of the episode
+    being right (eq. 6), as ``rollout.CommittedPolicy`` does.  If no hypothesis agrees with all of these
+    actions, only the latest ones count, as many as some hypothesis agrees with.
     """
 
     def __init__(
@@ -49,21 +50,24 @@ class ExactAgent(DiscretePolicy):
         family: Int[np.ndarray, " B"],
         rule: Rule,
     ) -> None:
-        """Row b holds the M variations ``families[family[b]]`` for possible, all equally."""
+        """The prior of row b is uniform over the M variations ``families[family[b]]``.
+
+        ``labels``: the optimal policies of each family, from ``soft_labels``.
+        """
         self._size, self._rule, self._family = families[0].size, rule, family
         stacked = (np.stack([getattr(h, name) for h in families])[family] for name in ("goal", "p", "q"))
         self._h = Hypotheses(self._size, families[0].horizon, *stacked)
         self._labels = np.stack(labels).transpose(0, 2, 3, 1).astype(np.float64)
         self._log_prior = np.full(self._h.p.shape[1], -np.log(self._h.p.shape[1]))
         self._loglik = np.zeros(self._h.p.shape)
-        self._guess = self._posterior()
+        self._weight = self._posterior()
         self._step = 0
         self._zeta: list[Float64[np.ndarray, "B M"]] = []
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
         labels = self._labels[self._family, cell_numbers(observation, self._size)]
-        law: np.ndarray = (labels @ self._guess[:, :, None])[:, :, 0]
-        return law
+        probs: np.ndarray = (labels @ self._weight[:, :, None])[:, :, 0]
+        return probs
 
     def observe(
         self,
@@ -73,22 +77,22 @@ class ExactAgent(DiscretePolicy):
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None:
-        """Raises ValueError if the rule keeps a hypothesis and no hypothesis would have acted so."""
+        """Raises ValueError if the rule keeps a hypothesis and no hypothesis allows the action."""
         cell, arrived = cell_numbers(observation, self._size), cell_numbers(next_observation, self._size)
         seen = log_likelihood(self._h, cell, action.astype(np.int64), reward, arrived)
         self._loglik += seen
         self._step = 0 if done else self._step + 1
         if self._rule in ("windows", "committed"):
-            self._guess = _normalised(self._guess * self._labels[self._family, cell, action])
+            self._weight = _normalized(self._weight * self._labels[self._family, cell, action])
         if self._rule == "committed":
-            kept = np.where(np.isneginf(seen), 0.0, self._guess)
-            self._guess = kept + (1.0 - kept.sum(axis=1, keepdims=True)) * self._posterior()
+            kept = np.where(np.isneginf(seen), 0.0, self._weight)
+            self._weight = kept + (1.0 - kept.sum(axis=1, keepdims=True)) * self._posterior()
         elif self._rule == "zeta":
             right = self._labels[self._family, cell, action]
             self._zeta = [] if done else [*self._zeta, right][-ZETA:]
-            self._guess = self._given_zeta()
+            self._weight = self._given_zeta()
         elif done or self._rule == "every step" or (self._rule == "windows" and self._step % WINDOW == 0):
-            self._guess = self._posterior()
+            self._weight = self._posterior()
 
     def append(
         self,
@@ -97,12 +101,12 @@ class ExactAgent(DiscretePolicy):
         next_observations: Float32[np.ndarray, "B T S"],
         rewards: Float32[np.ndarray, "B T"],
     ) -> None:
-        """Add data D_off of any other policy, and let go of the hypothesis kept."""
+        """Add data D_off of any other policy, and drop the kept hypothesis."""
         cells, arrived = cell_numbers(observations, self._size), cell_numbers(next_observations, self._size)
         for t in range(actions.shape[1]):
             self._loglik += log_likelihood(self._h, cells[:, t], actions[:, t].astype(np.int64), rewards[:, t], arrived[:, t])
         self._zeta = []
-        self._guess = self._posterior()
+        self._weight = self._posterior()
 
     def _given_zeta(self) -> Float64[np.ndarray, "B M"]:
         weight, agreed = self._posterior(), np.ones(len(self._family), bool)
@@ -110,22 +114,22 @@ class ExactAgent(DiscretePolicy):
             both = weight * right
             agreed &= both.sum(axis=1) > 0
             weight = np.where(agreed[:, None], both, weight)
-        return _normalised(weight)
+        return _normalized(weight)
 
     def _posterior(self) -> Float64[np.ndarray, "B M"]:
         return posterior(self._log_prior, self._loglik)
 
 
-def _normalised(weight: Float64[np.ndarray, "B M"]) -> Float64[np.ndarray, "B M"]:
+def _normalized(weight: Float64[np.ndarray, "B M"]) -> Float64[np.ndarray, "B M"]:
     total = weight.sum(axis=1, keepdims=True)
     if not (total > 0).all():
-        raise ValueError("the exact agent was told of an action that it never takes: give other policies' data to append")
+        raise ValueError("observe got an action that the exact agent never takes: add data of other policies with append")
     result: np.ndarray = weight / total
     return result
 
 
 class OptimalAgent(DiscretePolicy):
-    """The oracle: knows tau and phi, and follows pi*_{tau,phi} of eq. (5)."""
+    """The oracle: it is given tau and phi, and follows pi*_{tau,phi} of eq. (5)."""
 
     def __init__(self, labels: Float32[np.ndarray, "B C A"], size: int) -> None:
         self._labels, self._size = labels, size
@@ -136,4 +140,4 @@ class OptimalAgent(DiscretePolicy):
         return result
 
     def observe(self, *transition: object) -> None:
-        """Nothing to learn."""
+        """Ignore the transition: the policy is fixed."""

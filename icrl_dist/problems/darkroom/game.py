@@ -16,7 +16,7 @@ import numpy as np
 
 from icrl_dist.config.run import Run
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
-from icrl_dist.problems.darkroom.posterior import Belief, Room
+from icrl_dist.problems.darkroom.posterior import Belief, RoomPosterior
 from icrl_dist.problems.darkroom.room import ACTIONS, cells, next_cell
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from icrl_dist.types import NULL, Adversary
@@ -25,15 +25,16 @@ if TYPE_CHECKING:
     from icrl_dist.agent.in_context_agent import InContextAgent
 
 EPISODES = 400
-"""Returns that are kept and shown."""
+"""Number of finished episodes that are kept and shown."""
 SPEEDS = (0.5, 100.0)
-"""Minimum and maximum speed, steps a second."""
+"""Minimum and maximum speed, steps per second."""
 HELD_S = 1.5
 """A held override ends after this time unless ``hold`` is called again, because its viewer may have disconnected."""
 _SUPPOSED = (NULL, Adversary.of("uniform", p=0.4))
 """Adversaries assumed in the posteriors over the goal; the exact posterior does not depend on them."""
 
 Cause = Literal["agent", "law", "hand"]
+"""Who selected an executed action: the agent, a random override, or the person."""
 
 
 class Played(NamedTuple):
@@ -44,63 +45,64 @@ class Played(NamedTuple):
     """Expected return of the optimal policy given goal and overrides; None if either changed during the episode."""
     overridden: int
     by_hand: int
+    """Number of the overrides by the person."""
 
 
 class PlayGame:
-    """One agent in one room; the caller steps it.  Every episode starts in the corner, as in evaluation.
+    """One agent in one room; the caller calls ``step``.  Every episode starts in the origin, as in evaluation.
 
-    Not thread-safe.  The same agent, seed and commands between the same steps give the same game.
+    Not thread-safe.  The same agent, seed and commands between the same steps give the same episodes.
     """
 
     def __init__(self, agent: InContextAgent, run: Run, seed: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
-        """``run``: what the agent was trained by.  ``clock``: seconds, for hands that let go."""
+        """``run``: the run that trained the agent.  ``clock``: time in seconds, by which a held override ends."""
         room: DarkRoomConfig = run.section("darkroom")
         goals = agent.manifest.get("test_goals") or [[room.size - 1] * 2]
         self.agent, self.size, self.horizon = agent, room.size, room.horizon
-        self.goal, self.p, self.law = int(goals[0][0]) * room.size + int(goals[0][1]), 0.0, _UNIFORM
+        self.goal, self.p, self.override_probs = int(goals[0][0]) * room.size + int(goals[0][1]), 0.0, _UNIFORM
         self.speed, self.paused, self.keep = 8.0, False, False
         self._rng, self._clock = np.random.default_rng(seed), clock
         self._next, self._cells = next_cell(room.size), cells(room.size)
-        self._beliefs = Room(room.size, room.horizon, _SUPPOSED, room.gamma, room.label_slack)
+        self._beliefs = RoomPosterior(room.size, room.horizon, _SUPPOSED, room.gamma, room.label_slack)
         self.context_max = run.context.max
-        self._hand: int | None = None
+        self._once: int | None = None
         self._held: int | None = None
         self._held_until = 0.0
-        self._owed = 0
-        self.renew()
+        self._steps_due = 0
+        self.restart()
 
-    def renew(self) -> None:
+    def restart(self) -> None:
         """Restart: the same weights, an empty context, the first episode."""
-        self._forget()
+        self._clear_context()
         self.episodes: deque[Played] = deque(maxlen=EPISODES)
         self.number = 1
-        self._begin()
+        self._start_episode()
 
-    def _forget(self) -> None:
+    def _clear_context(self) -> None:
         self.agent.reset_context()
-        self._since = self._unread = 0
+        self._since_move = self._not_in_context = 0
 
-    def _begin(self) -> None:
+    def _start_episode(self) -> None:
         self.cell, self.steps, self.total, self._changed = 0, 0, 0.0, False
         self.path: list[tuple[int, Cause]] = []
 
     @property
     def optimum(self) -> float:
         """Expected return of the optimal policy given goal and overrides: exact, by value iteration."""
-        return _optimum(self.size, self.horizon, self.goal, self.p, self.law)
+        return _optimum(self.size, self.horizon, self.goal, self.p, self.override_probs)
 
     @property
     def wait_s(self) -> float | None:
         """Time between two steps; None while paused."""
-        return 0.0 if self._owed else None if self.paused else 1.0 / self.speed
+        return 0.0 if self._steps_due else None if self.paused else 1.0 / self.speed
 
     def step(self) -> None:
         """One step: the agent selects an action, an override may replace it, and the agent observes its own action and
         the outcome."""
         if self.steps == self.horizon:
             self.number += 1
-            self._begin()
-        self._owed = max(0, self._owed - 1)
+            self._start_episode()
+        self._steps_due = max(0, self._steps_due - 1)
         before = self._cells[self.cell]
         (action,) = self.agent.act([before])
         executed, cause = self._executed(int(action))
@@ -109,8 +111,8 @@ class PlayGame:
         reward, done = float(self.cell == self.goal), self.steps == self.horizon
         self.agent.observe([before], [action], [reward], [self._cells[self.cell]], [done])
         self.total += reward
-        self._since += 1
-        self._unread = 0 if done or self.agent.deploy == "committed" else self._unread + 1
+        self._since_move += 1
+        self._not_in_context = 0 if done or self.agent.deploy == "committed" else self._not_in_context + 1
         self.path.append((self.cell, cause))
         if done:
             causes = [c for _, c in self.path]
@@ -118,32 +120,31 @@ class PlayGame:
             self.episodes.append(Played(self.total, optimum, self.horizon - causes.count("agent"), causes.count("hand")))
 
     def _executed(self, action: int) -> tuple[int, Cause]:
-        chance, drawn = self._rng.random(), int(self._rng.choice(ACTIONS, p=self.law))
-        hand, self._hand = self._hand, None
-        if hand is None and self._clock() < self._held_until:
-            hand = self._held
-        if hand is not None:
-            return hand, "hand"
-        return (drawn, "law") if chance < self.p else (action, "agent")
+        u, drawn = self._rng.random(), int(self._rng.choice(ACTIONS, p=self.override_probs))
+        chosen, self._once = self._once, None
+        if chosen is None and self._clock() < self._held_until:
+            chosen = self._held
+        if chosen is not None:
+            return chosen, "hand"
+        return (drawn, "law") if u < self.p else (action, "agent")
 
     def belief(self) -> Belief:
         """The posterior over goals that the agent's action distributions imply, and the exact posterior.
 
         The exact posterior uses only the transitions in the agent's context since the goal last moved.
         """
-        return self._beliefs.read(self.agent, last=max(0, self._since - self._unread))
+        return self._beliefs.read(self.agent, last=max(0, self._since_move - self._not_in_context))
 
     def command(self, fields: dict[str, Any]) -> None:
-        """Execute a viewer's command.  Raises ValueError with the wrong value and what is expected."""
-        known = {name: kind for name, (kind, _) in COMMANDS.items()}
+        """Execute a viewer's command.  Raises ValueError with the wrong value and the expected one."""
         do = fields.get("do")
-        if not isinstance(do, str) or do not in known:
-            raise ValueError(f"do={str(do)[:40]!r}: expected one of {', '.join(known)}")
-        names = {"do", *([] if known[do] is None else ["value"])}
+        if not isinstance(do, str) or do not in COMMANDS:
+            raise ValueError(f"do={str(do)[:40]!r}: expected one of {', '.join(COMMANDS)}")
+        check, execute = COMMANDS[do]
+        names = {"do", *([] if check is None else ["value"])}
         if fields.keys() != names:
             raise ValueError(f"{do}: expected the fields {', '.join(sorted(names))}")
-        check, carry_out = COMMANDS[do]
-        carry_out(self, *([] if check is None else [check(self, fields["value"])]))
+        execute(self, *([] if check is None else [check(self, fields["value"])]))
 
     def move_goal(self, cell: int) -> None:
         """Move the goal, from the next step on.
@@ -153,10 +154,10 @@ class PlayGame:
         """
         if cell == self.goal:
             return
-        self.goal, self._since = cell, 0
+        self.goal, self._since_move = cell, 0
         self._changed |= self.steps < self.horizon and self.steps > 0
         if not self.keep:
-            self._forget()
+            self._clear_context()
 
     def keep_context(self, keep: bool) -> None:
         self.keep = keep
@@ -166,15 +167,15 @@ class PlayGame:
         self._changed |= p != self.p and self.steps > 0
         self.p = p
 
-    def choose_law(self, action: int | None) -> None:
-        """Draw overrides from this action alone, or uniformly from all actions if None."""
-        law = _UNIFORM if action is None else tuple(float(a == action) for a in range(ACTIONS))
-        self._changed |= law != self.law and self.p > 0 and self.steps > 0
-        self.law = law
+    def choose_distribution(self, action: int | None) -> None:
+        """Draw overriding actions from this action only, or uniformly from all actions if None."""
+        probs = _UNIFORM if action is None else tuple(float(a == action) for a in range(ACTIONS))
+        self._changed |= probs != self.override_probs and self.p > 0 and self.steps > 0
+        self.override_probs = probs
 
-    def push(self, action: int) -> None:
+    def override_once(self, action: int) -> None:
         """Execute this action in the next step instead of the agent's."""
-        self._hand = action
+        self._once = action
 
     def hold(self, action: int | None) -> None:
         """Execute this action in every step until ``hold(None)``, but for at most ``HELD_S``."""
@@ -182,19 +183,19 @@ class PlayGame:
             self._held_until = 0.0
             return
         if action != self._held or self._clock() >= self._held_until:
-            self._hand = action
+            self._once = action
         self._held, self._held_until = action, self._clock() + HELD_S
 
     def pause(self, paused: bool) -> None:
-        self.paused, self._owed = paused, 0
+        self.paused, self._steps_due = paused, 0
 
     def one_step(self) -> None:
         """Pause and make one step."""
-        self.paused, self._owed = True, min(self._owed + 1, self.horizon)
+        self.paused, self._steps_due = True, min(self._steps_due + 1, self.horizon)
 
     def one_episode(self) -> None:
         """Pause and run to the end of this episode, or of the next if it has ended, at full speed."""
-        self.paused, self._owed = True, self.horizon - self.steps % self.horizon
+        self.paused, self._steps_due = True, self.horizon - self.steps % self.horizon
 
     def change_speed(self, speed: float) -> None:
         self.speed = speed
@@ -213,7 +214,7 @@ class PlayGame:
             "optimum": round(self.optimum, 2),
             "path": [[0, "start"], *([cell, cause] for cell, cause in self.path)],
             "p": self.p,
-            "law": None if self.law == _UNIFORM else self.law.index(1.0),
+            "law": None if self.override_probs == _UNIFORM else self.override_probs.index(1.0),
             "held": self._held if self._clock() < self._held_until else None,
             "speed": self.speed,
             "paused": self.paused,
@@ -235,8 +236,8 @@ _UNIFORM = (1.0 / ACTIONS,) * ACTIONS
 
 
 @functools.lru_cache(maxsize=4096)
-def _optimum(size: int, horizon: int, goal: int, p: float, law: tuple[float, ...]) -> float:
-    h = Hypotheses(size, horizon, np.array([goal]), np.array([p]), np.array([law]))
+def _optimum(size: int, horizon: int, goal: int, p: float, override_probs: tuple[float, ...]) -> float:
+    h = Hypotheses(size, horizon, np.array([goal]), np.array([p]), np.array([override_probs]))
     return float(optimal_returns(h)[0])
 
 
@@ -252,7 +253,7 @@ def _action(game: PlayGame, value: object) -> int:
     return value
 
 
-def _maybe(game: PlayGame, value: object) -> int | None:
+def _action_or_none(game: PlayGame, value: object) -> int | None:
     return None if value is None else _action(game, value)
 
 
@@ -274,14 +275,14 @@ def _flag(game: PlayGame, value: object) -> bool:
 COMMANDS: dict[str, tuple[Callable[[PlayGame, object], Any] | None, Callable[..., None]]] = {
     "goal": (_cell, PlayGame.move_goal),
     "p": (_number(0.0, 1.0, "p"), PlayGame.override),
-    "law": (_maybe, PlayGame.choose_law),
-    "push": (_action, PlayGame.push),
-    "hold": (_maybe, PlayGame.hold),
+    "law": (_action_or_none, PlayGame.choose_distribution),
+    "push": (_action, PlayGame.override_once),
+    "hold": (_action_or_none, PlayGame.hold),
     "speed": (_number(*SPEEDS, "speed"), PlayGame.change_speed),
     "pause": (_flag, PlayGame.pause),
     "keep": (_flag, PlayGame.keep_context),
     "step": (None, PlayGame.one_step),
     "episode": (None, PlayGame.one_episode),
-    "new": (None, PlayGame.renew),
+    "new": (None, PlayGame.restart),
 }
 """Commands of a viewer by name: the check of the value (None if there is no value), and the method to call."""

@@ -1,4 +1,4 @@
-"""Labels of Dark Room: query states and action windows of any history, labelled exactly."""
+"""Labels of Dark Room: query states and action windows for any trajectory, with exact labels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from icrl_dist.types import Identity, Job, Variation
 
 @dataclass(frozen=True)
 class RoomLabelling:
-    """What a job needs to label query states in rooms."""
+    """Settings by which a job labels query states in rooms."""
 
     labels: Literal["soft", "sampled", "heuristic"]
     """As ``DarkRoomConfig.labels``."""
@@ -30,11 +30,11 @@ class RoomLabelling:
     slack: NotNegativeFloat
     """As ``DarkRoomConfig.label_slack``."""
     queries: Positive
-    """Query states a trajectory."""
+    """Query states per trajectory."""
     window: Positive
-    """States of an action window."""
+    """States per action window."""
     windows: NotNegative
-    """Action windows a trajectory."""
+    """Action windows per trajectory."""
     decoy_fraction: Share
     """Share of the windows in which the optimal policy of another goal acts."""
     decoys: tuple[int, ...]
@@ -46,12 +46,12 @@ NO_WINDOWS = np.zeros(0, np.int16), np.zeros(0, np.float32)
 
 
 def labels_of(hypotheses: Hypotheses, labels: str, gamma: float, slack: float) -> Float32[np.ndarray, "M C A"]:
-    """pi*_{tau,phi} of every hypothesis as a label in every cell (eq. 5), or the paper's heuristic."""
+    """The labels of every hypothesis in every cell: pi*_{tau,phi} (eq. 5), or the paper's heuristic."""
     return heuristic_labels(hypotheses) if labels == "heuristic" else soft_labels(hypotheses, gamma, slack)
 
 
 class RoomLabeller:
-    """Random query states of each trajectory's variation, and action windows from random states on, with labels."""
+    """Draws query states and action windows of each trajectory's variation, from random states, and labels them."""
 
     def __init__(self, job: Job, labelling: RoomLabelling) -> None:
         self._job, self._labelling = job, labelling
@@ -71,9 +71,9 @@ class RoomLabeller:
     def __call__(self, identities: Sequence[Identity], rngs: Sequence[np.random.Generator]) -> list[LabelledQueries]:
         """The labelled queries of each trajectory, drawn with its own generator."""
         rows = np.array([self._row[identity.task, identity.variation] for identity in identities])
-        alone = [self._queries(row, rng) for row, rng in zip(rows.tolist(), rngs, strict=True)]
+        single = [self._queries(row, rng) for row, rng in zip(rows.tolist(), rngs, strict=True)]
         if not self._labelling.windows:
-            return alone
+            return single
         states, taken, gained = self._windows(rows, rngs)
         labels = self._table[rows[:, None], cell_numbers(states, self._size)]
         if self._labelling.labels == "sampled":
@@ -87,11 +87,11 @@ class RoomLabeller:
                 gained[b],
                 one.origin,
             )
-            for b, one in enumerate(alone)
+            for b, one in enumerate(single)
         ]
 
     def _queries(self, row: int, rng: np.random.Generator) -> LabelledQueries:
-        """Single query states of one variation."""
+        """Query states of one variation that belong to no window, with labels."""
         query = rng.integers(0, len(self._cells), size=self._labelling.queries)
         labels = self._table[row, query]
         if self._labelling.labels == "sampled":
@@ -100,23 +100,24 @@ class RoomLabeller:
         return LabelledQueries(self._cells[query], labels, *NO_WINDOWS, origin)
 
     def _windows(
-        self, place: Int[np.ndarray, " B"], rngs: Sequence[np.random.Generator]
+        self, row: Int[np.ndarray, " B"], rngs: Sequence[np.random.Generator]
     ) -> tuple[Float32[np.ndarray, "B R S"], Int16[np.ndarray, "B R"], Float32[np.ndarray, "B R"]]:
-        """States, actions and rewards of each row's action windows, one after another, from random states on.
+        """States, actions and rewards of each trajectory's action windows, one after another; each starts in a random state.
 
-        The labelling policy acts, or in a decoy the optimal policy of another goal.
+        The policy of the labels acts, or in a decoy the optimal policy of another goal.  ``row``: the
+        trajectories' rows of ``Job.variations``.
         """
         of = self._labelling
         drawn = [(rng.random(of.windows), rng.integers(0, len(self._decoys), size=of.windows)) for rng in rngs]
         u, decoy = (np.concatenate(column) for column in zip(*drawn, strict=True))
-        rows = place.repeat(of.windows)
-        policy = np.where((u < of.decoy_fraction)[:, None, None], self._decoys[decoy], self._table[rows])
-        short = [self._job.variations[p] for p in rows.tolist()]
-        short = [Variation(v.task.replace(start="random", horizon=of.window), v.adversary) for v in short]
-        repeated = [rng for rng in rngs for _ in range(of.windows)]
-        ran = episode(DarkRoom(short), OptimalAgent(policy, self._size), repeated)
-        states = ran.observations[:, :-1].reshape(len(place), of.windows * of.window, -1)
-        return states, ran.actions.reshape(len(place), -1), ran.rewards.reshape(len(place), -1)
+        repeated_row = row.repeat(of.windows)
+        policy = np.where((u < of.decoy_fraction)[:, None, None], self._decoys[decoy], self._table[repeated_row])
+        variations = [self._job.variations[r] for r in repeated_row.tolist()]
+        short = [Variation(v.task.replace(start="random", horizon=of.window), v.adversary) for v in variations]
+        repeated_rng = [rng for rng in rngs for _ in range(of.windows)]
+        ran = episode(DarkRoom(short), OptimalAgent(policy, self._size), repeated_rng)
+        states = ran.observations[:, :-1].reshape(len(row), of.windows * of.window, -1)
+        return states, ran.actions.reshape(len(row), -1), ran.rewards.reshape(len(row), -1)
 
 
 def _one_hot(labels: Float32[np.ndarray, "Q A"], u: np.ndarray) -> Float32[np.ndarray, "Q A"]:

@@ -1,4 +1,4 @@
-"""What live views show of a Dark Room: an episode as a drawing, and the optimum of a variation."""
+"""Dark Room in live views: the drawing of an episode, and the optimum of a variation."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_values
 from icrl_dist.types import Adversary, Task, Variation
 
 _LARGEST_DRAWN = 256
+"""Maximum size of a room that is drawn."""
 _LARGEST_SOLVED, _LONGEST_SOLVED = 32, 1000
-"""For larger rooms and longer episodes the optimum is not computed."""
+"""Maximum size and horizon of a room whose optimum is computed."""
 
 
 def drawing(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
-    """A ``room`` drawing: ``size``, ``goal``, ``path`` (cells, one more than steps), ``overridden`` (one a step).
+    """A ``room`` drawing: ``size``, ``goal``, ``path`` (cells, one more than steps), ``overridden`` (one per step).
 
     Raises ValueError for values that describe no room.
     """
@@ -31,9 +32,9 @@ def drawing(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], 
 
 
 def message_optimum(task: Mapping[str, Any], adversary: Mapping[str, Any]) -> float | None:
-    """The optimal undiscounted return of a variation, averaged over its start cells.
+    """Expected undiscounted return of the optimal policy of a variation, averaged over its start cells.
 
-    None if the message describes no room or no adversary, or if the room is too large.
+    None if the message does not describe a room and an adversary, or if the room is too large.
     """
     size, horizon = task.get("size"), task.get("horizon")
     if not isinstance(size, int) or not isinstance(horizon, int):
@@ -50,7 +51,7 @@ def message_optimum(task: Mapping[str, Any], adversary: Mapping[str, Any]) -> fl
         best = float(values.mean() if start == "random" else values[int(start[0]) * size + int(start[1])])
         return best if math.isfinite(best) else None
     except (ValueError, KeyError, TypeError, IndexError, ArithmeticError):
-        return None  # a message may hold anything
+        return None  # messages are not validated before
 
 
 def _value(value: Any) -> Any:

@@ -42,11 +42,11 @@ ORACLE = "oracle"
 
 
 class ExactRoom:
-    """Exact answers of one kind of room."""
+    """Exact solutions of variations of rooms with this section of a run file."""
 
     def __init__(self, config: DarkRoomConfig) -> None:
         self._config = config
-        self._known: dict[Adversary, tuple[Hypotheses, Float32[np.ndarray, "M C A"]]] = {}
+        self._by_adversary: dict[Adversary, tuple[Hypotheses, Float32[np.ndarray, "M C A"]]] = {}
 
     def optimum(self, variations: Sequence[Variation]) -> Float64[np.ndarray, " M"]:
         """Expected return of the optimal policy from the origin, by value iteration."""
@@ -62,7 +62,7 @@ class ExactRoom:
         return good
 
     def agent(self, run: Run, rule: str) -> MakePolicy:
-        """The exact agent that knows every row's adversary; each cell is the goal with equal probability."""
+        """The exact agent, which is given every row's adversary; its prior over goals is uniform over all cells."""
 
         def make(rows: Sequence[Variation], env: Batch) -> ExactAgent:
             adversaries = list(dict.fromkeys(v.adversary for v in rows))
@@ -73,15 +73,15 @@ class ExactRoom:
         return make
 
     def _any_goal(self, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
-        """Every goal under this adversary, with its labels; the newest adversaries are kept."""
-        if adversary not in self._known:
+        """One hypothesis per goal under this adversary, with their labels; cached for the latest 64 adversaries."""
+        if adversary not in self._by_adversary:
             size, horizon = self._config.size, self._config.horizon
             goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
             hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
-            self._known[adversary] = hypotheses, soft_labels(hypotheses, self._config.gamma, self._config.label_slack)
-            if len(self._known) > 64:
-                del self._known[next(iter(self._known))]
-        return self._known[adversary]
+            self._by_adversary[adversary] = hypotheses, soft_labels(hypotheses, self._config.gamma, self._config.label_slack)
+            if len(self._by_adversary) > 64:
+                del self._by_adversary[next(iter(self._by_adversary))]
+        return self._by_adversary[adversary]
 
 
 class DarkRoomProblem(Problem):
@@ -90,7 +90,7 @@ class DarkRoomProblem(Problem):
     section = "darkroom"
     Config = DarkRoomConfig
     Labelling = RoomLabelling
-    earns_in_contexts: ClassVar[bool] = False  # a random walk may never meet the goal
+    earns_in_contexts: ClassVar[bool] = False  # a random walk may miss the goal in every episode
     config: DarkRoomConfig
 
     def spec_of(self, task: Task) -> Spec:
@@ -105,7 +105,7 @@ class DarkRoomProblem(Problem):
         return round(self.config.train_fraction * self.config.size**2)
 
     def make_split(self) -> Split:
-        """All goals, shuffled by ``split_seed``, cut at ``train_fraction``."""
+        """All goals, shuffled with ``split_seed``; the first ``train_fraction`` of them are training tasks."""
         of = self.config
         goals = [(x, y) for x in range(of.size) for y in range(of.size)]
         order = generator(of.split_seed, RandomKey.SPLIT).permutation(len(goals))
@@ -116,14 +116,14 @@ class DarkRoomProblem(Problem):
         return room.DarkRoom(variations)
 
     def at_test_start(self, task: Task) -> Task:
-        """Every test episode starts in the origin (appendix C.1)."""
+        """Test episodes start in the origin (appendix C.1)."""
         return task.replace(start=(0, 0))
 
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
         return adversary_set(rng, config.count, room.ACTIONS, config.p_max)
 
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
-        """``uniform``: q_b = 1/5 (Figures 3c, 6c); ``unseen``: a Dirichlet prior never trained on (Figures 3d, 6d)."""
+        """``uniform``: q_b = 1/5 (Figures 3c, 6c); ``unseen``: a newly drawn Dirichlet adversary (Figures 3d, 6d)."""
         if prior == "uniform":
             return Adversary.of("uniform", p=strength)
         return sample_dirichlet(rng, room.ACTIONS, 1.0).replace(p=strength)
@@ -147,7 +147,7 @@ class DarkRoomProblem(Problem):
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
 
     def references(self, run: Run) -> dict[str, Reference]:
-        """A random policy, the exact agent by each rule, and the oracle that knows goal and adversary."""
+        """A random policy, the exact agent of each rule, and the oracle, which is given goal and adversary."""
 
         def random(rows: Sequence[Variation], env: Batch) -> Policy:
             return RandomPolicy(room.ACTIONS)
@@ -162,7 +162,7 @@ class DarkRoomProblem(Problem):
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         of = self.config
         if not 0 < self.train_count < of.size**2:
-            yield "darkroom.train_fraction", of.train_fraction, "leave goals to train and to test"
+            yield "darkroom.train_fraction", of.train_fraction, "leave at least one goal to train on and one to test on"
         for name in run.pretrain.behaviors:
             if name not in KINDS:
                 yield "pretrain.behaviors", run.pretrain.behaviors, f"choose from {', '.join(KINDS)}"
@@ -184,7 +184,7 @@ class DarkRoomProblem(Problem):
 
     @property
     def behavior(self) -> MakeBehavior:
-        """Walks through the room, one named kind a row."""
+        """Walks through the room: one behavior policy per row."""
 
         def walks(names: Sequence[str], rngs: Sequence[np.random.Generator], env: Batch) -> Policy:
             return Walks(round(env.spec.high[0]) + 1, env.spec.horizon, names, rngs)
@@ -207,14 +207,14 @@ class DarkRoomProblem(Problem):
 
     @property
     def posterior(self) -> Any:
-        """The comparison with the exact posterior (``problems.darkroom.divergence``)."""
+        """The comparison with the exact posterior."""
         from icrl_dist.problems.darkroom.divergence import PosteriorSuite
 
         return PosteriorSuite(self.config)
 
     @property
     def game(self) -> Any:
-        """``icrl-dist play`` in a room (``problems.darkroom.game``)."""
+        """The interactive room of ``icrl-dist play``."""
         from icrl_dist.problems.darkroom.game import PlayGame
 
         return PlayGame

@@ -1,7 +1,7 @@
-"""Dark Room (appendix C.1): a hidden goal in a square room, reward on every step spent on it.
+"""The environment Dark Room (appendix C.1): a hidden goal in a square room, reward 1 for every step on it.
 
-The unit of work is a batch of variations stepped together in numpy.  Each row draws from its
-own generator, so a row's episode is the same whatever stands beside it in the batch.
+A batch of variations is stepped together in numpy.  Each row draws from its own generator, so a
+row's episode does not depend on the other rows.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ def check(task: Task) -> None:
 
 
 def spec(task: Task) -> Spec:
-    """Shape of the room: two coordinates, five actions."""
+    """Spec of the room: two coordinates, five actions."""
     size = task.number("size")
     return Spec(low=(0.0, 0.0), high=(size - 1.0, size - 1.0), actions=ACTIONS, horizon=int(task.number("horizon")))
 
 
 def cells(size: int) -> Float[np.ndarray, "C 2"]:
-    """All C = size^2 cells as ``(x, y)``, cell number x * size + y."""
+    """All C = size^2 cells as ``(x, y)``; the number of a cell is x * size + y."""
     x, y = np.divmod(np.arange(size * size), size)
     return np.stack([x, y], axis=1).astype(np.float32)
 
 
 def next_cell(size: int) -> Int[np.ndarray, "C A"]:
-    """Number of the cell that each action leads to from each cell; walls stop a move."""
+    """Number of the cell that each action leads to from each cell; a move into a wall changes nothing."""
     moved = np.clip(cells(size).astype(np.int64)[:, None, :] + MOVES[None], 0, size - 1)
     table: np.ndarray = moved[..., 0] * size + moved[..., 1]
     return table
@@ -83,25 +83,25 @@ class DarkRoom:
         self._goal = np.array([int(g[0]) * size + int(g[1]) for g in (t.vector("goal") for t in tasks)])
         starts = [t.get("start", "random") for t in tasks]
         self._start = np.array([-1 if isinstance(s, (str, int, float)) else int(s[0]) * size + int(s[1]) for s in starts])
-        laws = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
-        self._p = np.array([laws[v.adversary][0] for v in variations])
-        # One uniform number u decides a step: u < p overrides, and u / p picks the action.
-        self._edges = np.stack([laws[v.adversary][0] * np.cumsum(laws[v.adversary][1])[:-1] for v in variations])
+        overrides = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
+        self._p = np.array([overrides[v.adversary][0] for v in variations])
+        # One uniform number u per step: if u < p the adversary overrides, and u / p selects its action.
+        self._edges = np.stack([overrides[v.adversary][0] * np.cumsum(overrides[v.adversary][1])[:-1] for v in variations])
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float[np.ndarray, "B S"]:
-        """Start an episode in every row, all of whose chance is drawn here, row by row."""
+        """Start an episode in every row; all random numbers of the episode are drawn here, row by row."""
         if len(rngs) != self.batch:
             raise ValueError(f"darkroom: {len(rngs)} generators for {self.batch} rows")
-        chance = np.stack([rng.random(1 + self.spec.horizon) for rng in rngs], axis=1)
-        drawn = (chance[0] * len(self._cells)).astype(np.int64)
-        self._noise: Float64[np.ndarray, "H B"] = chance[1:]
-        self._cell = np.where(self._start >= 0, self._start, drawn)
+        u = np.stack([rng.random(1 + self.spec.horizon) for rng in rngs], axis=1)
+        random_start = (u[0] * len(self._cells)).astype(np.int64)
+        self._noise: Float64[np.ndarray, "H B"] = u[1:]
+        self._cell = np.where(self._start >= 0, self._start, random_start)
         self._h = 0
         observation: np.ndarray = self._cells[self._cell]
         return observation
 
     def step(self, actions: Int[np.ndarray, " B"]) -> Step:
-        """Act in every row.  Raises RuntimeError past the horizon or before a reset."""
+        """Execute one action in every row.  Raises RuntimeError past the horizon or before a reset."""
         if self._h >= self.spec.horizon:
             raise RuntimeError(f"darkroom: stepped past the horizon of {self.spec.horizon}; call reset first")
         if actions.shape != (self.batch,) or actions.min() < 0 or actions.max() >= ACTIONS:
@@ -122,10 +122,10 @@ class DarkRoom:
         )
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The room from above, x to the right and y upwards: goal green, agent blue; 24 pixels a cell."""
+        """The room from above, x to the right and y upwards: goal green, agent blue; 24 pixels per cell."""
         size = round(len(self._cells) ** 0.5)
         room = np.full((size, size, 3), 235, np.uint8)
-        for cell, colour in ((self._goal[row], (45, 164, 78)), (self._cell[row], (31, 111, 235))):
+        for cell, color in ((self._goal[row], (45, 164, 78)), (self._cell[row], (31, 111, 235))):
             x, y = divmod(int(cell), size)
-            room[size - 1 - y, x] = colour
+            room[size - 1 - y, x] = color
         return room.repeat(24, axis=0).repeat(24, axis=1)

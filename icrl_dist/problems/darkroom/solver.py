@@ -1,7 +1,7 @@
-"""Exact answers for Dark Room: optimal values, labels, the posterior over (tau, phi).
+"""Exact solutions of Dark Room: optimal values, labels, the posterior over (tau, phi).
 
 A variation is a finite MDP with P = (1 - p) P_a + p sum_b q_b P_b, so value iteration is
-exact and takes milliseconds.  Everything here takes M hypotheses (goal, p, q) at once.
+exact and takes milliseconds.  All functions compute M hypotheses (goal, p, q) at once.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from icrl_dist.types import Trajectory, Variation
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """M variations of one room as arrays: what could be true of the environment.
+    """M variations of one room as arrays: the possible environments.
 
-    With a leading axis, of each row of a batch (only ``log_likelihood`` takes those).
+    With a leading axis each row of a batch has its own hypotheses; only ``log_likelihood`` accepts that.
     """
 
     size: int
@@ -40,13 +40,13 @@ class Hypotheses:
         if len(shapes) != 1:
             raise ValueError(f"hypotheses must share one size and horizon, not {sorted(shapes)}")
         (size, horizon) = shapes.pop()
-        known = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
-        laws = [known[v.adversary] for v in variations]
+        by_adversary = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
+        overrides = [by_adversary[v.adversary] for v in variations]
         goal = np.array([int(g[0]) * size + int(g[1]) for g in (v.task.vector("goal") for v in variations)])
-        return cls(size, horizon, goal, np.array([p for p, _ in laws]), np.stack([q for _, q in laws]))
+        return cls(size, horizon, goal, np.array([p for p, _ in overrides]), np.stack([q for _, q in overrides]))
 
     def rewards(self) -> Float64[np.ndarray, "M C"]:
-        """Reward of arriving in each cell."""
+        """Reward for entering each cell."""
         return (np.arange(self.size**2)[None, :] == self.goal[:, None]).astype(np.float64)
 
 
@@ -59,7 +59,7 @@ def _backup(h: Hypotheses, value: Float64[np.ndarray, "M C"], gamma: float) -> F
 
 
 def q_values(h: Hypotheses, gamma: float) -> Float64[np.ndarray, "M C A"]:
-    """Optimal action values with a full horizon to go, discounted by gamma."""
+    """Optimal action values at the start of an episode, discounted by gamma."""
     value = np.zeros((len(h.goal), h.size**2))
     for _ in range(h.horizon - 1):
         value = _backup(h, value, gamma).max(axis=2)
@@ -67,7 +67,7 @@ def q_values(h: Hypotheses, gamma: float) -> Float64[np.ndarray, "M C A"]:
 
 
 def optimal_values(h: Hypotheses) -> Float64[np.ndarray, "M C"]:
-    """Undiscounted return of the optimal policy from every cell."""
+    """Expected undiscounted return of the optimal policy from every cell."""
     value = np.zeros((len(h.goal), h.size**2))
     for _ in range(h.horizon):
         value = _backup(h, value, 1.0).max(axis=2)
@@ -75,15 +75,15 @@ def optimal_values(h: Hypotheses) -> Float64[np.ndarray, "M C"]:
 
 
 def optimal_returns(h: Hypotheses, start: Sequence[int] = (0, 0)) -> Float64[np.ndarray, " M"]:
-    """The same from ``start``: the ceiling of every agent."""
+    """Expected undiscounted return of the optimal policy from ``start``, which no agent can exceed."""
     best: np.ndarray = optimal_values(h)[:, int(start[0]) * h.size + int(start[1])]
     return best
 
 
 def soft_labels(h: Hypotheses, gamma: float, slack: float) -> Float32[np.ndarray, "M C A"]:
-    """pi*_{tau,phi} as a label: uniform over the actions within ``slack`` of the best (eq. 5).
+    """pi*_{tau,phi} as a label: uniform over the actions whose value is within ``slack`` of the best (eq. 5).
 
-    Without slack the model would be asked to learn tie-breaks that cost nothing.
+    Without slack the model would have to learn differences between actions that hardly change the return.
     """
     q = q_values(h, gamma)
     good = q >= q.max(axis=2, keepdims=True) - slack
@@ -115,23 +115,23 @@ def log_likelihood(
     reward: Float[np.ndarray, " T"],
     arrived: Int[np.ndarray, " T"],
 ) -> Float64[np.ndarray, "T M"]:
-    """log P(s', r | s, a, tau, phi) of each transition under each hypothesis, both factors.
+    """log P(s', r | s, a, tau, phi) of each transition under each hypothesis.
 
-    -inf where a hypothesis is refuted.  The agent's own choice of a is left out: it is the
-    same under every hypothesis (Assumption E.1).  Every transition may have hypotheses of its
-    own, ``h.p (T, M)``.
+    -inf where the transition refutes the hypothesis.  The probability of the action is left out,
+    because it is the same under every hypothesis (Assumption E.1).  Every transition may have its
+    own hypotheses, ``h.p (T, M)``.
     """
     reached = next_cell(h.size)[cell] == arrived[:, None]
     overridden = (h.q @ reached[:, :, None].astype(np.float64))[..., 0]
-    chance = (1 - h.p) * reached[np.arange(len(cell)), action][:, None] + h.p * overridden
+    probability = (1 - h.p) * reached[np.arange(len(cell)), action][:, None] + h.p * overridden
     consistent = (arrived[:, None] == h.goal) == (reward[:, None] > 0.5)
     with np.errstate(divide="ignore"):
-        result: np.ndarray = np.log(chance * consistent)
+        result: np.ndarray = np.log(probability * consistent)
     return result
 
 
 def trajectory_log_likelihood(h: Hypotheses, trajectory: Trajectory) -> Float64[np.ndarray, " M"]:
-    """log P(xi | tau, phi) of a whole trajectory, up to the agent's own choices."""
+    """log P(xi | tau, phi) of a whole trajectory, without the probabilities of the agent's actions."""
     cell = cell_numbers(trajectory.observations, h.size)
     steps = log_likelihood(h, cell[:-1], trajectory.actions.astype(np.int64), trajectory.rewards, cell[1:])
     total: np.ndarray = steps.sum(axis=0)
@@ -143,7 +143,7 @@ def posterior(log_prior: Float64[np.ndarray, " M"], loglik: Float64[np.ndarray, 
     logits = log_prior + loglik
     top = logits.max(axis=-1, keepdims=True)
     if not np.isfinite(top).all():
-        raise ValueError("the context has probability 0 under every hypothesis: is the room or the adversary set wrong?")
+        raise ValueError("the context has probability 0 under every hypothesis: check the room and the set of adversaries")
     weight = np.exp(logits - top)
     result: np.ndarray = weight / weight.sum(axis=-1, keepdims=True)
     return result
@@ -154,5 +154,5 @@ def posterior_action(
     labels: Float32[np.ndarray, "M C A"],
     cell: Int[np.ndarray, " B"],
 ) -> Float64[np.ndarray, "B A"]:
-    """P(a* | s_query, D): what a perfectly pretrained T_theta would output (Theorem E.3)."""
+    """P(a* | s_query, D): the output of a perfectly pretrained T_theta (Theorem E.3)."""
     return np.einsum("bm,mba->ba", belief, labels[:, cell].astype(np.float64))

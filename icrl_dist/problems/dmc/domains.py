@@ -11,25 +11,26 @@ from icrl_dist.config.toml import nearest
 from icrl_dist.types import Spec, Task
 
 HORIZON = 200
-"""Steps an episode (appendix C.3)."""
+"""Steps per episode (appendix C.3)."""
 GRID = 8
-"""Values of each parameter: an 8x8 grid, of which the central 4x4 is trained on (appendix D.4)."""
+"""Values of each parameter: the tasks form an 8x8 grid, and its central 4x4 are training tasks (appendix D.4)."""
 
 Preset = Literal["paper", "qarl"]
-"""Which forces: Table 2's, or those of QARL's code, on other bodies and sometimes far stronger."""
+"""Source of the adversary's forces: Table 2, or QARL's code, which has other bodies and some far larger forces."""
 
 Component = tuple[str, str]
-"""A body, and the axes on which a force acts: x, y, z, or X, Y, Z for a torque about one."""
+"""A body, and the axes of the force on it: x, y, z; or X, Y, Z for a torque about that axis."""
 AXES = "xyzXYZ"
+"""All axes in MuJoCo's order: three forces, three torques."""
 
 
 @dataclass(frozen=True)
 class Forces:
-    """Where an adversary pushes."""
+    """The forces that an adversary applies."""
 
     components: tuple[Component, ...]
     largest: float
-    """Newtons (newton metres for a torque) at an adversary's action of 1."""
+    """Newtons (newton meters for a torque) for an adversary's action of 1."""
 
     @property
     def count(self) -> int:
@@ -48,13 +49,13 @@ class Parameter:
     """The body whose mass it is; None for friction."""
 
     def grid(self) -> tuple[float, ...]:
-        """Its ``GRID`` values, evenly spaced."""
+        """The parameter's ``GRID`` values, evenly spaced."""
         return tuple(float(round(value, 9)) for value in np.linspace(self.low, self.high, GRID))
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A domain of the suite, one of its tasks, and how it is varied."""
+class DomainTask:
+    """One task of one domain of the suite, with the forces and parameters by which it is varied."""
 
     domain: str
     task: str
@@ -63,7 +64,7 @@ class Problem:
     actions: int
     """Components of the agent's action."""
     scale: tuple[float, ...]
-    """What an observation component seldom passes, up or down: a spec's range, to which it is clipped."""
+    """Bound of each observation component's absolute value, which is seldom exceeded; observations are clipped to it."""
 
 
 _CARTPOLE: dict[Preset, Forces] = {"paper": Forces((("pole_1", "xz"),), 0.005), "qarl": Forces((("pole_1", "xz"),), 2.0)}
@@ -85,33 +86,34 @@ def _both(forces: Forces) -> dict[Preset, Forces]:
     return {"paper": forces, "qarl": forces}
 
 
-def _cartpole(task: str, low: float, high: float) -> Problem:
+def _cartpole(task: str, low: float, high: float) -> DomainTask:
     masses = (Parameter("pole_mass", low, high, "pole_1"), Parameter("cart_mass", 0.5, 1.5, "cart"))
-    return Problem("cartpole", task, _CARTPOLE, masses, 1, (2.0, 1.0, 1.0, 10.0, 20.0))
+    return DomainTask("cartpole", task, _CARTPOLE, masses, 1, (2.0, 1.0, 1.0, 10.0, 20.0))
 
 
-def _hopper(task: str) -> Problem:
+def _hopper(task: str) -> DomainTask:
     parameters = (Parameter("torso_mass", 1.0, 9.0, "torso"), _friction(0.1, 1.9))
-    return Problem("hopper", task, _HOPPER, parameters, 4, (1.5, 8.0, 1.0, 3.0, 3.0, 1.0, 5.0, 10.0, *(30.0,) * 5, 10.0, 10.0))
+    scale = (1.5, 8.0, 1.0, 3.0, 3.0, 1.0, 5.0, 10.0, *(30.0,) * 5, 10.0, 10.0)
+    return DomainTask("hopper", task, _HOPPER, parameters, 4, scale)
 
 
-def _quadruped(task: str) -> Problem:
+def _quadruped(task: str) -> DomainTask:
     parameters = (Parameter("torso_mass", 65.0, 75.0, "torso"), _friction(0.95, 1.05))
     scale = (*(1.5,) * 16, *(20.0,) * 16, *(1.0,) * 12, *(8.0,) * 3, 1.0, *(200.0,) * 3, *(12.0,) * 3, *(10.0,) * 24)
-    return Problem("quadruped", task, _QUADRUPED, parameters, 12, scale)
+    return DomainTask("quadruped", task, _QUADRUPED, parameters, 12, scale)
 
 
-def _reacher(task: str) -> Problem:
+def _reacher(task: str) -> DomainTask:
     masses = (Parameter("arm_mass", 0.02, 0.06, "arm"), Parameter("hand_mass", 0.02, 0.05, "hand"))
-    return Problem("reacher", task, _both(_REACHER), masses, 2, (15.0, 3.5, 0.5, 0.5, 15.0, 15.0))
+    return DomainTask("reacher", task, _both(_REACHER), masses, 2, (15.0, 3.5, 0.5, 0.5, 15.0, 15.0))
 
 
-def _walker(task: str) -> Problem:
+def _walker(task: str) -> DomainTask:
     parameters = (Parameter("torso_mass", 5.0, 15.0, "torso"), _friction(0.1, 1.3))
-    return Problem("walker", task, _both(_WALKER), parameters, 6, (*(1.0,) * 14, 2.0, 10.0, 10.0, 40.0, *(60.0,) * 6))
+    return DomainTask("walker", task, _both(_WALKER), parameters, 6, (*(1.0,) * 14, 2.0, 10.0, 10.0, 40.0, *(60.0,) * 6))
 
 
-_CHEETAH_RUN = Problem(
+_CHEETAH_RUN = DomainTask(
     "cheetah",
     "run",
     _both(_CHEETAH),
@@ -120,7 +122,7 @@ _CHEETAH_RUN = Problem(
     (1.0, 7.0, *(1.5,) * 6, 15.0, 10.0, 15.0, *(35.0,) * 6),
 )
 
-PROBLEMS: dict[str, Problem] = {
+PROBLEMS: dict[str, DomainTask] = {
     f"dmc-{problem.domain}-{problem.task}": problem
     for problem in (
         _cartpole("balance", 1.0, 20.0),
@@ -132,21 +134,22 @@ PROBLEMS: dict[str, Problem] = {
         *map(_walker, ("walk", "run")),
     )
 }
-"""By the kind of their tasks."""
+"""All problems by name, which is the ``kind`` of their tasks."""
 
 
-def problem(kind: str) -> Problem:
-    """Raises ValueError for an unknown one, with the nearest name."""
+def problem(kind: str) -> DomainTask:
+    """The problem of this name.  Raises ValueError, with the nearest name, for an unknown one."""
     if kind not in PROBLEMS:
         raise ValueError(f"task {kind!r}: no such problem{nearest(kind, tuple(PROBLEMS))}; known: {', '.join(PROBLEMS)}")
     return PROBLEMS[kind]
 
 
 def task(kind: str, **settings: object) -> Task:
-    """A task of this problem; a parameter that is not given is the suite's own.
+    """A task of this problem; a parameter that is not given has the suite's value.
 
-    ``settings``: the problem's two parameters; ``horizon``, steps; ``forces``, a ``Preset``;
-    ``mass``, ``rescaled`` or ``qarl`` (see ``dmc.DMC``).  Raises ValueError as ``check`` does.
+    ``settings``: the problem's two parameters; ``horizon``, steps; ``forces``, a ``Preset``; ``mass``:
+    ``rescaled``, a changed mass also changes the body's inertia, or ``qarl``, it does not.  Raises
+    ValueError as ``check`` does.
     """
     made = Task.of(kind, **settings)
     check(made)
@@ -154,7 +157,7 @@ def task(kind: str, **settings: object) -> Task:
 
 
 def check(task: Task) -> None:
-    """Raises ValueError, naming the value, unless the task is one of the problem's."""
+    """Raises ValueError, with the value, unless the task is one of the problem's."""
     parameters = {one.name: one for one in problem(task.kind).parameters}
     choices = {"forces": ("paper", "qarl"), "mass": ("rescaled", "qarl")}
     known = [*parameters, "horizon", *choices]
@@ -173,7 +176,7 @@ def check(task: Task) -> None:
 
 
 def spec(task: Task) -> Spec:
-    """Shape of the problem, observation components each within its ``Problem.scale``."""
+    """Spec of the task; ``DomainTask.scale`` is the range of its observations."""
     check(task)
     one = problem(task.kind)
     horizon = int(task.number("horizon")) if "horizon" in dict(task.params) else HORIZON
@@ -181,9 +184,9 @@ def spec(task: Task) -> Spec:
 
 
 def grid(kind: str, central: int = GRID) -> tuple[Task, ...]:
-    """The tasks of the central part of the problem's 8x8 grid, the first parameter the slower: 4 for those of pretraining."""
+    """The tasks of the central ``central`` x ``central`` part of the problem's grid; the second parameter varies fastest."""
     if not (0 < central <= GRID and (GRID - central) % 2 == 0):
-        raise ValueError(f"grid of {central}x{central}: use an even number up to {GRID}, which has a centre in {GRID}x{GRID}")
+        raise ValueError(f"grid of {central}x{central}: use an even number up to {GRID}, which has a center in {GRID}x{GRID}")
     one, other = problem(kind).parameters
     kept = slice((GRID - central) // 2, (GRID + central) // 2)
     return tuple(task(kind, **{one.name: a, other.name: b}) for a in one.grid()[kept] for b in other.grid()[kept])

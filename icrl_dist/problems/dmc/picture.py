@@ -1,4 +1,4 @@
-"""Stick figures of DeepMind Control, from what is observed: MuJoCo's kinematics place the limbs."""
+"""Stick figures of DeepMind Control: MuJoCo's kinematics compute the limbs' positions from observations."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from icrl_dist.problems.dmc.simulation import suite_environment
 
 _CAPSULE, _BOX, _ELLIPSOID = (getattr(mujoco.mjtGeom, f"mjGEOM_{kind}").value for kind in ("CAPSULE", "BOX", "ELLIPSOID"))
 _TARGET_ARM = 0.03
-"""Half the width of the cross that stands for reacher's target, in metres."""
+"""Half the width of the cross at reacher's target, in meters."""
 
 
 def sticks(kind: str, states: Float32[np.ndarray, "F S"]) -> list[list[list[float]]]:
-    """F frames of a problem's observations, each a list of segments ``[x0, y0, x1, y1]`` in metres.
+    """F observations of a problem as frames, each a list of segments ``[x0, y0, x1, y1]`` in meters.
 
-    From the side; reacher and quadruped from above.  Where the body stands is not observed: the
-    figure stays where it is.
+    The view is from the side; for reacher and quadruped from above.  Observations do not contain the
+    position of the body, so the figure does not move forward.
     """
     figure = _figure(kind)
     return [figure.frame(state) for state in states.astype(np.float64)]
@@ -38,10 +38,10 @@ def _figure(kind: str) -> Figure:
 
 
 class Figure:
-    """One problem's limbs."""
+    """The limbs of one problem's body."""
 
     def __init__(self, kind: str) -> None:
-        self._env: Any = suite_environment(kind)  # it owns the model
+        self._env: Any = suite_environment(kind)  # keeps the model alive
         self._model, self._domain = self._env.physics.model.ptr, problem(kind).domain
         self._data = mujoco.MjData(self._model)
         self.step_s: float = self._env.control_timestep()
@@ -50,7 +50,7 @@ class Figure:
         self._geoms = np.flatnonzero(limbs)
         capsule = self._model.geom_type[self._geoms] == _CAPSULE
         self._half = np.where(capsule, self._model.geom_size[self._geoms, 1], self._model.geom_size[self._geoms, 0])
-        self._along = np.where(capsule, 2, 0)  # a capsule lies along its own z
+        self._along = np.where(capsule, 2, 0)  # a capsule's axis is its own z
         self._view = [0, 1] if self._domain in ("reacher", "quadruped") else [0, 2]
 
     def frame(self, state: Float[np.ndarray, " S"]) -> list[list[float]]:
@@ -68,7 +68,7 @@ class Figure:
         return rounded
 
     def _positions(self, state: Float[np.ndarray, " S"]) -> Float[np.ndarray, " Q"]:
-        """qpos, of what the observation says; what it leaves out stays as the model has it."""
+        """qpos of an observation; joints that it does not contain have the model's default."""
         qpos = self._model.qpos0.copy()
         if self._domain == "cartpole":
             qpos[:] = state[0], np.arctan2(state[2], state[1])
@@ -81,13 +81,13 @@ class Figure:
             absolute = np.arctan2(state[1:14:2], state[0:14:2])
             qpos[2] = absolute[0]
             parents = self._model.body_parentid[2:] - 1
-            qpos[3:] = absolute[parents] - absolute[1:]  # these joints turn about -y
+            qpos[3:] = absolute[parents] - absolute[1:]  # these joints rotate about -y
         else:
             hinges = self._model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE.value
             qpos[self._model.jnt_qposadr[hinges]] = state[: hinges.sum()]
         return qpos
 
     def _target(self, state: Float[np.ndarray, " S"]) -> Float[np.ndarray, "2 4"]:
-        """A cross where reacher's finger has to go."""
+        """A cross at the target of reacher's finger."""
         x, y = self._data.geom_xpos[self._model.geom("finger").id][:2] + state[2:4]
         return np.array([[x - _TARGET_ARM, y, x + _TARGET_ARM, y], [x, y - _TARGET_ARM, x, y + _TARGET_ARM]])

@@ -39,28 +39,28 @@ class DMCProblem(ContinuousProblem):
         return domains.problem(self.name).forces[self.config.forces].count
 
     def make_split(self) -> Split:
-        """Training tasks: the centre of the grid of parameters; test tasks: others of the grid, drawn by ``split_seed``."""
+        """Training tasks: the center of the grid of parameters; test tasks: others of the grid, drawn with ``split_seed``."""
         of = self.config
-        middle = domains.grid(self.name, math.isqrt(of.train_tasks))
-        others = [task for task in domains.grid(self.name) if task not in middle]
+        center = domains.grid(self.name, math.isqrt(of.train_tasks))
+        others = [task for task in domains.grid(self.name) if task not in center]
         order = generator(of.split_seed, RandomKey.SPLIT).permutation(len(others))
         outer = [others[i] for i in order[: of.test_tasks]]
         horizon = {"horizon": of.horizon} if of.horizon else {}
-        train, test = (tuple(task.replace(forces=of.forces, **horizon) for task in part) for part in (middle, outer))
+        train, test = (tuple(task.replace(forces=of.forces, **horizon) for task in part) for part in (center, outer))
         return Split(train, test)
 
     @property
     def evaluated(self) -> tuple[Task, ...]:
-        """As in the paper (appendix D.4) the tasks that the experts were trained in."""
+        """The training tasks, as in the paper (appendix D.4)."""
         return self.split.train
 
     def batch(self, variations: Sequence[Variation]) -> Batch:
-        from icrl_dist.problems.dmc.simulation import Variations  # MuJoCo takes a moment to import
+        from icrl_dist.problems.dmc.simulation import DMCVariations  # imported here because MuJoCo is slow to import
 
-        return Variations(variations)
+        return DMCVariations(variations)
 
     def references(self, run: Run) -> dict[str, Reference]:
-        """A random policy, and the experts of the undisturbed tasks where this machine has them."""
+        """A random policy, and the experts of the undisturbed tasks if they are in this node's cache."""
         experts = experts_of(self, run)
         return super().references(run) | ({} if experts is None else {EXPERT: Reference(experts, ceiling=True)})
 
@@ -72,9 +72,13 @@ class DMCProblem(ContinuousProblem):
         if of.histories == "scripted":
             yield "control.histories", of.histories, "only Meta-World has a scripted policy"
         if count not in (4, 16, 36):
-            yield "control.train_tasks", count, "the centre of the grid has 4, 16 or 36 tasks"
+            yield "control.train_tasks", count, "use 4, 16 or 36: the tasks are the center of the grid"
         elif of.test_tasks > _TASKS - count:
-            yield "control.test_tasks", of.test_tasks, f"the grid has {_TASKS - count} others"
+            yield (
+                "control.test_tasks",
+                of.test_tasks,
+                f"use at most {_TASKS - count}: the grid has no more tasks besides the training tasks",
+            )
 
     def title(self, tasks: int) -> str:
         return f"{tasks} training tasks of {self.name}"
@@ -91,9 +95,10 @@ class DMCProblem(ContinuousProblem):
 
 
 def _sticks(name: str, states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
-    """A ``sticks`` drawing: ``frames`` of segments ``[x0, y0, x1, y1]`` in metres, ``frame_s`` apart, ``force`` in 0..1."""
-    if states.shape[1] != len(domains.problem(name).scale):
-        raise ValueError(f"{states.shape[1]} observation components are not those of {name}")
+    """A ``sticks`` drawing: ``frames`` of segments ``[x0, y0, x1, y1]`` in meters, ``frame_s`` apart, ``force`` in 0..1."""
+    components = len(domains.problem(name).scale)
+    if states.shape[1] != components:
+        raise ValueError(f"{states.shape[1]} observation components: {name} has {components}")
     from icrl_dist.problems.dmc import picture
 
     force = [round(float(value), 3) for value in np.minimum(adversary, 1.0)]

@@ -1,8 +1,8 @@
-"""The DeepMind Control Suite as two-player games: the agent acts, an adversary pushes (appendix C.3).
+"""The DeepMind Control Suite in batches, with an adversary that applies forces (appendix C.3).
 
-Episodes begin as dm_control begins them.  A step is MuJoCo's own, ended as dm_control ends it, so
-that what is observed belongs to the state; observations and rewards are computed for the whole
-batch at once (``envs.suite``).
+Episodes start as in dm_control.  A step calls MuJoCo directly and ends as in dm_control, so that
+observations belong to the new state; observations and rewards of the whole batch are computed
+together (``suite.py``).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from jaxtyping import Float32, UInt8
 
 from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.dmc.domains import AXES, HORIZON, Preset, check, problem, spec
-from icrl_dist.problems.dmc.suite import BROKEN, DOMAINS, Rows, check_step, drawn, observed
+from icrl_dist.problems.dmc.suite import BROKEN, DOMAINS, Rows, check_step, observed, rendered
 from icrl_dist.types import Step, Task, Variation
 
 
 def suite_environment(kind: str) -> Any:
-    """dm_control's own environment of this problem, with the suite's parameters."""
-    os.environ.setdefault("MUJOCO_GL", "disabled")  # before dm_control looks for a display
+    """dm_control's environment of this problem, with the suite's parameters."""
+    os.environ.setdefault("MUJOCO_GL", "disabled")  # must be set before dm_control is imported, which looks for a display
     from dm_control import suite
 
     one = problem(kind)
@@ -31,10 +31,10 @@ def suite_environment(kind: str) -> Any:
 
 
 class DMC:
-    """B simulations of one problem, each of its own task: agent and adversary act together."""
+    """B simulations of one problem, each with its own task; agent and adversary act simultaneously."""
 
     def __init__(self, tasks: Sequence[Task]) -> None:
-        """Raises ValueError for unlike problems, and for a parameter outside its grid."""
+        """Raises ValueError for different problems, and for a parameter outside its grid."""
         shapes = {(one.kind, one.get("horizon", HORIZON), one.get("forces", "paper")) for one in tasks}
         if len(shapes) != 1:
             raise ValueError(f"dmc: one batch holds one problem, horizon and preset of forces, not {sorted(map(str, shapes))}")
@@ -45,7 +45,7 @@ class DMC:
         preset: Preset = "qarl" if tasks[0].get("forces", "paper") == "qarl" else "paper"
         self._forces = self._problem.forces[preset]
         self.disturbance = self._forces.count
-        """Components of an adversary's action."""
+        """Number of components of the adversary's action."""
         self._envs = [suite_environment(one.kind) for one in tasks]
         for env, one in zip(self._envs, tasks, strict=True):
             _vary(env.physics, one)
@@ -56,16 +56,16 @@ class DMC:
         views = ([data.ctrl for data in self._data], [data.xfrc_applied for data in self._data])
         self._each = list(zip(self._models, self._data, *views, strict=True))
         self._wrenches = np.zeros((self.batch, *views[1][0].shape))
-        pushed = [(self._rows.body(body), AXES.index(axis)) for body, axes in self._forces.components for axis in axes]
-        self._bodies, self._axes = (np.array(places) for places in zip(*pushed, strict=True))
+        components = [(self._rows.body(body), AXES.index(axis)) for body, axes in self._forces.components for axis in axes]
+        self._bodies, self._axes = (np.array(places) for places in zip(*components, strict=True))
         self._warnings = [data.warning.number for data in self._data]
         self._substeps = round(self._envs[0].control_timestep() / self._models[0].opt.timestep)
-        self._whole = self._models[0].opt.integrator == mujoco.mjtIntegrator.mjINT_RK4.value
+        self._runge_kutta = self._models[0].opt.integrator == mujoco.mjtIntegrator.mjINT_RK4.value
         self._low, self._high = (np.array(bound, np.float32) for bound in (self.spec.low, self.spec.high))
         self._h = self.spec.horizon
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
-        """Start an episode in every row, from that row's generator, as dm_control does."""
+        """Start an episode in every row as in dm_control, with the row's generator."""
         if len(rngs) != self.batch:
             raise ValueError(f"dmc: {len(rngs)} generators for {self.batch} rows")
         for env, rng in zip(self._envs, rngs, strict=True):
@@ -77,34 +77,34 @@ class DMC:
         self._shown = self._observe()
         return self._shown
 
-    def step(self, actions: Float32[np.ndarray, "B A"], pushes: Float32[np.ndarray, "B F"]) -> Step:
-        """Act in every row; ``pushes`` of 1 are the largest force of the preset.
+    def step(self, actions: Float32[np.ndarray, "B A"], forces: Float32[np.ndarray, "B F"]) -> Step:
+        """Execute the agent's and the adversary's action in every row; ``forces`` of 1 are the preset's largest force.
 
-        A simulation that diverges stands still, without reward, to the episode's end, and is
-        ``diverged`` from then on.  Raises ValueError for actions outside [-1, 1], RuntimeError
-        past the horizon or before a reset.
+        A simulation that diverges is not stepped any more: until the end of the episode it has the same
+        observation, reward 0 and ``diverged``.  Raises ValueError for actions outside [-1, 1],
+        RuntimeError past the horizon or before a reset.
         """
         check_step("dmc", self.spec, self.batch, self._h, actions)
-        self._wrenches[:, self._bodies, self._axes] = pushes * self._forces.largest
+        self._wrenches[:, self._bodies, self._axes] = forces * self._forces.largest
         each = zip(self._each, actions, self._wrenches, self._diverged.tolist(), strict=True)
-        for (model, data, control, push), action, wrench, diverged in each:
+        for (model, data, control, applied), action, wrench, diverged in each:
             if not diverged:
                 control[:] = action
-                push[:] = wrench
+                applied[:] = wrench
                 self._advance(model, data)
         self._h += 1
         self._diverged |= np.stack(self._warnings)[:, BROKEN].any(axis=1)
         reward = np.where(self._diverged, 0.0, self._reward(self._rows)).astype(np.float32)
         self._shown = np.where(self._diverged[:, None], self._shown, self._observe())
-        return Step(self._shown, reward, self._h == self.spec.horizon, pushes, self._diverged.copy())
+        return Step(self._shown, reward, self._h == self.spec.horizon, forces, self._diverged.copy())
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
-        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
-        return drawn(lambda: self._envs[row].physics.render(240, 320, camera_id=0))
+        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot render on this node."""
+        return rendered(lambda: self._envs[row].physics.render(240, 320, camera_id=0))
 
     def _advance(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """As dm_control steps: what depends on position and velocity is up to date before and after."""
-        if self._whole:
+        """Step as dm_control does: all quantities that depend on position and velocity are up to date before and after."""
+        if self._runge_kutta:
             mujoco.mj_step(model, data, self._substeps)
         else:
             mujoco.mj_step2(model, data)
@@ -117,10 +117,10 @@ class DMC:
 
 
 def _vary(physics: Any, task: Task) -> None:
-    """Set the task's masses and friction on the live model.
+    """Set the task's masses and friction in the compiled model.
 
-    A mass takes its body's inertia along, and what MuJoCo derives from it; with ``mass = "qarl"``
-    neither, as in QARL's code.
+    A new mass also scales the body's inertia, and MuJoCo's derived constants are updated; with
+    ``mass = "qarl"`` neither happens, as in QARL's code.
     """
     model, data = physics.model.ptr, physics.data.ptr
     for parameter in problem(task.kind).parameters:
@@ -138,28 +138,28 @@ def _vary(physics: Any, task: Task) -> None:
         mujoco.mj_setConst(model, data)
 
 
-class Variations:
-    """B variation environments: the game closed with every row's fixed adversary."""
+class DMCVariations:
+    """B variation environments: simulations in which every row has its fixed adversary."""
 
     def __init__(self, variations: Sequence[Variation]) -> None:
-        self.game = DMC([v.task for v in variations])
-        self.spec, self.batch = self.game.spec, self.game.batch
-        self._adversaries = Networks([v.adversary for v in variations], self.spec, self.game.disturbance)
-        self._seen: Float32[np.ndarray, "B S"] | None = None
+        self.simulation = DMC([v.task for v in variations])
+        self.spec, self.batch = self.simulation.spec, self.simulation.batch
+        self._adversaries = Networks([v.adversary for v in variations], self.spec, self.simulation.disturbance)
+        self._observation: Float32[np.ndarray, "B S"] | None = None
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
         """Start an episode in every row."""
-        self._seen = self.game.reset(rngs)
-        return self._seen
+        self._observation = self.simulation.reset(rngs)
+        return self._observation
 
     def step(self, actions: Float32[np.ndarray, "B A"]) -> Step:
-        """Act in every row, against what the adversary makes of the same observation.  Raises as ``DMC.step`` does."""
-        if self._seen is None:
+        """Execute one action in every row; the adversary acts on the same observation.  Raises as ``DMC.step`` does."""
+        if self._observation is None:
             raise RuntimeError("dmc: call reset before the first step")
-        step = self.game.step(actions, self._adversaries.act(self._seen))
-        self._seen = step.observation
+        step = self.simulation.step(actions, self._adversaries.act(self._observation))
+        self._observation = step.observation
         return step
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
-        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
-        return self.game.image(row)
+        """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot render on this node."""
+        return self.simulation.image(row)

@@ -1,8 +1,8 @@
-"""What dm_control's six domains show and reward, for a whole batch of simulations at once.
+"""Observations and rewards of dm_control's six domains, for a whole batch of simulations together.
 
-The same formulas as ``dm_control.suite``, on the arrays of all rows together: there a step spends
-most of its time in indexing by name, here it is paid once for the batch.  Tests hold both to each
-other, step by step, under forces.
+The formulas are those of ``dm_control.suite``, applied to arrays of all rows.  In dm_control a step
+spends most of its time in indexing by name; here that is done once per batch.  Tests compare both,
+step by step, with forces.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from icrl_dist.types import Spec
 
 Array = Float64[np.ndarray, "B ..."]
 BROKEN = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{of}").value for of in ("POS", "VEL", "ACC")]
-"""MuJoCo's warnings of a simulation that has broken down, which it then begins anew."""
-_XX, _XZ, _ZZ = 0, 2, 8  # places in a rotation matrix
+"""MuJoCo's warnings when a simulation breaks down; MuJoCo then resets it."""
+_XX, _XZ, _ZZ = 0, 2, 8  # indices in a flat rotation matrix
 
 
 class Rows:
-    """The data of B simulations of one model's shape, by MuJoCo's names, stacked when they are asked for."""
+    """The data of B simulations with equally shaped models, by MuJoCo's names; a field is stacked when it is read."""
 
     def __init__(self, models: Sequence[mujoco.MjModel], data: Sequence[mujoco.MjData]) -> None:
         self.model = models[0]
-        """The shape that all share; masses, frictions and positions are each row's own."""
+        """The first model: the others have the same shape, but their own masses, frictions and positions."""
         self._models, self._data = models, data
         self._fields: dict[str, tuple[list[np.ndarray], np.ndarray, np.ndarray]] = {}
         self._numbers: dict[tuple[mujoco.mjtObj, str], int] = {}
         self._readings: dict[tuple[Any, ...], Int64[np.ndarray, " R"]] = {}
 
     def __call__(self, field: str) -> Array:
-        """This field of ``MjData`` in every row, ``(B, ...)``: valid until it is asked for again."""
+        """This field of ``MjData`` in every row, ``(B, ...)``.  The array is valid until the field is read again."""
         if field not in self._fields:
             views = [getattr(data, field) for data in self._data]
             stacked = np.stack(views)
@@ -54,7 +54,7 @@ class Rows:
         return self._number(mujoco.mjtObj.mjOBJ_GEOM, name)
 
     def sensor(self, *names: str) -> Array:
-        """The readings of sensors, one after the other."""
+        """The readings of these sensors, concatenated."""
         if names not in self._readings:
             self._readings[names] = self._places([self._number(mujoco.mjtObj.mjOBJ_SENSOR, name) for name in names])
         return self("sensordata")[:, self._readings[names]]
@@ -82,7 +82,7 @@ class Rows:
 
 
 class Domain(NamedTuple):
-    """What one domain of the suite shows, and what each of its tasks pays."""
+    """The observation of one domain of the suite, and the reward of each of its tasks."""
 
     observe: Callable[[Rows], list[Array]]
     rewards: dict[str, Callable[[Rows], Array]]
@@ -92,11 +92,11 @@ def _flat(array: Array) -> Array:
     return array.reshape(len(array), -1)
 
 
-def _cartpole_shows(rows: Rows) -> list[Array]:
+def _cartpole_observation(rows: Rows) -> list[Array]:
     return [rows("qpos")[:, :1], rows("xmat")[:, 2, [_ZZ, _XZ]], rows("qvel")]
 
 
-def _balanced(rows: Rows) -> Array:
+def _cartpole_reward(rows: Rows) -> Array:
     upright = (rows("xmat")[:, 2, _ZZ] + 1) / 2
     centered = (1 + tolerance(rows("qpos")[:, 0], margin=2)) / 2
     small_control = (4 + tolerance(rows("ctrl")[:, 0], margin=1, value_at_margin=0, sigmoid="quadratic")) / 5
@@ -104,7 +104,7 @@ def _balanced(rows: Rows) -> Array:
     return np.asarray(upright * small_control * small_velocity * centered)
 
 
-def _planar_shows(rows: Rows) -> list[Array]:
+def _planar_observation(rows: Rows) -> list[Array]:
     return [rows("qpos")[:, 1:], rows("qvel")]
 
 
@@ -112,32 +112,32 @@ def _speed(rows: Rows) -> Array:
     return rows.sensor("torso_subtreelinvel")[:, 0]
 
 
-def _ran(rows: Rows) -> Array:
-    return _fast(_speed(rows), 10.0, 10.0, 0.0)
+def _cheetah_reward(rows: Rows) -> Array:
+    return _speed_reward(_speed(rows), 10.0, 10.0, 0.0)
 
 
-def _fast(speed: Array, least: float, margin: float, at_margin: float) -> Array:
+def _speed_reward(speed: Array, least: float, margin: float, at_margin: float) -> Array:
     return np.asarray(
         tolerance(speed, bounds=(least, float("inf")), margin=margin, value_at_margin=at_margin, sigmoid="linear")
     )
 
 
-def _hopper_shows(rows: Rows) -> list[Array]:
-    return [*_planar_shows(rows), np.log1p(rows.sensor("touch_toe", "touch_heel"))]
+def _hopper_observation(rows: Rows) -> list[Array]:
+    return [*_planar_observation(rows), np.log1p(rows.sensor("touch_toe", "touch_heel"))]
 
 
-def _on_its_foot(rows: Rows) -> Array:
+def _standing(rows: Rows) -> Array:
     places = rows("xipos")
     return np.asarray(tolerance(places[:, rows.body("torso"), 2] - places[:, rows.body("foot"), 2], (0.6, 2)))
 
 
-def _stood(rows: Rows) -> Array:
+def _hopper_stand_reward(rows: Rows) -> Array:
     small_control = tolerance(rows("ctrl"), margin=1, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
-    return np.asarray(_on_its_foot(rows) * (small_control + 4) / 5)
+    return np.asarray(_standing(rows) * (small_control + 4) / 5)
 
 
-def _hopped(rows: Rows) -> Array:
-    return np.asarray(_on_its_foot(rows) * _fast(_speed(rows), 2.0, 1.0, 0.5))
+def _hopper_hop_reward(rows: Rows) -> Array:
+    return np.asarray(_standing(rows) * _speed_reward(_speed(rows), 2.0, 1.0, 0.5))
 
 
 def _to_target(rows: Rows) -> Array:
@@ -145,31 +145,31 @@ def _to_target(rows: Rows) -> Array:
     return places[:, rows.geom("target"), :2] - places[:, rows.geom("finger"), :2]
 
 
-def _reacher_shows(rows: Rows) -> list[Array]:
+def _reacher_observation(rows: Rows) -> list[Array]:
     return [rows("qpos"), _to_target(rows), rows("qvel")]
 
 
-def _reached(rows: Rows) -> Array:
+def _reacher_reward(rows: Rows) -> Array:
     radii = rows.sizes("target") + rows.sizes("finger")
     return (np.linalg.norm(_to_target(rows), axis=1) <= radii).astype(np.float64)
 
 
-def _walker_shows(rows: Rows) -> list[Array]:
+def _walker_observation(rows: Rows) -> list[Array]:
     height = rows("xpos")[:, [rows.body("torso")], 2]
     return [_flat(rows("xmat")[:, 1:, [_XX, _XZ]]), height, rows("qvel")]
 
 
-def _walked(least: float) -> Callable[[Rows], Array]:
+def _walker_reward(least: float) -> Callable[[Rows], Array]:
     def reward(rows: Rows) -> Array:
         torso = rows.body("torso")
         standing = tolerance(rows("xpos")[:, torso, 2], bounds=(1.2, float("inf")), margin=0.6)
-        stands = (3 * standing + (1 + rows("xmat")[:, torso, _ZZ]) / 2) / 4
-        return np.asarray(stands * (5 * _fast(_speed(rows), least, least / 2, 0.5) + 1) / 6)
+        posture = (3 * standing + (1 + rows("xmat")[:, torso, _ZZ]) / 2) / 4
+        return np.asarray(posture * (5 * _speed_reward(_speed(rows), least, least / 2, 0.5) + 1) / 6)
 
     return reward
 
 
-def _quadruped_shows(rows: Rows) -> list[Array]:
+def _quadruped_observation(rows: Rows) -> list[Array]:
     model, kind = rows.model, mujoco.mjtSensor
     hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE.value)
     return [
@@ -183,44 +183,44 @@ def _quadruped_shows(rows: Rows) -> list[Array]:
     ]
 
 
-def _moved(least: float) -> Callable[[Rows], Array]:
+def _quadruped_reward(least: float) -> Callable[[Rows], Array]:
     def reward(rows: Rows) -> Array:
-        upright = _fast(rows("xmat")[:, rows.body("torso"), _ZZ], 1.0, 2.0, 0.0)
-        return np.asarray(upright * _fast(rows.sensor("velocimeter")[:, 0], least, least, 0.5))
+        upright = _speed_reward(rows("xmat")[:, rows.body("torso"), _ZZ], 1.0, 2.0, 0.0)
+        return np.asarray(upright * _speed_reward(rows.sensor("velocimeter")[:, 0], least, least, 0.5))
 
     return reward
 
 
 DOMAINS: dict[str, Domain] = {
-    "cartpole": Domain(_cartpole_shows, {"balance": _balanced, "swingup": _balanced}),
-    "cheetah": Domain(_planar_shows, {"run": _ran}),
-    "hopper": Domain(_hopper_shows, {"stand": _stood, "hop": _hopped}),
-    "quadruped": Domain(_quadruped_shows, {"walk": _moved(0.5), "run": _moved(5.0)}),
-    "reacher": Domain(_reacher_shows, {"easy": _reached, "hard": _reached}),
-    "walker": Domain(_walker_shows, {"walk": _walked(1.0), "run": _walked(8.0)}),
+    "cartpole": Domain(_cartpole_observation, {"balance": _cartpole_reward, "swingup": _cartpole_reward}),
+    "cheetah": Domain(_planar_observation, {"run": _cheetah_reward}),
+    "hopper": Domain(_hopper_observation, {"stand": _hopper_stand_reward, "hop": _hopper_hop_reward}),
+    "quadruped": Domain(_quadruped_observation, {"walk": _quadruped_reward(0.5), "run": _quadruped_reward(5.0)}),
+    "reacher": Domain(_reacher_observation, {"easy": _reacher_reward, "hard": _reacher_reward}),
+    "walker": Domain(_walker_observation, {"walk": _walker_reward(1.0), "run": _walker_reward(8.0)}),
 }
 
 
 def observed(rows: Rows, domain: str) -> Array:
-    """The observation of every row: dm_control's dict, flattened in its order."""
+    """The observation of every row: dm_control's dict, flattened in the dict's order."""
     return np.concatenate(DOMAINS[domain].observe(rows), axis=1)
 
 
-def drawn(draw: Callable[[], np.ndarray]) -> UInt8[np.ndarray, "height width 3"]:
-    """An image by MuJoCo.  Raises RuntimeError with the remedy if there is no way to draw on this machine."""
+def rendered(draw: Callable[[], np.ndarray]) -> UInt8[np.ndarray, "height width 3"]:
+    """The image that ``draw`` renders with MuJoCo.  Raises RuntimeError, with the remedy, if it cannot on this node."""
     gl = os.environ.get("MUJOCO_GL", "")
     remedy = "set MUJOCO_GL=egl, or osmesa without a GPU, before Python starts, and install libegl1 or libosmesa6"
     if gl in ("", "disabled", "disable", "off", "false", "0"):
-        raise RuntimeError(f"MuJoCo cannot draw here (MUJOCO_GL={gl!r}): {remedy}")
+        raise RuntimeError(f"MuJoCo cannot render here (MUJOCO_GL={gl!r}): {remedy}")
     try:
         return np.asarray(draw(), np.uint8)
-    except Exception as error:  # each back end has its own
-        raise RuntimeError(f"MuJoCo cannot draw here (MUJOCO_GL={gl!r}: {' '.join(str(error).split())}): {remedy}") from None
+    except Exception as error:  # each back end raises its own type
+        raise RuntimeError(f"MuJoCo cannot render here (MUJOCO_GL={gl!r}: {' '.join(str(error).split())}): {remedy}") from None
 
 
-def check_step(game: str, spec: Spec, batch: int, done: int, actions: Float32[np.ndarray, "B A"]) -> None:
-    """After ``done`` steps: raises RuntimeError past the horizon, ValueError for actions outside [-1, 1]."""
+def check_step(problem: str, spec: Spec, batch: int, done: int, actions: Float32[np.ndarray, "B A"]) -> None:
+    """Raises RuntimeError if ``done`` steps reach the horizon, ValueError for actions outside [-1, 1]."""
     if done >= spec.horizon:
-        raise RuntimeError(f"{game}: stepped past the horizon of {spec.horizon}; call reset first")
+        raise RuntimeError(f"{problem}: stepped past the horizon of {spec.horizon}; call reset first")
     if actions.shape != (batch, spec.actions) or not np.abs(actions).max() <= 1:
-        raise ValueError(f"{game}: actions {actions}: expected {batch} x {spec.actions} numbers in [-1, 1]")
+        raise ValueError(f"{problem}: actions {actions}: expected {batch} x {spec.actions} numbers in [-1, 1]")

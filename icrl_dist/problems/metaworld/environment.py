@@ -1,7 +1,7 @@
-"""Meta-World's ML1 pick-place: a hidden goal, and a bounded disturbance of what is observed (appendix C.2).
+"""Meta-World's ML1 pick-place with a bounded disturbance of the observation (appendix C.2).
 
-The agent sees where hand and object seem to be, never the goal (ML1 shows zeros in its place); the
-labeller sees the true state, goal included.
+Observations contain the disturbed positions of hand and object, and zeros instead of the goal, as in ML1.
+Labels are computed from the true state, which includes the goal.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from icrl_dist.problems.continuous.network_adversary import Networks
-from icrl_dist.problems.dmc.suite import BROKEN, check_step, drawn
+from icrl_dist.problems.dmc.suite import BROKEN, check_step, rendered
 from icrl_dist.problems.metaworld import pick_place
 from icrl_dist.types import Step, Task, Variation
 
@@ -26,9 +26,9 @@ _NOW, _BEFORE = slice(0, 18), slice(18, 36)
 
 @functools.lru_cache(maxsize=8)
 def ml1_tasks(count: int = 20, seed: int = 0) -> tuple[Task, ...]:
-    """The first of ML1's own seeded training tasks: where the object lies and where it has to go, in metres.
+    """The first training tasks of ML1 with this seed.
 
-    Raises ValueError for more than its 50.
+    Raises ValueError for more than ML1's 50.
     """
     from metaworld import ML1
 
@@ -36,30 +36,30 @@ def ml1_tasks(count: int = 20, seed: int = 0) -> tuple[Task, ...]:
     made = make("pick-place-v3", seed=seed).train_tasks
     if not 0 < count <= len(made):
         raise ValueError(f"metaworld: {count} tasks: ML1 has {len(made)}, use 1 to {len(made)}")
-    vectors = [pickle.loads(one.data)["rand_vec"] for one in made[:count]]  # ML1 itself has just pickled them
+    vectors = [pickle.loads(one.data)["rand_vec"] for one in made[:count]]  # safe: ML1 pickled them in this process
     return tuple(pick_place.task(vector[:3].tolist(), vector[3:].tolist()) for vector in vectors)
 
 
 def expert(truth: Float64[np.ndarray, "B S"]) -> Float32[np.ndarray, "B A"]:
-    """Meta-World's scripted policy, given true states that show the goal; its actions clipped to [-1, 1]."""
+    """Actions of Meta-World's scripted policy, clipped to [-1, 1]; ``truth``: true states including the goal."""
     from metaworld.policies import SawyerPickPlaceV3Policy
 
     policy = SawyerPickPlaceV3Policy()
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Constant")  # that its actions need clipping
+        warnings.filterwarnings("ignore", message="Constant")  # a warning that actions need clipping
         return np.stack([np.clip(policy.get_action(row), -1.0, 1.0) for row in truth]).astype(np.float32)
 
 
 class PickPlace:
-    """B variation environments: each row's own object and goal, seen through its own adversary.
+    """B variation environments, each with its own object position, goal and adversary.
 
-    The adversary is a function of the true state, goal included, and moves what is shown of hand,
-    object and, where it is shown, goal by at most ``disturbance`` metres a component at strength 1.
-    It moves the first observation too; the frame before is shown as it was shown then.
+    The adversary is a function of the true state including the goal.  At strength 1 it moves the observed
+    positions of hand, object and (if observations contain it) goal by at most ``disturbance`` meters per
+    component, also in the first observation.  An observation's previous frame is the disturbed one.
     """
 
     def __init__(self, variations: Sequence[Variation]) -> None:
-        """Raises ValueError for unlike tasks, and for an adversary of other widths."""
+        """Raises ValueError if horizon, ``goal_shown`` or ``disturbance`` differ, or an adversary has other widths."""
         tasks = [v.task for v in variations]
         for one in tasks:
             pick_place.check(one)
@@ -70,19 +70,19 @@ class PickPlace:
             )
         self.spec, self.batch = pick_place.spec(tasks[0]), len(tasks)
         self._adversaries = Networks([v.adversary for v in variations], self.spec, pick_place.MOVED)
-        self._metres = pick_place.disturbance(tasks[0])
+        self._meters = pick_place.disturbance(tasks[0])
         self._shows_goal = bool(tasks[0].get("goal_shown", 0))
         self._envs = [environment(one) for one in tasks]
         self._goals = np.array([one.vector("goal") for one in tasks])
         self._low, self._high = (np.array(bound, np.float32) for bound in (self.spec.low, self.spec.high))
         self._h = self.spec.horizon
         self.truth: Float64[np.ndarray, "B S"] = np.zeros((self.batch, self.spec.observation))
-        """The true states, goals included, for whoever labels."""
+        """The true states including the goals, for labels."""
         self.success = np.zeros(self.batch, bool)
-        """Where the object is within 7 cm of the goal."""
+        """Whether the object is within 7 cm of the goal."""
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
-        """Start an episode in every row.  A task begins always alike, so nothing is drawn."""
+        """Start an episode in every row.  The initial state of a task is fixed, so nothing is rendered."""
         if len(rngs) != self.batch:
             raise ValueError(f"metaworld: {len(rngs)} generators for {self.batch} rows")
         self.truth = np.stack([env.reset()[0] for env in self._envs])
@@ -94,7 +94,7 @@ class PickPlace:
         return self._shown
 
     def step(self, actions: Float32[np.ndarray, "B A"]) -> Step:
-        """Act in every row; a simulation that diverges stands still, as in ``dmc.DMC.step``.
+        """Execute one action in every row; a simulation that diverges is not stepped any more.
 
         Raises ValueError for actions outside [-1, 1], RuntimeError past the horizon or before a reset.
         """
@@ -103,25 +103,25 @@ class PickPlace:
         reward = np.zeros(self.batch, np.float32)
         self.truth, self.success = self.truth.copy(), np.zeros(self.batch, bool)
         for row in np.flatnonzero(~self._diverged):
-            state, paid, _, _, info = self._envs[row].step(actions[row])
+            state, state_reward, _, _, info = self._envs[row].step(actions[row])
             self._diverged[row] = self._envs[row].data.warning.number[BROKEN].any()
             if not self._diverged[row]:
-                self.truth[row, :36], reward[row], self.success[row] = state[:36], paid, bool(info["success"])
+                self.truth[row, :36], reward[row], self.success[row] = state[:36], state_reward, bool(info["success"])
         self._shown, moved = self._show(self._shown)
         return Step(self._shown, reward, self._h == self.spec.horizon, moved, self._diverged.copy())
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
-        """One row through a camera of Meta-World's.  Raises RuntimeError if MuJoCo cannot draw on this machine."""
+        """One row through a camera of Meta-World.  Raises RuntimeError if MuJoCo cannot render on this node."""
         env = self._envs[row]
         env.render_mode = "rgb_array"
-        return drawn(env.render)
+        return rendered(env.render)
 
     def _show(self, before: Float32[np.ndarray, "B S"] | None) -> tuple[Float32[np.ndarray, "B S"], Float32[np.ndarray, "B F"]]:
-        """What the agent sees of the true states, and the adversaries' actions."""
+        """Observations of the true states, and the adversaries' actions; ``before``: the previous observations."""
         shown = self.truth.astype(np.float32)
         moved = self._adversaries.act(shown)
         for place, part in ((_HAND, slice(0, 3)), (_OBJECT, slice(3, 6)), (_GOAL, slice(6, 9))):
-            shown[:, place] += np.float32(self._metres) * moved[:, part]
+            shown[:, place] += np.float32(self._meters) * moved[:, part]
         if not self._shows_goal:
             shown[:, _GOAL] = 0.0
         shown[:, _BEFORE] = shown[:, _NOW] if before is None else before[:, _NOW]
@@ -129,12 +129,12 @@ class PickPlace:
 
 
 def environment(task: Task) -> Any:
-    """Meta-World's environment, its object and goal fixed to the task's."""
+    """Meta-World's environment with the task's object position and goal."""
     from metaworld.envs import SawyerPickPlaceEnvV3
-    from metaworld.types import Task as TheirTask
+    from metaworld.types import Task as MetaWorldTask
 
     env = SawyerPickPlaceEnvV3()
     vector = np.array([*task.vector("object"), *task.vector("goal")])
     fields = {"env_cls": SawyerPickPlaceEnvV3, "rand_vec": vector, "partially_observable": True}
-    env.set_task(TheirTask(env_name="pick-place-v3", data=pickle.dumps(fields)))  # the only form it takes a task in
+    env.set_task(MetaWorldTask(env_name="pick-place-v3", data=pickle.dumps(fields)))  # the only form that it accepts
     return env

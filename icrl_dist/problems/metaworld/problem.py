@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from icrl_dist.problems.benchmarks import Benchmarks
 
 _TASKS = 50
-"""Training tasks that ML1 has."""
+"""Number of ML1's training tasks."""
 _HAND, _OBJECT = slice(0, 2), slice(4, 6)
-"""Where the observation has x and y of hand and object."""
+"""Components of the observation with x and y of hand and object."""
 
 
 def _scripted_context(job: Job, problem: Problem, worker: str, progress: Progress) -> Iterator[Trajectory]:
-    from icrl_dist.problems.metaworld.scripted_contexts import scripted_context  # with torch, which a run file needs not
+    from icrl_dist.problems.metaworld.scripted_contexts import scripted_context  # imported here because it imports torch
 
     return scripted_context(job, problem, worker, progress)
 
 
 class MetaWorldProblem(ContinuousProblem):
-    """A hidden goal to which an object has to be carried; an adversary disturbs the observation."""
+    """The agent must carry an object to a hidden goal; an adversary disturbs the observation."""
 
     template: ClassVar[str] = ""
     job_kinds: ClassVar[Mapping[str, JobKind]] = {ScriptedContexts.kind: JobKind(ScriptedContexts, _scripted_context)}
@@ -44,16 +44,16 @@ class MetaWorldProblem(ContinuousProblem):
         return self.config.horizon or pick_place.HORIZON
 
     @property
-    def spec(self) -> Spec:  # without ML1, which takes seconds to make its tasks
-        place = {"object": (0.0, 0.6, 0.02), "goal": (0.0, 0.8, 0.1)}
-        return self.spec_of(Task.of(pick_place.KIND, **place, horizon=self.horizon))
+    def spec(self) -> Spec:  # does not need ML1, which takes seconds to create its tasks
+        positions = {"object": (0.0, 0.6, 0.02), "goal": (0.0, 0.8, 0.1)}
+        return self.spec_of(Task.of(pick_place.KIND, **positions, horizon=self.horizon))
 
     @property
     def disturbances(self) -> int:
         return pick_place.MOVED
 
     def make_split(self) -> Split:
-        """Training tasks: the first of ML1's, in its order for ``split_seed``; test tasks: the next."""
+        """Training tasks: the first of ML1's tasks, in its order for ``split_seed``; test tasks: the next ones."""
         from icrl_dist.problems.metaworld.environment import ml1_tasks
 
         of = self.config
@@ -63,18 +63,18 @@ class MetaWorldProblem(ContinuousProblem):
         return Split(chosen[: of.train_tasks], chosen[of.train_tasks :])
 
     def batch(self, variations: Sequence[Variation]) -> Batch:
-        from icrl_dist.problems.metaworld.environment import PickPlace  # MuJoCo takes a moment to import
+        from icrl_dist.problems.metaworld.environment import PickPlace  # imported here because MuJoCo is slow to import
 
         return PickPlace(variations)
 
     def contexts(self, run: Run) -> Contexts:
-        """Episodes of the scripted policy, or histories of SAC experts, by ``control.histories``."""
+        """Episodes of the scripted policy or histories of SAC experts; see ``control.histories``."""
         if self.config.histories == "scripted":
             return Contexts(ScriptedContexts(self.labelling(run)))
         return super().contexts(run)
 
     def references(self, run: Run) -> dict[str, Reference]:
-        """A random policy, and the scripted policy that reads the true state, goal included."""
+        """A random policy, and the scripted policy, which is given the true state including the goal."""
         from icrl_dist.experts.train import ScriptedPolicy
 
         def scripted(rows: Sequence[Variation], env: Batch) -> Policy:
@@ -84,7 +84,7 @@ class MetaWorldProblem(ContinuousProblem):
 
     @property
     def scripted(self) -> Callable[[Float[np.ndarray, "N T"]], Float32[np.ndarray, "N A"]]:
-        """Meta-World's scripted policy, given true states that show the goal."""
+        """Meta-World's scripted policy; the true states contain the goal."""
         from icrl_dist.problems.metaworld.environment import expert
 
         return expert
@@ -92,13 +92,17 @@ class MetaWorldProblem(ContinuousProblem):
     def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         of, most = self.config, _TASKS - self.config.test_tasks
         if of.train_tasks > most:
-            yield "control.train_tasks", of.train_tasks, f"ML1 has {_TASKS} tasks: use 1 to {most}, or test fewer"
+            yield "control.train_tasks", of.train_tasks, f"ML1 has {_TASKS} tasks: use 1 to {most}, or fewer test tasks"
         if of.horizon > pick_place.HORIZON:
             yield "control.horizon", of.horizon, f"Meta-World allows at most {pick_place.HORIZON} steps"
         if isinstance(of.strength, str) and of.disturbance == 0:
-            yield "control.disturbance", of.disturbance, "a drop needs a distance to multiply"
+            yield (
+                "control.disturbance",
+                of.disturbance,
+                "use a distance above 0 if control.strength is drop:SHARE",
+            )
         if run.method == "experts" and of.histories == "scripted":
-            yield "control.histories", of.histories, "experts are made for sac"
+            yield "control.histories", of.histories, "use sac: the method experts trains SAC experts"
 
     @property
     def drawing(self) -> MakeDrawing:
@@ -112,12 +116,12 @@ class MetaWorldProblem(ContinuousProblem):
 
 
 def _paths(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
-    """A ``paths`` drawing: named lists of points from above in metres, and ``goal``."""
+    """A ``paths`` drawing: named lists of points seen from above, in meters, and ``goal``."""
     goal = task.get("goal")
     if not isinstance(goal, (list, tuple)) or len(goal) != 3 or not all(type(c) in (int, float) for c in goal):
-        raise ValueError("no pick-place episode")
+        raise ValueError("not an episode of pick-place")
     if states.shape[1] < 7 or not np.isfinite(goal).all():
-        raise ValueError("no pick-place episode")
+        raise ValueError("not an episode of pick-place")
     drawn = {"hand": _HAND, "object": _OBJECT}
     paths = [{"name": name, "points": [_rounded(p) for p in states[:, place]]} for name, place in drawn.items()]
     return {"kind": "paths", "paths": paths, "goal": _rounded(np.array(goal[:2]))}

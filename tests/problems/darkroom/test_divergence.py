@@ -20,7 +20,7 @@ from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import divergence
 from icrl_dist.problems.darkroom.adversaries import argmax_distribution
-from icrl_dist.problems.darkroom.divergence import KINDS, LAWS, Divergence, RoomContext
+from icrl_dist.problems.darkroom.divergence import KINDS, PRIORS, Divergence, RoomContext
 from icrl_dist.problems.darkroom.room import ACTIONS
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, soft_labels
 from icrl_dist.results import evaluate
@@ -153,7 +153,7 @@ def test_without_disturbance_in_training_there_is_none_in_the_contexts(run, mode
     monkeypatch.setattr(divergence, "CONTEXTS", 2)
     run = dataclasses.replace(run, **change)
     found = [pair for heldout in (False, True) for pair in measured(run, model, heldout)]
-    assert [(one.kind, one.p) for pair in found for one in pair] == [(kind, 0.0) for kind in (*KINDS, *KINDS) for _ in LAWS]
+    assert [(one.kind, one.p) for pair in found for one in pair] == [(kind, 0.0) for kind in (*KINDS, *KINDS) for _ in PRIORS]
     assert all((h.p == 0).all() for h in divergence.hypotheses(run, heldout=True))
 
 
@@ -247,7 +247,7 @@ class Uniform(PretrainedTransformer):
 
 
 @pytest.mark.parametrize(("heldout", "labels"), [(False, "soft"), (True, "soft"), (True, "heuristic")])
-@pytest.mark.parametrize("prior", range(len(LAWS)))
+@pytest.mark.parametrize("prior", range(len(PRIORS)))
 def test_a_model_that_is_the_exact_posterior_has_no_divergence(run, monkeypatch, heldout, labels, prior) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 9)
     run = dataclasses.replace(run, darkroom=dataclasses.replace(run.section("darkroom"), labels=labels))
@@ -265,12 +265,12 @@ def test_the_divergence_of_a_uniform_model_equals_a_slow_loop(run: Run, monkeypa
     monkeypatch.setattr(divergence, "contexts", lambda *given: asked.append(real(*given)) or asked[-1])
     found = list(measured(run, Uniform(registry.of(run).spec, run.model).eval(), heldout=False))
     for (one, other), context in zip(found, asked, strict=True):
-        assert one.kl.shape == one.met.shape == (5, 17)
+        assert one.kl.shape == one.reached.shape == (5, 17)
         for b, t in itertools.product(range(5), range(17)):
-            assert one.met[b, t] == other.met[b, t] == any(context.rewards[b, :t] > 0)
+            assert one.reached[b, t] == other.reached[b, t] == any(context.rewards[b, :t] > 0)
             slow = sum(p * math.log(p / 0.2) for p in one.exact[b, t].tolist() if p > 0)
             assert one.kl[b, t] == pytest.approx(slow)
-    assert {bool(m) for one, _ in found for m in one.met.ravel()} == {False, True}
+    assert {bool(m) for one, _ in found for m in one.reached.ravel()} == {False, True}
 
 
 def made(kind: str, p: float, kl: list[list[float]], met: list[list[bool]]) -> Divergence:

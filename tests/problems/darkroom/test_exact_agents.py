@@ -164,7 +164,7 @@ def test_an_agent_that_keeps_a_hypothesis_refuses_actions_that_none_would_take(r
         agent = ExactAgent([h], [labels], np.array([0]), rule)
         away = (np.array([[0.0, 1.0]], np.float32), np.array([3]), np.zeros(1, np.float32), np.zeros((1, 2), np.float32), False)
         if rule in ("windows", "committed"):
-            with pytest.raises(ValueError, match="an action that it never takes"):
+            with pytest.raises(ValueError, match="an action that the exact agent never takes"):
                 agent.observe(*away)
         else:
             agent.observe(*away)

@@ -12,7 +12,7 @@ from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom import posterior
 from icrl_dist.problems.darkroom.exact_agents import ExactAgent
-from icrl_dist.problems.darkroom.posterior import Room, by_goal, exact, hypotheses, implied
+from icrl_dist.problems.darkroom.posterior import RoomPosterior, by_goal, exact, hypotheses, implied
 from icrl_dist.problems.darkroom.room import cells
 from icrl_dist.problems.darkroom.solver import soft_labels
 from icrl_dist.rollout.deployment import in_context
@@ -127,7 +127,7 @@ def test_the_exact_agents_distribution_implies_the_exact_posterior(adversary, ro
         for t in range(length) if length else ():
             one = [column[t : t + 1] for column in columns]
             agent.observe(one[0], one[1], one[3], one[2], False)
-        read = Room(size, 10 * size, [adversary], 0.99, 0.1).read(Seen(agent, [c[:length] for c in columns]))
+        read = RoomPosterior(size, 10 * size, [adversary], 0.99, 0.1).read(Seen(agent, [c[:length] for c in columns]))
         assert np.abs(read.implied - read.exact).sum() / 2 < 1e-3
         assert read.transitions == length and read.exact.sum() == pytest.approx(1)
         refuted = {tuple(cell) for cell, r in zip(columns[2][:length].tolist(), columns[3], strict=False) if not r}

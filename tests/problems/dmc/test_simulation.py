@@ -242,7 +242,7 @@ def test_a_diverged_episode_is_truncated_and_marked(tmp_path, monkeypatch):
     env = registry.make(Variation(domains.task("dmc-cartpole-balance")))
     env.reset(seed=0)
     assert env.step(np.zeros(1, np.float32))[3:] == (False, {"adversary": pytest.approx(np.zeros(2)), "diverged": False})
-    env._batch.game._data[0].qvel[:] = 1e12
+    env._batch.simulation._data[0].qvel[:] = 1e12
     _, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
     assert (reward, terminated, truncated, info["diverged"]) == (0.0, False, True, True)
 
@@ -286,7 +286,7 @@ def test_variations_and_actions_that_do_not_fit_are_refused_with_the_remedy():
     for wrong in (Task.of("dmc-cheetah-run", torso_mass=1000.0), Task.of("dmc-cheetah-run", torso_mas=1.0)):
         with pytest.raises(ValueError, match="torso_mas"):
             simulation.DMC([cheetah, wrong])
-    with pytest.raises(ValueError, match=r"5 inputs and 2 outputs: this game has 17.*6 of disturbance"):
+    with pytest.raises(ValueError, match=r"5 inputs and 2 outputs: this problem has 17.*6 of disturbance"):
         registry.batch([Variation(cheetah, network_adversary.network(0, 5, 2))])
     with pytest.raises(ValueError, match=r"'dirichlet'.*null and network"):
         registry.batch([Variation(cheetah, Adversary.of("dirichlet", p=0.1, alpha=[1.0] * 5))])

@@ -154,7 +154,7 @@ def test_a_diverged_simulation_stands_still_without_reward_and_the_next_episode_
         ({"goal": (0.0, 0.85)}, r"goal=\(0\.0, 0\.85\) lies outside"),
         ({"horizon": 501}, "horizon=501: expected 1 to 500"),
         ({"goal_shown": 2}, "goal_shown=2"),
-        ({"disturbance": 1.0}, r"disturbance=1\.0: expected 0 to 0\.1 metres"),
+        ({"disturbance": 1.0}, r"disturbance=1\.0: expected 0 to 0\.1 meters"),
         ({"goal_show": 1}, r"no parameter 'goal_show'.*did you mean 'goal_shown'"),
     ],
 )
@@ -165,7 +165,7 @@ def test_an_impossible_task_is_refused(settings, said):
 
 
 def test_variations_and_actions_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"17 inputs.*this game has 39"):
+    with pytest.raises(ValueError, match=r"17 inputs.*this problem has 39"):
         registry.batch([Variation(TASK, network_adversary.network(0, 17, 9))])
     with pytest.raises(ValueError, match="null and network"):
         registry.batch([Variation(TASK, Adversary.of("uniform", p=0.1))])

@@ -12,7 +12,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.metaworld import environment, pick_place, scripted_contexts
-from icrl_dist.problems.metaworld.scripted_contexts import Lead
+from icrl_dist.problems.metaworld.scripted_contexts import EpisodePlan
 from icrl_dist.stream import wire
 from icrl_dist.training.batches import TrainingBatch
 from tests.jobs import InMemoryDataset, decoded, do, in_problem, jobs_of
@@ -43,8 +43,8 @@ def job_of(run):
 def test_half_of_the_episodes_lead_to_the_goal_and_the_rest_to_other_places_in_its_box(spec):
     goal = np.array([0.05, 0.85, 0.2])
     rngs = [np.random.default_rng(seed) for seed in range(200)]
-    right = [Lead.drawn(rng, goal, True, spec) for rng in rngs]
-    wrong = [Lead.drawn(rng, goal, False, spec) for rng in rngs]
+    right = [EpisodePlan.drawn(rng, goal, True, spec) for rng in rngs]
+    wrong = [EpisodePlan.drawn(rng, goal, False, spec) for rng in rngs]
     assert all((one.goals == goal).all() for one in right)
     given = np.stack([one.goals for one in wrong])
     low, high = pick_place.GOALS
@@ -53,18 +53,18 @@ def test_half_of_the_episodes_lead_to_the_goal_and_the_rest_to_other_places_in_i
     assert set(changes.tolist()) == {0, 1} and given.std(axis=(0, 1)).min() > 0.02
     deviations = np.array([one.noise.std() for one in right])
     assert 0 <= deviations.min() < 0.1 and 0.5 < deviations.max() < 1.1 * scripted_contexts.NOISE
-    lapsed = np.stack([one.lapsed for one in right])
-    assert 0.05 < lapsed.mean() < 0.2 and (~lapsed.any(axis=1)).any()
-    assert all((np.abs(one.instead[one.lapsed]).max(axis=1) > 0).all() for one in right if one.lapsed.any())
+    lapses = np.stack([one.lapses for one in right])
+    assert 0.05 < lapses.mean() < 0.2 and (~lapses.any(axis=1)).any()
+    assert all((np.abs(one.lapse_actions[one.lapses]).max(axis=1) > 0).all() for one in right if one.lapses.any())
 
 
 def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_goal(run, monkeypatch):
-    monkeypatch.setattr(scripted_contexts, "LAPSES", 0.2)
+    monkeypatch.setattr(scripted_contexts, "LAPSE_PROBABILITY", 0.2)
     job, given = job_of(run), []
     assert job.kind == "scripted_context" and decoded(run, wire.encode_job(job)) == job
-    drawn = Lead.drawn.__func__
+    drawn = EpisodePlan.drawn.__func__
     keep = lambda cls, *args: given.append(drawn(cls, *args)) or given[-1]  # noqa: E731
-    monkeypatch.setattr(Lead, "drawn", classmethod(keep))
+    monkeypatch.setattr(EpisodePlan, "drawn", classmethod(keep))
     sent = do(run, job)
     assert [t.identity for t in sent] == list(job.identities()) and {t.origin for t in sent} == {"expert"}
     states = {}
@@ -79,11 +79,11 @@ def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_g
                 states[seen[row].tobytes(), one.variation] = environment.expert(truth[None])[0]
                 truth[36:] = lead.goals[step]
                 wanted = np.clip(environment.expert(truth[None])[0] + lead.noise[step], -1, 1)
-                wanted = lead.instead[step] if lead.lapsed[step] else wanted
+                wanted = lead.lapse_actions[step] if lead.lapses[step] else wanted
                 np.testing.assert_allclose(one.actions[step], wanted, atol=1e-6)
             seen = env.step(np.stack([one.actions[step] for one in rows])).observation
         assert all(np.allclose(one.observations[-1], seen[row]) for row, one in enumerate(rows))
-    assert any(lead.lapsed[:HORIZON].any() for lead in given)
+    assert any(plan.lapses[:HORIZON].any() for plan in given)
     for t in sent:
         assert not t.observations[:, 36:].any() and len(t.queries) == HORIZON and not len(t.taken)
         labels = np.stack([states[query.tobytes(), t.variation] for query in t.queries])
@@ -109,6 +109,6 @@ def test_the_same_job_gives_the_same_bytes_with_action_windows(run, monkeypatch)
 def test_scripted_histories_are_refused_where_there_is_no_scripted_policy():
     with pytest.raises(ConfigError, match=r"control\.histories = 'scripted': only Meta-World"):
         override(load("dmc-reacher-easy"), ["control.histories=scripted"], "--set")
-    with pytest.raises(ConfigError, match=r"control\.histories = 'scripted': experts are made for sac"):
+    with pytest.raises(ConfigError, match=r"control\.histories = 'scripted': use sac: the method experts"):
         override(load("experts-metaworld-laptop"), [], "--set")
     assert load("metaworld").control.histories == "sac", "the paper's"
