@@ -122,7 +122,7 @@ def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_anoth
 
 def test_a_job_of_one_task_has_no_decoys(windowed):
     alone = dataclasses.replace(windowed, stream=dataclasses.replace(windowed.stream, job_tasks=1))
-    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: 0, or a stream\.job_tasks that leaves none"):
+    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or a stream\.job_tasks with at least two"):
         validate(alone, "x")
     validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, decoy_fraction=0.0)), "x")
 
