@@ -15,7 +15,7 @@ from icrl_dist.config.sections import AdversaryConfig, ICAAConfig, ModelConfig, 
 from icrl_dist.launch import train
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
-from icrl_dist.storage.fork import _same
+from icrl_dist.storage.fork import _check_same
 
 SMALL = ControlConfig(train_tasks=4, test_tasks=3)
 RUNS = {
@@ -23,7 +23,7 @@ RUNS = {
     "dmc-cartpole-balance": make_run("dmc-cartpole-balance", method="icaa", control=SMALL),
     "metaworld-pick-place": make_run("metaworld-pick-place", method="icaa", control=SMALL),
 }
-REMEDY = ": a fork has its parent's problem, split, method and model; begin a new run instead"
+REMEDY = ": a fork has its parent's problem, split, method and model; start a new run instead"
 
 CHOSEN: dict[str, Any] = {
     "control.train_tasks": 16,  # of DeepMind Control's 4, 16 or 36
@@ -75,7 +75,7 @@ def test_the_table_has_the_section_of_each_problem(problem: str) -> None:
     assert {field for one, section, field in PROBLEM_FIELDS if (one, section) == (problem, owner.section)} == fields
     assert set(owner.free_in_forks) <= fields
     validate(RUNS[problem], "x")
-    _same(RUNS[problem], RUNS[problem], "x")
+    _check_same(RUNS[problem], RUNS[problem], "x")
 
 
 @pytest.mark.parametrize(("problem", "section", "field"), PROBLEM_FIELDS)
@@ -85,11 +85,11 @@ def test_a_fork_has_every_field_of_its_parents_problem(problem: str, section: st
     if (problem, f"{section}.{field}") not in IMPOSSIBLE:
         validate(run, "x")
     if field in plugins.find("problems", problem).free_in_forks:
-        _same(parent, run, "--from parent@0")
+        _check_same(parent, run, "--from parent@0")
         return
     for one, other, old, new in ((parent, run, before, after), (run, parent, after, before)):
         with pytest.raises(ConfigError) as caught:
-            _same(one, other, "--from parent@0")
+            _check_same(one, other, "--from parent@0")
         assert str(caught.value) == f"--from parent@0: {section}.{field} = {new!r} (parent: {old!r}){REMEDY}"
 
 
@@ -111,7 +111,7 @@ def test_a_fork_has_the_problem_of_its_parent(parent: Run, problem: str) -> None
     if hasattr(run, "control"):
         run = dataclasses.replace(run, control=SMALL)  # the problem's name is the only difference within DeepMind Control
     with pytest.raises(ConfigError) as caught:
-        _same(parent, run, "--from parent@0")
+        _check_same(parent, run, "--from parent@0")
     assert str(caught.value) == f"--from parent@0: problem = {problem!r} (parent: {parent.problem!r}){REMEDY}"
 
 
@@ -121,7 +121,7 @@ def test_a_fork_has_the_method_of_its_parent(parent: Run, method: str) -> None:
     if method == parent.method:
         return
     with pytest.raises(ConfigError) as caught:
-        _same(parent, dataclasses.replace(parent, method=method), "--from parent@0")
+        _check_same(parent, dataclasses.replace(parent, method=method), "--from parent@0")
     assert str(caught.value) == f"--from parent@0: method = {method!r} (parent: {parent.method!r}){REMEDY}"
 
 
@@ -130,7 +130,7 @@ def test_a_fork_has_every_field_of_its_parents_model(problem: str, section: str,
     parent = RUNS[problem]
     run, before, after = changed(parent, section, field)
     with pytest.raises(ConfigError) as caught:
-        _same(parent, run, "--from parent@0")
+        _check_same(parent, run, "--from parent@0")
     assert str(caught.value) == f"--from parent@0: model.{field} = {after!r} (parent: {before!r}){REMEDY}"
 
 
@@ -138,13 +138,13 @@ def test_all_differences_are_named() -> None:
     parent = RUNS["darkroom"]
     run = override(parent, ["darkroom.size=9", "darkroom.gamma=0.5", "model.layers=3"], "x")
     with pytest.raises(ConfigError) as caught:
-        _same(parent, run, "x")
+        _check_same(parent, run, "x")
     for one in ("darkroom.size = 9 (parent: 10)", "darkroom.gamma = 0.5 (parent: 0.99)", "model.layers = 3 (parent: 4)"):
         assert one in str(caught.value)
     with pytest.raises(
         ConfigError, match=r"method = 'dpt' \(parent: 'icaa'\), problem = 'dmc-walker-run' \(parent: 'darkroom'\)"
     ):
-        _same(parent, make_run("dmc-walker-run", method="dpt"), "x")
+        _check_same(parent, make_run("dmc-walker-run", method="dpt"), "x")
 
 
 ALLOWED = {"adversary": AdversaryConfig, "pretrain": PretrainConfig, "icaa": ICAAConfig, "optim": OptimConfig}
@@ -157,7 +157,7 @@ ALLOWED = {"adversary": AdversaryConfig, "pretrain": PretrainConfig, "icaa": ICA
 def test_a_fork_may_change_how_it_collects_and_trains(problem: str, section: str, field: str) -> None:
     run, _, _ = changed(RUNS[problem], section, field)
     assert run != RUNS[problem]
-    _same(RUNS[problem], run, "x")
+    _check_same(RUNS[problem], run, "x")
 
 
 @pytest.mark.parametrize(
