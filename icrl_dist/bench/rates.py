@@ -268,7 +268,7 @@ def _evaluation(trained: TrainedModel, budget_s: float) -> float:
             ood_score.calibrate(trained, count)
         total = _extrapolated(np.diff(times), 2 * ood_score.EPISODES, 1 << 30)
     models = 1 + (len(trained.method.phases(run)) > 1)
-    for make, copies in [(Reference(evaluate.in_context(trained)), models), *_references(run)]:
+    for make, copies in [(Reference(evaluate.in_context(trained, trained.run.context)), models), *_references(run)]:
         times[:] = [time.perf_counter()]
         small = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, p=run.evaluate.p[-1:]))
         with contextlib.suppress(_BudgetSpent):

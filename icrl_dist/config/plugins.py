@@ -8,6 +8,7 @@ A package adds a problem with one line in its ``pyproject.toml``::
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from importlib import metadata
 from typing import Any, Literal
@@ -37,18 +38,28 @@ def find(group: Group, name: str) -> Any:
         raise ConfigError(f"{kind} = {name!r}{nearest(name, names(group))}: {known}")
     try:
         return _entries(group)[name].load()
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # whatever another package's module raises while it is imported
         raise ConfigError(f"{kind} = {name!r}: its package cannot be imported ({error}); reinstall that package") from None
+
+
+def importable(group: Group) -> dict[str, Any]:
+    """The classes of all problems or methods by name, without those whose package cannot be imported."""
+    found = {}
+    for name in names(group):
+        with contextlib.suppress(ConfigError):
+            found[name] = find(group, name)
+    return found
 
 
 @functools.cache
 def sections(problem: str | None) -> dict[str, type]:
     """The sections that a problem and the installed methods add to a run file: dataclass by name.
 
-    With None the sections of all problems.  Raises ConfigError if two dataclasses share a section's name.
+    With None the sections of all problems.  A package that cannot be imported adds none, unless it is the problem's.
+    Raises ConfigError if two dataclasses share a section's name.
     """
-    owners = [find("problems", name) for name in (names("problems") if problem is None else (problem,))]
-    owners += [method for method in (find("methods", name) for name in names("methods")) if method.section]
+    owners = list(importable("problems").values()) if problem is None else [find("problems", problem)]
+    owners += [method for method in importable("methods").values() if method.section]
     found: dict[str, type] = {}
     for owner in owners:
         if found.setdefault(owner.section, owner.Config) is not owner.Config:

@@ -122,7 +122,7 @@ def packaged_runs() -> list[str]:
 def _packaged() -> dict[str, tuple[str, str]]:
     """For each name its file, and its problem if several problems share the file (else an empty string)."""
     files = {file.name.removesuffix(".toml") for file in resources.files("icrl_dist.config.runs").iterdir()}
-    templates = {name: plugins.find("problems", name).template for name in plugins.names("problems")}
+    templates = {name: problem.template for name, problem in plugins.importable("problems").items()}
     shared = {
         f"{name}{size}": (f"{template}{size}", name)
         for name, template in templates.items()
@@ -187,6 +187,7 @@ def _known(tables: dict[str, Any], kind: type[Run], source: str) -> dict[str, An
 def override(run: Run, settings: Sequence[str], source: str) -> Run:
     """The run with ``settings`` such as ``adversary.count=16`` applied; strings need no quotes.
 
+    If the run now has another problem, the sections that this problem lacks are left out, unless a setting names them.
     Raises ConfigError for a malformed setting, an unknown key or an impossible value.
     """
     tables = tomllib.loads(dumps(run))
@@ -202,4 +203,8 @@ def override(run: Run, settings: Sequence[str], source: str) -> Run:
             table[key] = value.strip()
         except TypeError:
             raise ConfigError(f"{source} {setting}: {path[0]} is not a section") from None
+    if tables["problem"] in plugins.names("problems"):
+        named = {setting.partition("=")[0].strip().partition(".")[0] for setting in settings}
+        former = set(plugins.sections(None)) - set(plugins.sections(tables["problem"])) - named
+        tables = {name: table for name, table in tables.items() if name not in former}
     return _from_tables(tables, source)

@@ -45,7 +45,7 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
     if run.model.width % run.model.heads:
         yield "model.heads", run.model.heads, "must divide model.width"
     if run.context.max < horizon:
-        yield "context.max", run.context.max, "must be at least one episode ({horizon} steps)"
+        yield "context.max", run.context.max, f"must be at least one episode ({horizon} steps)"
     if run.dagger.rounds and problem.labeller is None:
         yield "dagger.rounds", run.dagger.rounds, "only a problem with exact answers can label new histories"
     yield from _address_objections(run)

@@ -163,10 +163,20 @@ def recover(folder: Path) -> None:
 
 
 def _has_checkpoint(folder: Path) -> bool:
-    """Whether the run in a folder has a checkpoint of its own, beyond those of its fork, or has ended."""
-    first = -1
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        first = int(json.loads((folder / "fork.json").read_text())["version"])
+    """Whether the run in a folder has a checkpoint of its own, beyond those of its fork, or has ended.
+
+    A folder without ``run.toml`` holds an incomplete fork: the file is written after the parent's
+    checkpoints are linked and ``fork.json`` is complete.  If ``fork.json`` is damaged, nobody knows
+    whose the checkpoints are, and the answer is no, so that no run is removed.
+    """
+    if not (folder / "run.toml").is_file():
+        return False
+    first, record = -1, folder / "fork.json"
+    if record.exists():
+        try:
+            first = int(json.loads(record.read_text())["version"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
     return newest_version(folder) > first or (folder / "result.json").exists()
 
 

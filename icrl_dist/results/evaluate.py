@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import Deployment, Run
+from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
 from icrl_dist.problems import registry
 from icrl_dist.results.statistics import mean_and_error
@@ -71,9 +72,12 @@ def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple
     )
 
 
-def in_context(trained: TrainedModel, deploy: Deployment | None = None) -> MakePolicy:
-    """The model as a policy, deployed by this rule; None: the rule that it was trained for."""
-    return lambda rows, env: trained.method.policy(trained.model, len(rows), trained.run.context, deploy)
+def in_context(trained: TrainedModel, context: ContextConfig, deploy: Deployment | None = None) -> MakePolicy:
+    """The model as a policy with these context settings, deployed by this rule; None: the rule that it was trained for.
+
+    All models of one table get the context settings of the evaluated run, also those that its fork's parent trained.
+    """
+    return lambda rows, env: trained.method.policy(trained.model, len(rows), context, deploy)
 
 
 def online(
@@ -124,7 +128,9 @@ def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | N
             data = episode(env, behavior.make(rows, env), [i.rng(run.seed) for i in ids])
             shape = (len(chosen), run.evaluate.seeds, 1)
             results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
-            policies: dict[str, Policy] = {name: in_context(one, deploy)(rows, env) for name, one in models.items()}
+            policies: dict[str, Policy] = {
+                name: in_context(one, run.context, deploy)(rows, env) for name, one in models.items()
+            }
             policies |= {name: one.make(rows, env) for name, one in references.items()}
             for name, policy in policies.items():
                 if _accepts_data(policy):

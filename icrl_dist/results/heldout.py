@@ -87,7 +87,7 @@ def online(
     of the newest model after the last episode, by p; empty if it was not calibrated.
     """
     found, problem = models(what), registry.of(run)
-    policies = {name: evaluate.in_context(model, deploy) for name, model in found.items()}
+    policies = {name: evaluate.in_context(model, run.context, deploy) for name, model in found.items()}
     newest, model = next(iter(found.items()))
     scores: list[Surprise] = []
     if outcomes := outcomes_of(load_checkpoint(checkpoint_file(what))):
@@ -98,7 +98,7 @@ def online(
 
         policies[newest] = scored
     if (deploy or model.method.deployment(run)) != "paper":
-        policies[f"{newest}, Algorithm 1"] = evaluate.in_context(model, "paper")
+        policies[f"{newest}, Algorithm 1"] = evaluate.in_context(model, run.context, "paper")
     agents: dict[str, MakePolicy | Reference] = {**policies, **problem.references(run)}
     if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
         display.report({"event": "note", "text": missing})
@@ -176,7 +176,7 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
     model = trained(load_checkpoint(checkpoint_file(what)))
     suite = registry.of(run).posterior
     decide = functools.partial(model.method.distributions, model.model)
-    act = evaluate.in_context(model, "paper")
+    act = evaluate.in_context(model, run.context, "paper")
     report: dict[str, Any] = {}
     total = len(suite.kinds) * len(suite.levels(run))
     for name, heldout in (("kl_nats", False), ("kl_heldout", True)):
@@ -192,7 +192,7 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
     for name, heldout in (("paper_gap", True), ("paper_gap_train", False)):
         tasks = split.test if heldout else split.train[: len(split.test)]
         progress = _count(display, f"online, {_goals(heldout)}", run, 2)
-        report[name] = posterior_suite.gaps(run, evaluate.in_context(model), tasks, progress)
+        report[name] = posterior_suite.gaps(run, act, tasks, progress)
     return report
 
 

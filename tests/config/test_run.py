@@ -128,7 +128,7 @@ def test_values_are_read_into_their_fields() -> None:
         ('problem = "dmc-hopper-hop"\n[control]\ntrain_tasks = 9', ["control.train_tasks = 9", "4, 16 or 36"]),
         ('problem = "dmc-hopper-hop"\n[control]\ntest_tasks = 49', ["control.test_tasks = 49", "at most 48"]),
         ('problem = "dmc-hopper-hop"\n[dagger]\nrounds = 1', ["dagger.rounds = 1", "only a problem with exact answers"]),
-        ('problem = "dmc-hopper-hop"\n[context]\nmax = 150', ["context.max = 150", "at least one episode"]),
+        ('problem = "dmc-hopper-hop"\n[context]\nmax = 150', ["context.max = 150", "at least one episode (200 steps)"]),
         ('problem = "metaworld-pick-place"\n[control]\ntrain_tasks = 46', ["control.train_tasks = 46", "1 to 45"]),
         ('problem = "metaworld-pick-place"\n[control]\nhorizon = 501', ["control.horizon = 501", "500"]),
         ('problem = "metaworld-pick-place"\n[control]\ndisturbance = 1', ["control.disturbance = 1.0", "0.1 meters"]),

@@ -297,6 +297,47 @@ def test_the_versions_that_a_fork_starts_from_are_no_checkpoint_of_its_own(tmp_p
     assert not run_folder.aside_of(folder).exists()
 
 
+@pytest.mark.parametrize("record", [None, "{", "{}"])
+@pytest.mark.parametrize("run_file", [False, True])
+def test_after_a_kill_during_a_fork_the_old_run_is_never_removed(tmp_path, module_run, record, run_file):
+    folder, aside, before = killed(tmp_path, module_run)
+    forked(folder, 1)  # the checkpoints of the parent are linked
+    (folder / "fork.json").unlink() if record is None else (folder / "fork.json").write_text(record)
+    if not run_file:
+        (folder / "run.toml").unlink()
+    elif record is None:
+        return  # that is an ordinary run with checkpoints of its own
+    for resume, overwrite in ((False, False), (True, False), (False, True)):
+        with pytest.raises(ConfigError, match="was killed"):
+            launch.prepare(module_run, folder, resume, overwrite)
+    assert files(aside) == before
+    run_folder.remove(folder)  # the remedy
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(folder) == before
+
+
+def test_a_kill_while_a_fork_is_made_keeps_the_old_run(tmp_path, module_run, monkeypatch):
+    class Killed(BaseException):
+        """Stands for SIGKILL: nothing is cleaned up."""
+
+    folder, before = started(tmp_path, module_run)
+
+    def half(source, version, run, folder):
+        forked(folder, version)
+        (folder / "fork.json").unlink()
+        raise Killed
+
+    monkeypatch.setattr(launch, "fork", half)
+    monkeypatch.setattr(run_folder, "remove", lambda folder: None)
+    monkeypatch.setattr(run_folder.FolderTransaction, "roll_back", lambda self: self._lock.close())
+    with pytest.raises(Killed):
+        launch.prepare(module_run, folder, resume=False, overwrite=True, source=(tmp_path / "parent", 1))
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match="was killed"):
+        launch.prepare(module_run, folder, resume=False, overwrite=True)
+    assert files(run_folder.aside_of(folder)) == before
+
+
 def test_an_interrupted_removal_leaves_no_run(tmp_path, monkeypatch):
     folder = write(tmp_path / "run", OURS)
     unlink, removed = Path.unlink, []

@@ -48,7 +48,7 @@ def references(run):
 def test_the_oracle_reaches_the_exact_optimum_and_other_agents_stay_below_it(small_run, untrained):
     run = dataclasses.replace(small_run, evaluate=dataclasses.replace(small_run.evaluate, seeds=60, p=(0.0, 0.4)))
     found = references(run)
-    agents = {"model": evaluate.in_context(untrained), "random": found["random"], ORACLE: found[ORACLE]}
+    agents = {"model": evaluate.in_context(untrained, untrained.run.context), "random": found["random"], ORACLE: found[ORACLE]}
     for result in evaluate.online(run, agents):
         assert result.ceiling == (result.agent == ORACLE)
         assert result.returns.shape == (len(registry.of(run).split.test), 60, 3)
@@ -60,7 +60,10 @@ def test_the_oracle_reaches_the_exact_optimum_and_other_agents_stay_below_it(sma
 
 
 def test_all_agents_have_the_same_draws(small_run, untrained):
-    agents = {"one": evaluate.in_context(untrained), "two": evaluate.in_context(untrained)}
+    agents = {
+        "one": evaluate.in_context(untrained, untrained.run.context),
+        "two": evaluate.in_context(untrained, untrained.run.context),
+    }
     one, two, *_ = evaluate.online(small_run, agents)
     np.testing.assert_array_equal(one.returns, two.returns)
 
