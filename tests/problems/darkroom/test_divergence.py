@@ -80,7 +80,7 @@ def decide_of(run: Run, model: PretrainedTransformer) -> divergence.Decide:
 def measured(run: Run, model: PretrainedTransformer, heldout: bool) -> Iterator[tuple[Divergence, Divergence]]:
     """The divergences of a model that is deployed by Algorithm 1."""
     problem = registry.of(run)
-    act = evaluate.in_context(TrainedModel(run, methods.of(run), problem.spec, model), "paper")
+    act = evaluate.in_context(TrainedModel(run, methods.of(run), problem.spec, model), run.context, "paper")
     return problem.posterior.divergences(run, decide_of(run, model), act, heldout)
 
 
