@@ -28,6 +28,17 @@ class RandomKey(enum.IntEnum):
     """Calibration episodes of the out-of-distribution score: (task, row, episode)."""
     POSTERIOR_SUITE = 106
     """Contexts, queries and bootstrap of the comparison with the exact posterior."""
+    RESULTS = 107
+    """Bootstrap of the intervals in tables of results; its seed is 0, so equal rows give equal intervals."""
+
+
+def strength_key(p: float) -> int:
+    """The number of a strength p in [0, 1] in the identity of an evaluation's episodes: p in units of 1e-9, 0 for p = 0.
+
+    It depends on p alone, so an evaluation at p has the same draws whichever other strengths are evaluated.  It
+    is below 2**32, one word of a spawn key, so identities with and without disturbance have equal lengths.
+    """
+    return round(p * 1e9)
 
 
 def sequence(seed: int, key: RandomKey, *what: int) -> np.random.SeedSequence:

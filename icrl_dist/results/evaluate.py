@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.random_keys import strength_key
 from icrl_dist.config.run import Deployment, Run
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
@@ -91,10 +92,10 @@ def online(
     ``tasks``: where to deploy; None: the evaluated tasks.
     """
     problem, results = registry.of(run), []
-    for level, p in enumerate(run.evaluate.p):
+    for p in run.evaluate.p:
         chosen = variations(run, p, tasks)
         optimum = None if problem.exact is None else problem.exact.optimum(chosen)
-        rows, ids = _rows(run, chosen, level)
+        rows, ids = _rows(run, chosen, p)
         for name, agent in agents.items():
             env = problem.batch(rows)
             trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
@@ -119,10 +120,10 @@ def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | N
     assert problem.exact is not None
     references = problem.references(run)
     sources = {"random": references["random"], "expert": next(one for one in references.values() if one.ceiling)}
-    for level, p in enumerate(run.evaluate.p):
+    for p in run.evaluate.p:
         chosen = variations(run, p)
         optimum = problem.exact.optimum(chosen)
-        rows, ids = _rows(run, chosen, level)
+        rows, ids = _rows(run, chosen, p)
         env = problem.batch(rows)
         for source, behavior in sources.items():
             data = episode(env, behavior.make(rows, env), [i.rng(run.seed) for i in ids])
@@ -143,7 +144,7 @@ def _accepts_data(policy: Policy) -> TypeGuard[OfflinePolicy]:
     return hasattr(policy, "append")
 
 
-def _rows(run: Run, chosen: Sequence[Variation], level: int) -> tuple[list[Variation], list[Identity]]:
+def _rows(run: Run, chosen: Sequence[Variation], p: float) -> tuple[list[Variation], list[Identity]]:
     """Every variation ``evaluate.seeds`` times, and the identity of each row's first episode."""
     pairs = [(i, seed) for i in range(len(chosen)) for seed in range(run.evaluate.seeds)]
-    return [chosen[i] for i, _ in pairs], [Identity("evaluate", level, i, seed, 0) for i, seed in pairs]
+    return [chosen[i] for i, _ in pairs], [Identity("evaluate", strength_key(p), i, seed, 0) for i, seed in pairs]

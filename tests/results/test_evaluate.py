@@ -68,6 +68,20 @@ def test_all_agents_have_the_same_draws(small_run, untrained):
     np.testing.assert_array_equal(one.returns, two.returns)
 
 
+def test_the_draws_at_one_p_are_the_same_alone_and_in_any_list(small_run):
+    def returns(*levels):
+        evaluated = dataclasses.replace(small_run.evaluate, p=levels, seeds=5)
+        agents = {"random": references(small_run)["random"]}
+        found = evaluate.online(dataclasses.replace(small_run, evaluate=evaluated), agents)
+        return {result.p: result.returns for result in found}
+
+    alone, listed, turned = returns(0.3), returns(0.0, 0.2, 0.3), returns(0.3, 0.0)
+    np.testing.assert_array_equal(alone[0.3], listed[0.3])
+    np.testing.assert_array_equal(alone[0.3], turned[0.3])
+    np.testing.assert_array_equal(listed[0.0], turned[0.0])
+    assert not np.array_equal(listed[0.2], listed[0.3])
+
+
 def test_held_out_variations_start_in_the_origin(small_run):
     chosen = evaluate.variations(small_run, 0.2)
     assert [v.task.vector("goal") for v in chosen] == [t.vector("goal") for t in registry.of(small_run).split.test]
