@@ -1,7 +1,7 @@
 """Robust in-context reinforcement learning, distributed.
 
 ``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in;
-``oracle`` computes exact solutions of Dark Room.
+``oracle`` computes exact solutions of Dark Room; ``read_results`` reads the returns of evaluations.
 """
 
 from __future__ import annotations
@@ -15,11 +15,24 @@ if TYPE_CHECKING:
     from icrl_dist.interfaces import Method, Problem
     from icrl_dist.problems.darkroom import solver as oracle
     from icrl_dist.problems.registry import make
+    from icrl_dist.results.rows import read_results
     from icrl_dist.types import NULL, Adversary, Task, Variation
 
 __version__ = "0.1.0"
 
-__all__ = ["NULL", "Adversary", "InContextAgent", "Method", "Problem", "Task", "Variation", "load_agent", "make", "oracle"]
+__all__ = [
+    "NULL",
+    "Adversary",
+    "InContextAgent",
+    "Method",
+    "Problem",
+    "Task",
+    "Variation",
+    "load_agent",
+    "make",
+    "oracle",
+    "read_results",
+]
 
 _MODULES = {
     "InContextAgent": "icrl_dist.agent.in_context_agent",
@@ -27,6 +40,7 @@ _MODULES = {
     "Method": "icrl_dist.interfaces",
     "Problem": "icrl_dist.interfaces",
     "make": "icrl_dist.problems.registry",
+    "read_results": "icrl_dist.results.rows",
     "NULL": "icrl_dist.types",
     "Adversary": "icrl_dist.types",
     "Task": "icrl_dist.types",

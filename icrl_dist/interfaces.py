@@ -207,6 +207,8 @@ class Problem(abc.ABC):
     """Fields of the section that a fork may change, because neither the tasks nor their split depend on them."""
     job_kinds: ClassVar[Mapping[str, JobKind]] = {}
     """Kinds of jobs that only this problem has."""
+    agent_names: ClassVar[Mapping[str, str]] = {}
+    """What tables call reference agents, by the agents' keys; an agent that is missing here is called by its key."""
     earns_in_contexts: ClassVar[bool] = True
     """Whether episodes of pretraining contexts should have returns above 0; if False, returns of 0 raise no alert."""
 
@@ -247,7 +249,11 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def references(self, run: Run) -> dict[str, Reference]:
-        """The reference agents by the name that tables show, in the tables' order."""
+        """The reference agents by key, in the tables' order.
+
+        Result rows hold the keys (docs/data.md), so a key never changes; ``agent_names`` holds the names that tables
+        show.  ``random`` is the random policy, ``expert`` a policy trained in the task.
+        """
 
     # Optional parts: a problem that has a part overrides the property.
 
@@ -400,6 +406,17 @@ class TrajectoryDataset(Protocol):
         ...
 
 
+class RatedVariation(NamedTuple):
+    """Trials of the model in one training variation, and how good the labels are that it made from them."""
+
+    trials: Sequence[Trajectory]
+    """In the order of ``Identity.trial``."""
+    optimum: float
+    """Expected return of the optimal policy."""
+    agreement: float | None
+    """Share of the labels that are optimal; None if the trials gave no labels."""
+
+
 Draw = Callable[[np.random.Generator], Any]
 """Draws one training batch; the same generator state gives the same batch."""
 
@@ -485,6 +502,6 @@ class Method(abc.ABC):
         """
         return None
 
-    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> dict[str, float]:
-        """Quality of the labels that the model made itself in a phase; empty if it made none or quality is unknown."""
-        return {}
+    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Iterator[RatedVariation]:
+        """The variations that the model labelled itself in a phase; none if it labelled none or quality is unknown."""
+        yield from ()

@@ -16,6 +16,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
+from icrl_dist.results import training_rows
 from icrl_dist.storage import checkpoint, files
 from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
@@ -249,9 +250,10 @@ class Service:
                 f"quarantined; first: {next(iter(causes.values()))}"
             )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
-        quality = self._method.label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
-        if quality:
-            self._reporter.labels_rated(phase.round, quality)
+        if phase.next_version > self.version:
+            rated = self._method.label_quality(self._run, phase, self.store)
+            if quality := training_rows.rate_labels(self._run, self._folder, phase, rated):
+                self._reporter.labels_rated(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
         """Fit the model to the data of a phase, write its checkpoint and publish its weights."""

@@ -272,7 +272,7 @@ def _evaluation(trained: TrainedModel, budget_s: float) -> float:
         times[:] = [time.perf_counter()]
         small = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, p=run.evaluate.p[-1:]))
         with contextlib.suppress(_BudgetSpent):
-            evaluate.online(small, {"one": make}, count)
+            evaluate.online(small, {evaluate.Agent("one"): make}, count)
         spent = _extrapolated(np.diff(times), run.evaluate.episodes, run.context.max // trained.spec.horizon)
         total += copies * len(run.evaluate.p) * spent
     return total

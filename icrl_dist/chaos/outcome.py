@@ -24,7 +24,7 @@ class ReferenceRun:
 
     result: dict[str, Any]
     disk_bytes: int
-    """Bytes that its folder occupies, without the report."""
+    """Bytes that its folder occupies, without reports and result rows."""
     seconds: float
 
     @classmethod
@@ -39,7 +39,9 @@ class ReferenceRun:
             raise ConfigError(f"--reference {folder}: holds no result of a finished run ({error})") from None
         if dataclasses.replace(load(str(folder / "run.toml")), evaluate=run.evaluate) != run:
             raise ConfigError(f"--reference {folder}: is a run with other settings; omit --reference to run one with these")
-        return cls(result, allocated(folder) - allocated(folder / "report"), float(result["seconds"]))
+        return cls(
+            result, allocated(folder) - allocated(folder / "report") - allocated(folder / "results"), float(result["seconds"])
+        )
 
     def equals(self, result: dict[str, Any]) -> bool:
         """Whether another run's result equals this one's."""

@@ -52,9 +52,10 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     from icrl_dist.console.display import Display
     from icrl_dist.methods import registry as methods
     from icrl_dist.results import heldout
+    from icrl_dist.results.rows import is_unfinished
     from icrl_dist.storage.checkpoint import load_checkpoint
 
-    what, folder = _source_and_report(arguments)
+    what, folder = _source_and_output(arguments)
     checkpoint = load_checkpoint(checkpoint_file(what))
     run = parse(str(checkpoint.manifest.get("run", "")), str(what))
     options = {name: getattr(arguments, name) for name in ("episodes", "seeds", "p", "prior")}
@@ -66,29 +67,40 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     heldout.check_suite(run, arguments.suite)
     deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or methods.of(run).deployment(run)
     answer: dict[str, Any] = {"suite": arguments.suite, "deploy": deploy, "what": str(what)}
-    report = folder / heldout.report_name(run, what, arguments.suite, deploy)
+    report = folder / "report" / heldout.report_name(run, what, arguments.suite, deploy)
+    results = _results_folder(folder)
+    if arguments.what is not None and is_unfinished(what):
+        console.print(
+            f"{what}: this run is not finished; the newest version so far is evaluated", highlight=False, markup=False
+        )
     if arguments.suite == "online":
         with Display(console) as display:
-            results = heldout.online(run, what, display, arguments.deploy)
-        answer |= heldout.show_online(run, report, *results, console)
+            frame = heldout.online(run, what, results, display, arguments.deploy)
+        answer |= heldout.show_online(run, report, frame, console)
     elif arguments.suite == "posterior":
         with Display(console) as display:
-            divergences = heldout.posterior(run, what, display)
+            divergences = heldout.posterior(run, what, results, display)
         answer |= heldout.show_posterior(run, report, divergences, console)
     else:
-        answer |= heldout.show_offline(heldout.offline(run, what, arguments.deploy), console)
+        answer |= heldout.show_offline(heldout.offline(run, what, results, arguments.deploy), console)
     if arguments.json:
         print(json.dumps(answer))
     return OK
 
 
-def _source_and_report(arguments: EvaluateArguments) -> tuple[Path, Path]:
-    """The run folder or checkpoint to evaluate, and the folder of its report."""
+def _source_and_output(arguments: EvaluateArguments) -> tuple[Path, Path]:
+    """The run folder or checkpoint to evaluate, and the folder that its report and result rows are written below."""
     from icrl_dist.agent.loading import shipped
 
     what, name = arguments.what, arguments.pretrained
     if what is not None and name is None:
-        return what, (what if what.is_dir() else what.parent) / "report"
+        return what, what if what.is_dir() else what.parent
     if what is None and name is not None:
-        return shipped(name), Path("runs") / f"{name}-pretrained" / "report"
+        return shipped(name), Path("runs") / f"{name}-pretrained"
     raise ConfigError("evaluate: name a run folder or a checkpoint file, or with --pretrained an agent of the package")
+
+
+def _results_folder(folder: Path) -> Path:
+    """Where the result rows are written: rows of a checkpoint in a run folder belong to that run."""
+    run = folder.parent if folder.name == "checkpoints" and (folder.parent / "run.toml").exists() else folder
+    return run / "results"

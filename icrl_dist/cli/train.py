@@ -114,7 +114,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
                 if trains:
                     with launch.interruptible():
                         heldout.save_calibrated(folder, display)
-                        results = heldout.online(run, folder, display)
+                        frame = heldout.online(run, folder, folder / "results", display)
         except launch.TrainInterrupted:
             text = f"`{_resume_command(arguments.given)}` continues from the checkpoint"
             if transaction.rolled_back or not folder.exists():
@@ -123,9 +123,9 @@ def train(arguments: TrainArguments, console: Console) -> int:
             return INTERRUPTED
         result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
         if not trains:
-            evaluation = heldout.show_experts(folder, console)
+            evaluation = heldout.show_experts(run, folder, console)
         else:
-            evaluation = heldout.show_online(run, folder / "report" / heldout.report_name(run, folder), *results, console)
+            evaluation = heldout.show_online(run, folder / "report" / heldout.report_name(run, folder), frame, console)
         result = run_folder.final_result(folder, result, evaluation)
         atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     console.print(

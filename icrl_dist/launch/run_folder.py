@@ -35,6 +35,7 @@ _NAMES = {
     "crashes": r".+-\d+\.json|.+\.stacks",
     "dataset": r"segment-\d+\.frames",
     "report": _REPORTS,
+    "results": r"(online|offline|posterior|label_quality|experts)-[0-9a-f]{8}-\d{8}T\d{6}\.\d{6}Z\.parquet",
     "tensorboard": r"events\.out\.tfevents\..+",
     "": r"(run\.toml|env\.json|fork\.json|result\.json|metrics\.jsonl|agent\.npz|learner\.log|learner\.err|endpoint|\.lock)",
 }

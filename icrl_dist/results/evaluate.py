@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeGuard
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.random_keys import strength_key
@@ -15,52 +16,88 @@ from icrl_dist.config.run import Deployment, Run
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
 from icrl_dist.problems import registry
-from icrl_dist.results.statistics import mean_and_error
+from icrl_dist.results.rows import Block
 from icrl_dist.rollout.episode import OfflinePolicy, deploy_offline, deploy_online, episode
-from icrl_dist.types import Identity, Task, Variation
+from icrl_dist.types import Adversary, Identity, Task, Variation
+
+
+class Agent(NamedTuple):
+    """Names an evaluated agent in result rows; see the columns of the same names in docs/data.md."""
+
+    key: str
+    """``t2`` for T^2, or the key of a reference agent."""
+    deployment: str = ""
+    policy_version: int = -1
+    weights_digest: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Returns of one agent under adversaries of one strength, and the optimum of the same variations where it is known."""
+    """Returns of one agent under adversaries of one strength, with what is known of the same variations."""
 
-    agent: str
+    agent: Agent
     p: float
     returns: Float[np.ndarray, "tasks seeds episodes"]
-    optimum: Float[np.ndarray, " tasks"] | None
+    variations: tuple[Variation, ...]
+    """One per task."""
+    optimum: Float[np.ndarray, " tasks"] | None = None
     """Expected return of the optimal policy in each task's variation; None for a problem without exact answers."""
     ceiling: bool = False
     """The agent is given the task, so other returns are also shown as a share of its returns."""
-    broken: int = 0
-    """Episodes that ended early because the simulation diverged; their return up to that step counts."""
+    diverged: Bool[np.ndarray, "tasks seeds episodes"] | None = None
+    """Episodes that ended early because the simulation diverged; None if it cannot."""
+    data: str = ""
+    """Offline: the agent whose episode is the context."""
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+    """More columns of the result rows, of the shape of ``returns``."""
 
-    def last(self, episodes: int) -> float:
-        """Mean return over the last episodes."""
-        return float(self.returns[:, :, -episodes:].mean())
-
-    def first_over(self, oracle: Result, episodes: int) -> float:
-        """Mean return over the first episodes (or all, if there are fewer), as a share of the oracle's in these episodes."""
-        return round(float(self.returns[:, :, :episodes].mean() / oracle.returns[:, :, :episodes].mean()), 4)
-
-    def episode_of(self, oracle: Result, share: float) -> int | None:
-        """First episode, from 1, whose mean return is at least this share of the oracle's mean over all episodes; or None."""
-        good = self.returns.mean(axis=(0, 1)) >= share * oracle.returns.mean()
-        return int(good.argmax()) + 1 if good.any() else None
-
-    def row(self) -> dict[str, Any]:
-        """The result as plain values, for JSON."""
-        mean, error = mean_and_error(self.returns)
-        best = None if self.optimum is None else float(self.optimum.mean())
+    def block(self, run: Run, name: str, tasks: str) -> Block:
+        """The result as result rows.  ``name``: of the run; ``tasks``: which tasks these are."""
+        shape = self.returns.shape
+        task, seed, number = (index.ravel() for index in np.indices(shape))
+        adversaries = [one.adversary for one in self.variations]
+        optimum = np.full(shape[0], np.nan) if self.optimum is None else self.optimum
+        diverged = np.zeros(shape, bool) if self.diverged is None else self.diverged
         return {
-            "agent": self.agent,
+            **of_run(run, name),
+            "tasks": tasks,
+            "agent": self.agent.key,
+            "policy_version": self.agent.policy_version,
+            "weights_digest": self.agent.weights_digest,
+            "deployment": self.agent.deployment,
+            "ceiling": self.ceiling,
+            "data": self.data,
+            "prior": run.evaluate.prior,
+            "task_index": task,
+            "task": np.array([parameters(one.task) for one in self.variations], object)[task],
             "p": self.p,
-            "episodes": [round(float(m), 3) for m in mean],
-            "standard_error": [None if np.isnan(e) else round(float(e), 3) for e in error],
-            "optimum": None if best is None else round(best, 3),
-            "last5": round(self.last(5), 3),
-            "last5_over_optimum": None if best is None else round(self.last(5) / best, 4),
-            **({"broken": self.broken} if self.broken else {}),
+            "adversary_family": np.array([adversary.kind for adversary in adversaries], object)[task],
+            "adversary_index": task,
+            "adversary": np.array([parameters(adversary) for adversary in adversaries], object)[task],
+            "evaluation_seed": seed,
+            "episode": number,
+            "return": self.returns.ravel(),
+            "optimum": optimum[task],
+            "diverged": diverged.ravel(),
+            **{name: values.ravel() for name, values in self.extra.items()},
         }
+
+
+def of_run(run: Run, name: str) -> Block:
+    """The columns of result rows that are equal in all rows of a run."""
+    problem = registry.of(run)
+    return {
+        "run": name,
+        "method": run.method,
+        "problem": run.problem,
+        "training_seed": run.seed,
+        "split_seed": getattr(problem.config, "split_seed", None),
+    }
+
+
+def parameters(of: Task | Adversary) -> str:
+    """The parameters of a task or an adversary as JSON, with sorted names."""
+    return json.dumps(dict(of.params), sort_keys=True)
 
 
 def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple[Variation, ...]:
@@ -83,7 +120,7 @@ def in_context(trained: TrainedModel, context: ContextConfig, deploy: Deployment
 
 def online(
     run: Run,
-    agents: Mapping[str, MakePolicy | Reference],
+    agents: Mapping[Agent, MakePolicy | Reference],
     progress: Callable[[str, float, int], None] = lambda agent, p, episodes: None,
     tasks: Sequence[Task] | None = None,
 ) -> list[Result]:
@@ -96,21 +133,22 @@ def online(
         chosen = variations(run, p, tasks)
         optimum = None if problem.exact is None else problem.exact.optimum(chosen)
         rows, ids = _rows(run, chosen, p)
+        shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
         for name, agent in agents.items():
             env = problem.batch(rows)
             trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
-            returns, broken = [], 0
+            returns, broken = [], []
             made, ceiling = (agent.make, agent.ceiling) if isinstance(agent, Reference) else (agent, False)
             for ran in deploy_online(env, made(rows, env), trials):
                 returns.append(ran.returns)
-                broken += 0 if ran.diverged is None else int(ran.diverged.sum())
-                progress(name, p, len(returns))
-            shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
-            results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum, ceiling, broken))
+                broken.append(np.zeros(len(rows), bool) if ran.diverged is None else ran.diverged)
+                progress(name.key, p, len(returns))
+            values, diverged = (np.stack(of, axis=1).reshape(shape) for of in (returns, broken))
+            results.append(Result(name, p, values, chosen, optimum, ceiling, diverged))
     return results
 
 
-def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
+def offline(run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
     """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
 
     Deploys every model, and every reference that accepts data of other policies.  Only for a problem with
@@ -118,25 +156,25 @@ def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | N
     """
     problem, results = registry.of(run), []
     assert problem.exact is not None
-    references = problem.references(run)
-    sources = {"random": references["random"], "expert": next(one for one in references.values() if one.ceiling)}
+    references = {Agent(key): reference for key, reference in problem.references(run).items()}
+    expert = next(agent for agent, one in references.items() if one.ceiling)
     for p in run.evaluate.p:
         chosen = variations(run, p)
         optimum = problem.exact.optimum(chosen)
         rows, ids = _rows(run, chosen, p)
         env = problem.batch(rows)
-        for source, behavior in sources.items():
-            data = episode(env, behavior.make(rows, env), [i.rng(run.seed) for i in ids])
-            shape = (len(chosen), run.evaluate.seeds, 1)
-            results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
-            policies: dict[str, Policy] = {
+        shape = (len(chosen), run.evaluate.seeds, 1)
+        for source, behavior in (("random", Agent("random")), ("expert", expert)):
+            data = episode(env, references[behavior].make(rows, env), [i.rng(run.seed) for i in ids])
+            results.append(Result(behavior, p, data.returns.reshape(shape), chosen, optimum))
+            policies: dict[Agent, Policy] = {
                 name: in_context(one, run.context, deploy)(rows, env) for name, one in models.items()
             }
             policies |= {name: one.make(rows, env) for name, one in references.items()}
             for name, policy in policies.items():
                 if _accepts_data(policy):
                     ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
-                    results.append(Result(f"{name}, {source} data", p, ran.returns.reshape(shape), optimum))
+                    results.append(Result(name, p, ran.returns.reshape(shape), chosen, optimum, data=source))
     return results
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 
 from icrl_dist.agent import ood_score
@@ -22,23 +21,33 @@ from icrl_dist.console.display import Display
 from icrl_dist.interfaces import Batch, MakePolicy, Method, Policy, Reference
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
-from icrl_dist.results import evaluate, plots
+from icrl_dist.results import evaluate, plots, rows, summaries, training_rows
 from icrl_dist.results import posterior as posterior_suite
+from icrl_dist.results.evaluate import Agent
+from icrl_dist.results.names import key_of
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Variation
 
+if TYPE_CHECKING:
+    import pandas as pd
 
-def models(what: Path) -> dict[str, TrainedModel]:
-    """The newest model and, in a run folder with adapted versions, T^0; by the name that tables show."""
-    newest = load_checkpoint(checkpoint_file(what))
-    version = newest.manifest["version"]
-    found = {f"T^{version} ({newest.manifest['method']})": trained(newest)}
-    if what.is_dir() and version > 0:
-        found["T^0"] = trained(load_checkpoint(checkpoint_file(what, 0)))
-    return found
+
+def models(what: Path, deploy: Deployment | None = None) -> dict[Agent, TrainedModel]:
+    """The newest model and, in a run folder with adapted versions, T^0, each with the rule that deploys it."""
+    file = checkpoint_file(what)
+    files = [file]
+    if what.is_dir() and load_checkpoint(file).manifest["version"] > 0:
+        files.append(checkpoint_file(what, 0))
+    return dict(_agent(load_checkpoint(file), deploy) for file in files)
+
+
+def _agent(checkpoint: Checkpoint, deploy: Deployment | None = None) -> tuple[Agent, TrainedModel]:
+    model, version = trained(checkpoint), int(checkpoint.manifest["version"])
+    rule = deploy or model.method.deployment(model.run)
+    return Agent(key_of(version), rule, version, str(checkpoint.manifest.get("weights_digest", ""))), model
 
 
 def calibrate(what: Path, display: Display) -> Checkpoint:
@@ -77,17 +86,17 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     return f"{suite}-{prefix}{agent}-{rule}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
 
 
-def online(
-    run: Run, what: Path, display: Display, deploy: Deployment | None = None
-) -> tuple[list[evaluate.Result], dict[str, Any]]:
-    """Online returns of the folder's models, the newest first, and of the problem's references.
+def online(run: Run, what: Path, results: Path, display: Display, deploy: Deployment | None = None) -> pd.DataFrame:
+    """Online returns of the folder's models, the newest first, and of the problem's references, as result rows.
 
-    Models are deployed by ``deploy``; None: by the rule that they were trained for.  If that rule is not
-    Algorithm 1, the newest model is deployed by Algorithm 1 as well.  The second result is the OOD score
-    of the newest model after the last episode, by p; empty if it was not calibrated.
+    The rows are written to the folder ``results``.  Models are deployed by ``deploy``; None: by the rule that they
+    were trained for.  If that rule is not Algorithm 1, the newest model is deployed by Algorithm 1 as well.  Rows of
+    the newest model have the OOD score after the last episode if it was calibrated.
     """
-    found, problem = models(what), registry.of(run)
-    policies = {name: evaluate.in_context(model, run.context, deploy) for name, model in found.items()}
+    found, problem = models(what, deploy), registry.of(run)
+    agents: dict[Agent, MakePolicy | Reference] = {
+        agent: evaluate.in_context(model, run.context, deploy) for agent, model in found.items()
+    }
     newest, model = next(iter(found.items()))
     scores: list[Surprise] = []
     if outcomes := outcomes_of(load_checkpoint(checkpoint_file(what))):
@@ -96,18 +105,32 @@ def online(
             scores.append(Surprise(outcomes, model.spec, len(rows)))
             return model.method.policy(model.model, len(rows), run.context, deploy, scores[-1].observe)
 
-        policies[newest] = scored
-    if (deploy or model.method.deployment(run)) != "paper":
-        policies[f"{newest}, Algorithm 1"] = evaluate.in_context(model, run.context, "paper")
-    agents: dict[str, MakePolicy | Reference] = {**policies, **problem.references(run)}
+        agents[newest] = scored
+    if newest.deployment != "paper":
+        agents[newest._replace(deployment="paper")] = evaluate.in_context(model, run.context, "paper")
+    agents |= {Agent(key): reference for key, reference in problem.references(run).items()}
     if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
         display.report({"event": "note", "text": missing})
-    results = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
-    return results, {f"{p:g}": _spread(one.score()) for p, one in zip(run.evaluate.p, scores, strict=False)}
+    evaluated = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
+    for one, score in zip((one for one in evaluated if one.agent == newest), scores, strict=False):
+        column = np.full(one.returns.shape, np.nan)
+        column[:, :, -1] = score.score().reshape(column.shape[:2])
+        one.extra["surprise"] = column
+    return _recorded(run, what, results, "online", {"evaluated": evaluated}, deploy)
 
 
-def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
-    return {"median": round(float(np.median(values)), 2), "above_1": round(float((values > 1).mean()), 4)}
+def _recorded(
+    run: Run,
+    what: Path,
+    results: Path,
+    suite: str,
+    found: Mapping[str, Sequence[evaluate.Result]],
+    deploy: Deployment | None = None,
+) -> pd.DataFrame:
+    """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows as they were read."""
+    name = what.resolve().name if what.is_dir() else what.stem
+    blocks = [one.block(run, name, tasks) for tasks, ones in found.items() for one in ones]
+    return rows.read([rows.append(results, suite, report_name(run, what, suite, deploy), blocks)])
 
 
 def check_suite(run: Run, suite: str) -> None:
@@ -119,62 +142,52 @@ def check_suite(run: Run, suite: str) -> None:
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
 
 
-def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
-    """Offline returns of the folder's models and of references, given random and expert data."""
-    return evaluate.offline(run, models(what), deploy)
+def offline(run: Run, what: Path, results: Path, deploy: Deployment | None = None) -> pd.DataFrame:
+    """Offline returns of the folder's models and of references, given random and expert data; see ``online``."""
+    evaluated = evaluate.offline(run, models(what, deploy), deploy)
+    return _recorded(run, what, results, "offline", {"evaluated": evaluated}, deploy)
 
 
-def show_online(
-    run: Run, report: Path, results: list[evaluate.Result], scores: dict[str, Any], console: Console
-) -> dict[str, Any]:
-    """Print the table; write the rows to ``report``.json and the figure to ``report``.png.  Returns both, and summaries."""
-    rows = [result.row() for result in results]
-    adapted = _adaptation(results)
-    title = f"{run.method.upper()} on {registry.of(run).title(len(results[0].returns))}, {run.evaluate.seeds} seeds"
-    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(rows, indent=1).encode()))
-    figure = plots.adaptation(rows, report.with_name(f"{report.name}.png"), title)
-    console.print(returns_table(results, f"Return by online episode: {title}"))
-    for one in results:
-        if one.broken:
-            text = f"{one.agent}, p = {one.p:g}: the simulation diverged in {one.broken} of {one.returns.size} episodes; "
+def show_online(run: Run, report: Path, frame: pd.DataFrame, console: Console) -> dict[str, Any]:
+    """Print the table; write the numbers to ``report``.json and the figure to ``report``.png.  Returns both, and summaries."""
+    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), summaries.returns(frame)
+    _, tasks, evaluations, _ = found[0].returns.shape
+    title = f"{run.method.upper()} on {registry.of(run).title(tasks)}, {evaluations} seeds"
+    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
+    figure = plots.adaptation(numbers, report.with_name(f"{report.name}.png"), title)
+    console.print(returns_table(frame, f"Return by online episode: {title}"))
+    for one in found:
+        if one.diverged:
+            text = f"{one.name}, p = {one.p:g}: the simulation diverged in {one.diverged} of {one.returns.size} episodes; "
             console.print(text + "their return up to that step counts", highlight=False, markup=False)
     for p, score in scores.items():
         text = f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
         console.print(text, highlight=False, markup=False)
     console.print(f"figure {figure}", highlight=False, markup=False)
-    return {**adapted, "surprise": scores, "rows": rows, "figure": str(figure)}
+    return {**summaries.adaptation(frame), "surprise": scores, "rows": numbers, "figure": str(figure)}
 
 
-def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:
-    """How fast the newest model adapts, by p: ``Result.first_over`` and ``Result.episode_of`` relative to the oracle."""
-    oracle = {result.p: result for result in results if result.ceiling and result.optimum is not None}
-    if not oracle:
-        return {}
-    newest = [result for result in results if result.agent == results[0].agent]
-    return {
-        "first10_over_oracle": {f"{one.p:g}": one.first_over(oracle[one.p], 10) for one in newest},
-        "episode_of_90": {f"{one.p:g}": one.episode_of(oracle[one.p], 0.9) for one in newest},
-    }
+def show_experts(run: Run, folder: Path, console: Console) -> dict[str, Any]:
+    """Print the returns of the first and the last recorded episode of each expert; returns them.
 
-
-def show_experts(folder: Path, console: Console) -> dict[str, Any]:
-    """Print the returns of the first and the last recorded episode of each expert; returns the rows."""
+    The returns of all recorded episodes are written as result rows.
+    """
     data = Dataset(folder / "dataset", readonly=True)
-    rows = []
-    for key in data.variations("pretrain", 0):
-        trials = data.trials(key)
-        params = {name: round(value, 4) for name, value in trials[0].variation.task.params if isinstance(value, float)}
-        kind, ends = trials[0].variation.adversary.kind, (trials[0], trials[-1])
-        rows.append({"task": params, "adversary": kind, "returns": [round(trial.episode_return, 2) for trial in ends]})
+    blocks = [training_rows.of_expert(run, folder.name, data.trials(key)) for key in data.variations("pretrain", 0)]
     data.close()
-    console.print(experts_table(rows))
-    return {"experts": rows}
+    frame = rows.read([rows.append(folder / "results", "experts", {}, blocks)])
+    experts = summaries.experts(frame)
+    console.print(experts_table(experts))
+    return {"experts": experts}
 
 
-def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
-    """Comparison of the newest model with the exact posterior, on training and on held-out tasks."""
-    model = trained(load_checkpoint(checkpoint_file(what)))
-    suite = registry.of(run).posterior
+def posterior(run: Run, what: Path, results: Path, display: Display) -> dict[str, Any]:
+    """Comparison of the newest model with the exact posterior, on training and on held-out tasks.
+
+    The online returns are written as result rows to the folder ``results``.
+    """
+    agent, model = _agent(load_checkpoint(checkpoint_file(what)), "paper")
+    suite, split = registry.of(run).posterior, registry.of(run).split
     decide = functools.partial(model.method.distributions, model.model)
     act = evaluate.in_context(model, run.context, "paper")
     report: dict[str, Any] = {}
@@ -188,11 +201,13 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
         for prior, ones in zip(suite.priors, zip(*found, strict=True), strict=True):
             report |= {f"{name}{prior}{part}": value for part, value in suite.summary(ones).items()}
             report[f"{name}{prior}_curves"] = suite.curves(ones)
-    split = registry.of(run).split
-    for name, heldout in (("paper_gap", True), ("paper_gap_train", False)):
-        tasks = split.test if heldout else split.train[: len(split.test)]
-        progress = _count(display, f"online, {_goals(heldout)}", run, 2)
-        report[name] = posterior_suite.gaps(run, act, tasks, progress)
+    evaluated = {}
+    for name, tasks in (("test", split.test), ("train", split.train[: len(split.test)])):
+        progress = _count(display, f"online, {_goals(name == 'test')}", run, 2)
+        evaluated[name] = posterior_suite.online(run, (agent, act), tasks, progress)
+    frame = _recorded(run, what, results, "posterior", evaluated, "paper")
+    for name, which in (("paper_gap", "test"), ("paper_gap_train", "train")):
+        report[name] = posterior_suite.gaps(frame[frame["tasks"] == which], run.seed)
     return report
 
 
@@ -226,7 +241,7 @@ def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str
     return progress
 
 
-def show_offline(results: list[evaluate.Result], console: Console) -> dict[str, Any]:
-    """Print the table; returns the rows."""
-    console.print(returns_table(results, "One episode given data collected before, on goals never trained on"))
-    return {"rows": [result.row() for result in results]}
+def show_offline(frame: pd.DataFrame, console: Console) -> dict[str, Any]:
+    """Print the table; returns the numbers."""
+    console.print(returns_table(frame, "One episode given data collected before, on goals never trained on"))
+    return {"rows": summaries.result_rows(frame)}

@@ -1,4 +1,4 @@
-"""Figures of evaluations.  They use only the rows of a report."""
+"""Figures of evaluations, from numbers that are computed from result rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PRIORS = {"": "own adversaries", "_any": "any adversary"}
 def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Path:
     """Return per online episode, one panel for each p (Figures 3b and 3d); exact agents are gray, the oracle is a line.
 
-    ``rows``: of ``evaluate.Result.row``.  Returns ``path``.
+    ``rows``: of ``summaries.result_rows``.  Returns ``path``.
     """
     pyplot = _pyplot()
     from matplotlib.ticker import MaxNLocator
@@ -37,7 +37,7 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
         episodes = range(1, len(here[0]["episodes"]) + 1)
         for (color, dashes), row in zip(_EXACT, [r for r in here if _is_exact(r)], strict=False):
             axis.plot(episodes, row["episodes"], color=color, linestyle=dashes, label=row["agent"], linewidth=1.2)
-        learned = [r for r in here if r["agent"] != "oracle" and not _is_exact(r)]
+        learned = [r for r in here if r["key"] != "oracle" and not _is_exact(r)]
         for color, row in zip(itertools.cycle(COLORS), learned, strict=False):
             error = [e or 0.0 for e in row["standard_error"]]
             low = [m - e for m, e in zip(row["episodes"], error, strict=True)]
@@ -112,7 +112,7 @@ def _by_prefix(axis: Any, curves: Sequence[Mapping[str, Any]], width: int = 5) -
 
 
 def _is_exact(row: Mapping[str, Any]) -> bool:
-    return str(row["agent"]).startswith("exact")
+    return str(row["key"]).startswith("exact:")
 
 
 def _pyplot() -> Any:

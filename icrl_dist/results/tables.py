@@ -1,58 +1,101 @@
-"""Tables of results for the terminal."""
+"""Tables of results for the terminal, computed from result rows."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.table import Table
 
-from icrl_dist.results.evaluate import Result
+from icrl_dist.config.run import ConfigError
+from icrl_dist.results import comparison, statistics, summaries
+from icrl_dist.results.summaries import LAST, Interval
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
-def returns_table(results: Sequence[Result], title: str) -> Table:
-    """Mean return by online episode, one row per agent and p.
+def returns_table(frame: pd.DataFrame, title: str) -> Table:
+    """Mean return by online episode, one row per agent and p, with 95% intervals of the last episodes.
 
-    The last column is the return of the last episodes as a share of the first reference that is a ceiling
-    (oracle, scripted policy or experts), or of the exact optimum if there is none.
+    ``frame``: result rows of one suite.  The last column is the return of the last episodes as a share of the first
+    reference that is a ceiling (oracle, scripted policy or experts), or of the exact optimum if there is none.
     """
-    episodes = results[0].returns.shape[2]
-    shown = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes]
-    last = min(5, episodes)
-    table = Table(title=title, title_justify="left")
-    table.add_column("p", justify="right")
-    table.add_column("agent")
-    for e in shown:
-        table.add_column(f"ep {e}", justify="right")
-    table.add_column(f"last {last}", justify="right")
-    ceiling_agents = [r.agent for r in results if r.ceiling]
-    best = ceiling_agents[0] if ceiling_agents else "oracle" if results[0].optimum is not None else ""
+    found = summaries.returns(frame)
+    trainings, tasks, evaluations, episodes = found[0].returns.shape
+    shown, last = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes], min(LAST, episodes)
+    known = trainings * tasks * evaluations > 1  # otherwise there is nothing to resample
+    caption = f"[...]: {statistics.resampled(trainings, tasks, evaluations, last)}" if known else "one evaluation: no intervals"
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    for name in ("p", "agent", *(f"ep {e}" for e in shown), f"last {last}"):
+        table.add_column(name, justify="left" if name == "agent" else "right")
+    best, estimates = summaries.ceilings(found, last), summaries.intervals(found, last)
     if best:
-        table.add_column(f"of {best}", justify="right")
-    ceilings = {r.p: r.last(last) for r in results if r.agent == best}
-    for result in results:
-        mean = result.returns.mean(axis=(0, 1))
-        if not ceiling_agents and result.optimum is not None:
-            ceilings[result.p] = float(np.mean(result.optimum))
-        cells = [f"{mean[e - 1]:.1f}" for e in shown]
-        first = results[max(0, results.index(result) - 1)].p == result.p and results.index(result) > 0
+        table.add_column(f"of {next(iter(best.values())).name}", justify="right")
+    for before, one in zip([None, *found], found, strict=False):
+        value, share = estimates[one.p, one.agent]
+        mean, _ = one.by_episode()
         table.add_row(
-            "" if first else f"{result.p:g}",
-            result.agent,
-            *cells,
-            f"{result.last(last):.1f}",
-            *([_share(result.last(last), ceilings[result.p])] if best else []),
+            "" if before is not None and before.p == one.p else f"{one.p:g}",
+            one.name,
+            *(f"{mean[e - 1]:.1f}" for e in shown),
+            _with_interval(value, known, "{:.1f}"),
+            *([] if share is None else [_with_interval(share, known, "{:.0%}")]),
         )
     return table
 
 
-def _share(value: float, ceiling: float) -> str:
-    return f"{value / ceiling:.0%}" if ceiling else "-"
+def _with_interval(of: Interval, known: bool, form: str) -> str:
+    if math.isnan(of.value):
+        return "-"
+    value, low, high = (form.format(number) for number in (of.value, of.low, of.high))
+    return f"{value} \\[{low}, {high}]" if known and not math.isnan(of.low) else value
+
+
+def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) -> Table:
+    """The newest model of each later frame compared with that of the first, at every p that both have.
+
+    ``frames``: result rows, each of the trainings of one method (``icrl_dist.read_results``); ``names``: what the table
+    calls them, by default the names of their models.  An effect whose 95% interval holds the value of equal agents
+    is worded "not shown".  Raises ConfigError for rows that cannot be paired (``comparison.compare``).
+    """
+    if len(frames) < 2:
+        raise ConfigError(f"compare: {len(frames)} frames were given; give at least two")
+    arms = [comparison.newest_model(frame) for frame in frames]
+    called = list(names) or [arm[0].name for arm in arms]
+    base = arms[0]
+    trainings, tasks, evaluations, episodes = base[0].returns.shape
+    over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes))
+    table = Table(
+        title=f"Return of the last {min(last, episodes)} episodes, compared with {called[0]}",
+        title_justify="left",
+        caption=f"{over}; the same resamples for both.  `not shown`: the interval holds the value of equal agents",
+        caption_justify="left",
+    )
+    for name in ("p", "statistic", called[0], "compared", "its value", "effect", "95%", "verdict"):
+        table.add_column(name, justify="left" if name in ("statistic", "compared", "verdict") else "right")
+    for name, arm in zip(called[1:], arms[1:], strict=True):
+        partners = {one.p: one for one in arm}
+        if not (shared := [one for one in base if one.p in partners]):
+            raise ConfigError(f"compare: {called[0]} and {name} were evaluated at no p in common; evaluate both at one p")
+        for one in shared:
+            rows = comparison.compare(one, partners[one.p], last)
+            for row in rows:
+                form = _FORMS.get(row.statistic, "{:+.2f}")
+                effect, low, high = (form.format(v) for v in (row.effect.value, row.effect.low, row.effect.high))
+                single = ["" if value is None else f"{value:.2f}" for value in (row.first, row.second)]
+                cells = (_STATISTICS.get(row.statistic, row.statistic), single[0], name, single[1], effect, f"{low} .. {high}")
+                table.add_row(f"{row.p:g}" if row is rows[0] else "", *cells, row.verdict, end_section=row is rows[-1])
+    return table
+
+
+_FORMS = {"ratio": "{:+.1%}", "improvement": "{:.0%}"}
+_STATISTICS = {"ratio": "ratio of means, less 1", "improvement": "probability of improvement"}
 
 
 def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return of each expert's first and last recorded episode, one row per variation."""
+    """Return of each expert's first and last recorded episode, one row per variation; ``rows``: ``summaries.experts``."""
     table = Table(title="SAC experts: return of the first and of the last recorded episode", title_justify="left")
     for name in ("task", "adversary", "first", "last"):
         table.add_column(name, justify="left" if name in ("task", "adversary") else "right")
@@ -67,7 +110,10 @@ def kl_table(report: Mapping[str, Any], suffix: str, title: str) -> Table:
 
     ``suffix``: the part of the report's keys that stands for the prior.
     """
-    table = Table(title=title, title_justify="left")
+    contexts = report[f"kl_nats{suffix}_cells"][0]["contexts"]
+    over = f"{contexts} contexts of each kind and p"
+    caption = f"one training: +- is the standard error over {over}; it says nothing about other training seeds"
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for name in ("goals", "context", "p", "KL", "+-", "goal met", "not met", "met in"):
         table.add_column(name, justify="left" if name in ("goals", "context") else "right")
     for name, goals in ((f"kl_nats{suffix}", "trained on"), (f"kl_heldout{suffix}", "never trained on")):
@@ -84,14 +130,20 @@ def _nats(value: float | None) -> str:
 
 
 def gap_table(report: Mapping[str, Any], title: str) -> Table:
-    """Online return relative to the exact agent's, one row per set of goals and p, with 95% intervals."""
-    table = Table(title=title, title_justify="left")
-    for name in ("goals", "p", "model", "exact", "gap", "95%"):
-        table.add_column(name, justify="left" if name == "goals" else "right")
+    """Online return relative to the exact agent's, one row per set of goals and p, with 95% intervals.
+
+    ``report``: holds a table of ``posterior.gap`` by p for each set of goals.
+    """
+    first = next(iter(report["paper_gap"].values()))
+    caption = f"{statistics.resampled(1, first['tasks'], first['seeds'], first['episodes'])}; the same resamples for both"
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    for name in ("goals", "p", "model", "exact", "gap", "95%", "difference"):
+        table.add_column(name, justify="left" if name in ("goals", "difference") else "right")
     for name, goals in (("paper_gap", "never trained on"), ("paper_gap_train", "trained on")):
         for index, (p, row) in enumerate(report[name].items()):
             interval = f"{row['low']:+.1%} .. {row['high']:+.1%}"
             last = index + 1 == len(report[name])
             cells = (f"{row['model']:.1f}", f"{row['exact']:.1f}", f"{row['gap']:+.1%}", interval)
-            table.add_row("" if index else goals, p, *cells, end_section=last)
+            verdict = "not shown" if row["low"] <= 0 <= row["high"] else "higher" if row["low"] > 0 else "lower"
+            table.add_row("" if index else goals, p, *cells, verdict, end_section=last)
     return table

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from icrl_dist.types import Adversary, Variation
 if TYPE_CHECKING:
     from icrl_dist.config.run import Run
 
-EXPERT, SCRIPTED = "SAC expert", "scripted expert"
-"""Names of reference agents: experts trained in the undisturbed tasks, and a scripted policy of the true states."""
+EXPERT, SCRIPTED = "expert", "scripted"
+"""Keys of reference agents: experts trained in the undisturbed tasks, and a scripted policy of the true states."""
 
 
 class ContinuousProblem(Problem):
@@ -32,6 +32,7 @@ class ContinuousProblem(Problem):
     Config = ControlConfig
     Labelling = ExpertLabelling
     free_in_forks = ("strength", "solved")
+    agent_names: ClassVar[Mapping[str, str]] = {EXPERT: "SAC expert", SCRIPTED: "scripted expert"}
     config: ControlConfig
 
     @property

@@ -177,7 +177,8 @@ def summary(found: Sequence[Divergence]) -> dict[str, Any]:
     for one in found:
         each = one.kl.mean(axis=1)
         error = float(each.std(ddof=1) / np.sqrt(len(each)))
-        rows.append({"kind": one.kind, "p": one.p, **_split([one]), "standard_error": error, "met": float(one.reached.mean())})
+        row = {"kind": one.kind, "p": one.p, **_split([one]), "standard_error": error, "contexts": len(each)}
+        rows.append({**row, "met": float(one.reached.mean())})
     spread = float(np.sqrt(sum(row["standard_error"] ** 2 for row in rows)) / len(rows))
     whole = {"" if name == "kl" else f"_{name}": value for name, value in _split(found).items()}
     return {**whole, "_standard_error": spread, "_cells": rows}

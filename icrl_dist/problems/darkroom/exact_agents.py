@@ -29,6 +29,8 @@ RULES: dict[Rule, str] = {
     "zeta": f"exact, zeta of {ZETA}",
 }
 """Name of the exact agent of each rule in tables and figures."""
+KEYS: dict[Rule, str] = {rule: f"exact:{rule.replace(' ', '-')}" for rule in RULES}
+"""Key of the exact agent of each rule in result rows."""
 
 
 class ExactAgent(DiscretePolicy):

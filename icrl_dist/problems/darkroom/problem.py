@@ -28,7 +28,7 @@ from icrl_dist.problems.darkroom import picture, room
 from icrl_dist.problems.darkroom.adversaries import adversary_set, sample_dirichlet
 from icrl_dist.problems.darkroom.behavior_policies import KINDS, Walks
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
-from icrl_dist.problems.darkroom.exact_agents import RULES, ExactAgent, OptimalAgent, Rule
+from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.labels import RoomLabeller, RoomLabelling
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.rollout.policies import RandomPolicy
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from icrl_dist.problems.benchmarks import Benchmarks
 
 ORACLE = "oracle"
+"""Key of the optimal policy of each variation."""
 
 
 class ExactRoom:
@@ -90,6 +91,7 @@ class DarkRoomProblem(Problem):
     section = "darkroom"
     Config = DarkRoomConfig
     Labelling = RoomLabelling
+    agent_names: ClassVar[Mapping[str, str]] = {KEYS[rule]: name for rule, name in RULES.items()}
     earns_in_contexts: ClassVar[bool] = False  # a random walk may miss the goal in every episode
     config: DarkRoomConfig
 
@@ -156,7 +158,7 @@ class DarkRoomProblem(Problem):
             hypotheses = Hypotheses.of(rows)
             return OptimalAgent(soft_labels(hypotheses, self.config.gamma, slack=0.0), hypotheses.size)
 
-        exact = {name: Reference(self.exact.agent(run, rule)) for rule, name in RULES.items()}
+        exact = {KEYS[rule]: Reference(self.exact.agent(run, rule)) for rule in RULES}
         return {"random": Reference(random), **exact, ORACLE: Reference(optimal, ceiling=True)}
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:

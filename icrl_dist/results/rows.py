@@ -1,0 +1,216 @@
+"""Result rows: one row per evaluated episode, in Parquet files that are written once and never changed.
+
+Each evaluation adds one file to ``RUN_DIR/results/``.  All tables, figures and statistics are computed from these
+rows.  ``COLUMNS`` documents the columns; docs/data.md is generated from it.  pyarrow and pandas are imported only
+inside functions, because workers and most commands need neither.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from icrl_dist import __version__, version
+from icrl_dist.config.run import ConfigError
+from icrl_dist.storage.files import StoreError, atomic_write
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+FORMAT = 1
+"""Number of the file format.  It changes whenever a column is added, removed, or gets another meaning."""
+_FORMAT_KEY = b"icrl_dist.results.format"
+
+Block = Mapping[str, Any]
+"""Rows as columns: every value is an array with one entry per row, or one value for all rows.  ``return`` is an array."""
+
+
+class Column(NamedTuple):
+    """A column of the result rows."""
+
+    type: str
+    """Type of pyarrow: ``string``, ``int64``, ``double`` or ``bool``."""
+    meaning: str
+    nullable: bool = False
+
+
+COLUMNS: dict[str, Column] = {
+    "format": Column("int64", "number of the file format; this page describes format 1"),
+    "evaluation": Column("string", "name of the file without its suffix: which evaluation wrote the row"),
+    "written": Column("string", "when, in UTC"),
+    "package_version": Column("string", "version of icrl-dist"),
+    "code_digest": Column("string", "SHA-256 of the code of icrl-dist"),
+    "run": Column("string", "name of the run: the name of its folder or of the checkpoint file"),
+    "method": Column("string", "method of the run, such as `icaa`"),
+    "problem": Column("string", "problem of the run, such as `darkroom`"),
+    "training_seed": Column("int64", "`seed` of the run"),
+    "split_seed": Column("int64", "`split_seed` of the run's problem; null if the problem has none", True),
+    "suite": Column("string", "`online`, `offline`, `posterior`, `label_quality` or `experts`"),
+    "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
+    "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),
+    "policy_version": Column("int64", "version of the weights; -1 for an agent without weights of this run"),
+    "weights_digest": Column("string", "SHA-256 of the weights; empty for an agent without"),
+    "ceiling": Column("bool", "whether the agent is given the task, so that other returns are shown as a share of its own"),
+    "deployment": Column("string", "deployment rule of a model, `paper` or `committed`; empty for other agents"),
+    "data": Column("string", "in suite `offline`: whose episode the context holds, `random` or `expert`; else empty"),
+    "prior": Column("string", "`evaluate.prior`: distribution of the test adversaries; empty if they are of training"),
+    "task_index": Column("int64", "number of the task among `tasks`"),
+    "task": Column("string", "parameters of the task, JSON"),
+    "p": Column("double", "strength of the test adversary, from `evaluate.p`; null if it is an adversary of training", True),
+    "adversary_family": Column("string", "family of the adversary, such as `dirichlet`; `null` is no disturbance"),
+    "adversary_index": Column(
+        "int64", "number of the adversary: of the test task that it was drawn for, or of the variation in training"
+    ),
+    "adversary": Column("string", "parameters of the adversary, JSON; of a network they include its seed and strength"),
+    "evaluation_seed": Column("int64", "number of the evaluation of the task, from 0; the context starts empty in each"),
+    "episode": Column("int64", "number of the episode in that evaluation, from 0"),
+    "return": Column("double", "undiscounted return; up to the step at which the simulation diverged, if it did"),
+    "optimum": Column("double", "expected return of the optimal policy in this variation, where it is known", True),
+    "diverged": Column("bool", "whether the simulation diverged in this episode"),
+    "surprise": Column("double", "out-of-distribution score after the evaluation's last episode; null elsewhere", True),
+    "agreement": Column(
+        "double", "in suite `label_quality`: share of the variation's labels that are optimal; null if it gave none", True
+    ),
+}
+"""The columns of the result rows, in the files' order."""
+_PROVENANCE = ("format", "evaluation", "written", "package_version", "code_digest")
+_MEASURED = ("return", "optimum", "diverged", "surprise", "agreement", "ceiling")
+KEY = tuple(name for name in COLUMNS if name not in (*_PROVENANCE, *_MEASURED))
+"""The columns that name an episode: rows that are equal in all of them are repetitions of one episode."""
+
+
+def append(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) -> Path:
+    """Write the rows of one evaluation to a new file in ``folder`` and return its path.
+
+    The file's name holds the suite, the first digits of the SHA-256 of ``settings`` (JSON values), and the time; no
+    existing file is replaced.  Raises StoreError if the file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+    now = datetime.now(UTC)
+    while (path := folder / f"{suite}-{digest}-{now:%Y%m%dT%H%M%S.%f}Z.parquet").exists():
+        now += timedelta(microseconds=1)
+    provenance = {
+        "format": FORMAT,
+        "evaluation": path.stem,
+        "written": now.isoformat(),
+        "package_version": __version__,
+        "code_digest": version.digest(),
+        "suite": suite,
+    }
+    table = pa.concat_tables([_table({**block, **provenance}) for block in blocks])
+    atomic_write(path, lambda file: pq.write_table(table, file, compression="zstd"))
+    return path
+
+
+def _schema() -> pa.Schema:
+    import pyarrow as pa
+
+    types = {"string": pa.string(), "int64": pa.int64(), "double": pa.float64(), "bool": pa.bool_()}
+    fields = [pa.field(name, types[column.type], column.nullable) for name, column in COLUMNS.items()]
+    return pa.schema(fields, metadata={_FORMAT_KEY: str(FORMAT).encode()})
+
+
+def _table(block: Block) -> pa.Table:
+    import pyarrow as pa
+
+    schema, rows = _schema(), len(block["return"])
+    if unknown := block.keys() - COLUMNS.keys():
+        raise KeyError(f"no columns of result rows: {', '.join(sorted(unknown))}")
+    columns = []
+    for field in schema:
+        value = block.get(field.name)
+        if isinstance(value, np.ndarray):
+            columns.append(pa.array(value, field.type, from_pandas=True))  # nan becomes null
+        else:
+            columns.append(pa.repeat(pa.scalar(value, field.type), rows))
+        if columns[-1].null_count and not field.nullable:
+            raise ValueError(f"result rows: column {field.name} has no value in {columns[-1].null_count} of {rows} rows")
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def read(files: Iterable[Path]) -> pd.DataFrame:
+    """The rows of some files, in the files' order.  An episode that several evaluations repeat is in it once, from the last.
+
+    Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
+    """
+    import pyarrow as pa
+
+    tables = [_read(path) for path in files]
+    frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
+    frame["split_seed"] = frame["split_seed"].astype("Int64")
+    return frame.drop_duplicates(list(KEY), keep="last", ignore_index=True)
+
+
+def _read(path: Path) -> pa.Table:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with path.open("rb") as file:
+            table = pq.read_table(file)
+    except (OSError, pa.ArrowException) as error:
+        reason = " ".join(str(error).split())
+        raise StoreError(f"{path}: not a file of result rows ({reason}): move it away, and evaluate again") from None
+    found = (table.schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
+    if found != str(FORMAT):
+        raise StoreError(
+            f"{path}: result rows of format {found}, and this version reads format {FORMAT}: read them with the version that "
+            "wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
+        )
+    schema = _schema()
+    if wrong := sorted({(field.name, str(field.type)) for field in table.schema} ^ {(f.name, str(f.type)) for f in schema}):
+        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
+        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
+    for field in schema:
+        if not field.nullable and (missing := table.column(field.name).null_count):
+            raise StoreError(
+                f"{path}: {missing} of {len(table)} rows have no {field.name}, so they can be neither told apart nor paired: "
+                "move the file away, and evaluate again"
+            )
+    return table.select(schema.names).cast(schema)
+
+
+def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = False) -> pd.DataFrame:
+    """The result rows of one run folder or of several, one row per evaluated episode; docs/data.md explains the columns.
+
+    An episode that several evaluations of a run repeat is in the frame once, from the newest of them.
+
+    ``unfinished``: also read runs whose training has not finished.  Raises ConfigError for a folder without results
+    and for an unfinished run, StoreError for a file of another format.
+    """
+    folders = [Path(one) for one in ([runs] if isinstance(runs, str | Path) else runs)]
+    files = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise ConfigError(f"{folder}: no such run folder; `icrl-dist train demo` makes one in runs/demo")
+        if not unfinished and is_unfinished(folder):
+            raise ConfigError(
+                f"{folder}: this run is not finished: continue it with `icrl-dist train RUN --out {folder} --resume`, "
+                "or read what there is with read_results(..., unfinished=True)"
+            )
+        found = sorted((folder / "results").glob("*.parquet"), key=lambda path: path.stem.rsplit("-", 1)[-1])
+        if not found:
+            raise ConfigError(f"{folder}: holds no result rows; `icrl-dist evaluate {folder}` writes some")
+        files += found
+    return read(files)
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether a run folder holds a run whose training or evaluation has not ended."""
+    return (folder / "run.toml").exists() and not (folder / "result.json").exists()
+
+
+def document() -> str:
+    """The table of columns in docs/data.md."""
+    lines = ["| column | type | meaning |", "|---|---|---|"]
+    return "\n".join([*lines, *(f"| `{name}` | {column.type} | {column.meaning} |" for name, column in COLUMNS.items())])
