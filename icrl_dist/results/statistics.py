@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float, Float64, Int64
 
 RESAMPLES = 2000
@@ -58,6 +57,8 @@ def iqm(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
     The mean of the S * C scores without the floor(S * C / 4) smallest and the floor(S * C / 4) largest of them: the
     25% trimmed mean, as ``rliable.metrics.aggregate_iqm`` computes it.
     """
+    import scipy.stats  # imported here because it is slow to import, and the learner imports this module
+
     flat = scores.reshape(*scores.shape[:-2], -1)
     found: np.ndarray = np.asarray(scipy.stats.trim_mean(flat, proportiontocut=0.25, axis=-1))
     return found
@@ -137,11 +138,11 @@ def bootstrap(
 def interval(values: Float[np.ndarray, "R *rest"], level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
     """Percentile interval of a bootstrap: the quantiles (1 - level) / 2 and (1 + level) / 2 along the first axis.
 
-    nan among the values, such as an undefined ratio, is left out.
+    nan among the values, such as an undefined ratio, is left out; the interval of nothing but nan is nan.
     """
-    tail = 50 * (1 - level)
-    low, high = np.nanpercentile(values, (tail, 100 - tail), axis=0)
-    return low, high
+    tail, known = 50 * (1 - level), ~np.isnan(values).all(axis=0)
+    low, high = np.nanpercentile(np.where(known, values, 0.0), (tail, 100 - tail), axis=0)
+    return np.where(known, low, np.nan), np.where(known, high, np.nan)
 
 
 def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1) -> str:

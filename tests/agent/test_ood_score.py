@@ -16,10 +16,11 @@ from icrl_dist.config.run import ConfigError, parse
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import RARE, WINDOWS, OutcomeModel
 from icrl_dist.problems import registry
-from icrl_dist.results import evaluate, heldout
+from icrl_dist.results import evaluate, summaries
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.files import StoreError
 from icrl_dist.types import NULL, Spec
+from tests.results.row_blocks import block, frame
 
 B, D = 6, 4
 SPECS = (Spec((0.0, -1.0), (9.0, 1.0), 3, 5), Spec((0.0, -1.0), (9.0, 1.0), 2, 5, discrete=False))
@@ -217,4 +218,6 @@ def test_surprise_of_an_uncalibrated_agent_is_refused_and_export_calibrates_it(s
 
 
 def test_a_spread_is_the_median_and_the_share_above_1():
-    assert heldout._spread(np.array([0.0, 0.5, 1.5, 3.0])) == {"median": 1.0, "above_1": 0.5}
+    scores = np.array([[[np.nan, 0.0], [np.nan, 0.5]], [[np.nan, 1.5], [np.nan, 3.0]]])
+    rows = frame(block(np.zeros((2, 2, 2)), p=0.2, surprise=scores.ravel()), block(np.zeros((2, 2, 2)), "random", 0.2))
+    assert summaries.surprise(rows) == {"0.2": {"median": 1.0, "above_1": 0.5}}

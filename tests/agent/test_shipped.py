@@ -92,8 +92,9 @@ def test_a_shipped_agent_with_shuffled_weights_is_no_better_than_a_random_policy
     with torch.no_grad():
         for parameter in shuffled.model.parameters():
             parameter.copy_(parameter.flatten()[torch.randperm(parameter.numel())].view_as(parameter))
-    agents = {name: evaluate.in_context(model, run.context) for name, model in (("trained", untouched), ("shuffled", shuffled))}
-    agents["random"] = registry.of(run).references(run)["random"]
+    models = {"trained": untouched, "shuffled": shuffled}
+    agents = {evaluate.Agent(key): evaluate.in_context(model, run.context) for key, model in models.items()}
+    agents[evaluate.Agent("random")] = registry.of(run).references(run)["random"]
     whole, mixed, random = (result.returns.mean() for result in evaluate.online(run, agents))
     assert whole > 40 and mixed < 5 and random < 5
 

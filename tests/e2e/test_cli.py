@@ -165,7 +165,7 @@ from icrl_dist.cli import main as cli
 from icrl_dist.launch import train as launch
 
 def interrupted(*_):
-    print(*(name for name in ("torch", "scipy", "matplotlib", "mujoco") if name in sys.modules))
+    print(*(name for name in ("torch", "scipy", "matplotlib", "mujoco", "pandas", "pyarrow") if name in sys.modules))
     raise launch.TrainInterrupted
 
 launch.train_ray = interrupted
@@ -181,7 +181,7 @@ import sys
 from icrl_dist.cli import main
 
 main.main(["--help"])
-print([name for name in ("torch", "scipy", "matplotlib", "mujoco", "ray") if name in sys.modules])
+print([name for name in ("torch", "scipy", "matplotlib", "mujoco", "ray", "pandas", "pyarrow") if name in sys.modules])
 """
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines()[-1] == "[]"

@@ -12,11 +12,12 @@ from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.continuous.problem import EXPERT
 from icrl_dist.problems.dmc.problem import DMCProblem
-from icrl_dist.results import evaluate
+from icrl_dist.results import evaluate, summaries
 from icrl_dist.stream import wire
 from icrl_dist.types import NULL
 from tests.experts.histories import EPISODES, HORIZON, Breaking, KilledError, digests, run, trained
 from tests.jobs import FixedWeights, decoded, do, jobs_of
+from tests.results.row_blocks import frame
 
 __all__ = ["run", "trained"]
 
@@ -162,12 +163,16 @@ def test_an_evaluation_counts_episodes_that_diverged_and_reports_missing_experts
     real = DMCProblem.batch
     monkeypatch.setattr(DMCProblem, "batch", lambda problem, variations: Breaking(real(problem, variations), False))
     problem = registry.of(run)
-    agents = {"random": problem.references(run)["random"]}
-    results = evaluate.online(run, agents)
-    assert [result.broken for result in results] == [4, 4] and results[0].row()["broken"] == 4
+    agents = {evaluate.Agent("random"): problem.references(run)["random"]}
+
+    def broken():
+        results = evaluate.online(run, agents)
+        return [row.get("broken") for row in summaries.result_rows(frame(*(r.block(run, "x", "evaluated") for r in results)))]
+
+    assert broken() == [4, 4]
     monkeypatch.undo()
     file = f"{tmp_path}/run.toml"
-    assert "broken" not in evaluate.online(run, agents)[0].row()
+    assert broken() == [None, None]
     assert "4 of the evaluated tasks" in problem.missing_reference(run, file)
     assert f"`icrl-dist train experts-{file} --out OTHER` trains them" in problem.missing_reference(run, file)
     do(run, jobs_of(run)[0])

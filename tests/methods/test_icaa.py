@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from icrl_dist.methods import examples
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.examples import self_labelled
 from icrl_dist.problems import registry as problems
+from icrl_dist.results import training_rows
 from icrl_dist.training.batches import Examples
 from icrl_dist.types import Trajectory
 from tests.jobs import InMemoryDataset, do
@@ -133,13 +135,13 @@ def test_each_variation_is_labelled_once_a_run(small_run: Run, collected: Collec
     monkeypatch.setattr(examples, "self_labelled", count)
     method, data = methods.of(run), InMemoryDataset(collected.trajectories)
     pretrain, *rounds = method.phases(run)
-    assert method.label_quality(run, pretrain, data) == {}
+    assert not list(method.label_quality(run, pretrain, data))
     method.data(run, pretrain, data)(np.random.default_rng(0))
     assert not labelled, "D^0 has labels of the exact solver"
     assert len(rounds) == run.icaa.rounds + 1 > 1
     shares = []
     for phase in rounds:
-        shares.append(method.label_quality(run, phase, data)["labelling"])
+        shares.append(np.mean([one.agreement is not None for one in method.label_quality(run, phase, data)]))
         draw = method.data(run, phase, data)
         for seed in range(20):
             draw(np.random.default_rng(seed))
@@ -148,7 +150,7 @@ def test_each_variation_is_labelled_once_a_run(small_run: Run, collected: Collec
     assert any(0 < share < 1 for share in shares), "a variation without labels must not be computed anew either"
 
 
-def test_label_quality_compares_labels_with_the_exact_answer(small_run: Run, collected: Collected) -> None:
+def test_label_quality_compares_labels_with_the_exact_answer(small_run: Run, collected: Collected, tmp_path: Path) -> None:
     data, method = InMemoryDataset(collected.trajectories), methods.of(small_run)
     phase, exact = method.phases(small_run)[1], problems.of(small_run).exact
     assert exact is not None
@@ -162,5 +164,5 @@ def test_label_quality_compares_labels_with_the_exact_answer(small_run: Run, col
         late.append(np.mean([t.episode_return for t in trials[cut:]]))
         optimum.append(exact.optimum([trials[0].variation])[0])
     expected = {"agreement": agreement, "context_return": early, "label_return": late, "optimum": optimum}
-    found = method.label_quality(small_run, phase, data)
+    found = training_rows.rate_labels(small_run, tmp_path, phase, method.label_quality(small_run, phase, data))
     assert found == pytest.approx({name: np.mean(values) for name, values in expected.items()} | {"labelling": 1.0})

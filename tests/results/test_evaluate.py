@@ -21,16 +21,18 @@ from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.problem import EXPERT
 from icrl_dist.problems.darkroom import divergence, room
-from icrl_dist.problems.darkroom.exact_agents import RULES, ExactAgent
+from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent
 from icrl_dist.problems.darkroom.problem import ORACLE
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft_labels
-from icrl_dist.results import evaluate, posterior
+from icrl_dist.results import evaluate, posterior, summaries
+from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.statistics import mean_and_error
 from icrl_dist.results.tables import returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_file
 from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Variation
 from learner import checkpoints
+from tests.results.row_blocks import block, frame
 
 
 @pytest.fixture
@@ -48,12 +50,13 @@ def references(run):
 def test_the_oracle_reaches_the_exact_optimum_and_other_agents_stay_below_it(small_run, untrained):
     run = dataclasses.replace(small_run, evaluate=dataclasses.replace(small_run.evaluate, seeds=60, p=(0.0, 0.4)))
     found = references(run)
-    agents = {"model": evaluate.in_context(untrained, untrained.run.context), "random": found["random"], ORACLE: found[ORACLE]}
+    model = evaluate.in_context(untrained, untrained.run.context)
+    agents = {Agent("t0"): model, Agent("random"): found["random"], Agent(ORACLE): found[ORACLE]}
     for result in evaluate.online(run, agents):
-        assert result.ceiling == (result.agent == ORACLE)
+        assert result.ceiling == (result.agent == Agent(ORACLE))
         assert result.returns.shape == (len(registry.of(run).split.test), 60, 3)
         error = result.returns.mean(axis=(0, 2)).std() / np.sqrt(60)
-        if result.agent == ORACLE:
+        if result.agent.key == ORACLE:
             assert abs(result.returns.mean() - result.optimum.mean()) < 4 * error + 0.05
         else:
             assert result.returns.mean() < result.optimum.mean() - 4 * error
@@ -61,8 +64,8 @@ def test_the_oracle_reaches_the_exact_optimum_and_other_agents_stay_below_it(sma
 
 def test_all_agents_have_the_same_draws(small_run, untrained):
     agents = {
-        "one": evaluate.in_context(untrained, untrained.run.context),
-        "two": evaluate.in_context(untrained, untrained.run.context),
+        Agent("one"): evaluate.in_context(untrained, untrained.run.context),
+        Agent("two"): evaluate.in_context(untrained, untrained.run.context),
     }
     one, two, *_ = evaluate.online(small_run, agents)
     np.testing.assert_array_equal(one.returns, two.returns)
@@ -71,7 +74,7 @@ def test_all_agents_have_the_same_draws(small_run, untrained):
 def test_the_draws_at_one_p_are_the_same_alone_and_in_any_list(small_run):
     def returns(*levels):
         evaluated = dataclasses.replace(small_run.evaluate, p=levels, seeds=5)
-        agents = {"random": references(small_run)["random"]}
+        agents = {Agent("random"): references(small_run)["random"]}
         found = evaluate.online(dataclasses.replace(small_run, evaluate=evaluated), agents)
         return {result.p: result.returns for result in found}
 
@@ -88,51 +91,58 @@ def test_held_out_variations_start_in_the_origin(small_run):
     assert all(v.task.vector("start") == (0, 0) and v.adversary.number("p") == 0.2 for v in chosen)
 
 
-def test_rows_are_tidy(small_run):
-    result = evaluate.Result("x", 0.2, np.arange(12.0).reshape(2, 2, 3), np.array([10.0, 12.0]))
-    row = result.row()
+def test_numbers_of_result_json_are_means_over_tasks_and_seeds():
+    returns = np.arange(12.0).reshape(2, 2, 3)
+    (row,) = summaries.result_rows(frame(block(returns, p=0.2, optimum=[10.0, 12.0])))
     assert row["episodes"] == [4.5, 5.5, 6.5] and row["optimum"] == 11.0
     assert row["last5_over_optimum"] == round(5.5 / 11, 4)
-    mean, error = mean_and_error(result.returns)
-    np.testing.assert_allclose(error, np.full(3, np.std([3, 6], ddof=1) / np.sqrt(2)))
+    assert (row["agent"], row["key"], row["deployment"], row["p"]) == ("T^0 (dpt)", "t0", "paper", 0.2)
+    error = np.std([3, 6], ddof=1) / np.sqrt(2)
+    assert row["standard_error"] == [round(error, 3)] * 3
+    mean, errors = mean_and_error(returns)
+    np.testing.assert_allclose(errors, np.full(3, error))
     np.testing.assert_allclose(mean, [4.5, 5.5, 6.5])
 
 
 def test_adaptation_is_measured_relative_to_the_oracle():
-    def result(*episodes):
-        return evaluate.Result("x", 0.0, np.array(episodes, float).reshape(1, 1, -1), np.array([9.0]))
+    def result(*tasks):
+        (found,) = summaries.returns(frame(block([[task] for task in tasks], optimum=[9.0] * len(tasks))))
+        return found
 
-    oracle = result(10, 10, 8, 12)
-    assert result(1, 8, 9, 10).first_over(oracle, 2) == round(9 / 20, 4)
-    assert result(1, 8, 9, 10).first_over(oracle, 10) == round(28 / 40, 4)
-    assert [result(1, 8, 9, 10).episode_of(oracle, share) for share in (0.05, 0.9, 0.95)] == [1, 3, 4]
-    assert result(1, 8, 9, 10).episode_of(oracle, 1.01) is None
-    several = evaluate.Result("x", 0.0, np.array([[[0.0, 12.0]], [[6.0, 6.0]]]), np.array([9.0, 9.0]))
-    assert several.episode_of(oracle, 0.9) == 2, "not of all tasks and seeds together"
+    oracle, model = result((10, 10, 8, 12)), result((1, 8, 9, 10))
+    assert summaries.first_over(model, oracle, 2) == round(9 / 20, 4)
+    assert summaries.first_over(model, oracle, 10) == round(28 / 40, 4)
+    assert [summaries.episode_of(model, oracle, share) for share in (0.05, 0.9, 0.95)] == [1, 3, 4]
+    assert summaries.episode_of(model, oracle, 1.01) is None
+    assert summaries.episode_of(result((0, 12), (6, 6)), oracle, 0.9) == 2, "not of all tasks and seeds together"
+    both = frame(block([[(1, 8, 9, 10)]], "t2"), block([[(10, 10, 8, 12)]], "oracle", ceiling=True, optimum=[9.0]))
+    assert summaries.adaptation(both) == {"first10_over_oracle": {"0": 0.7}, "episode_of_90": {"0": 3}}
 
 
 def test_offline_rows_have_random_and_expert_data(small_run, untrained):
-    rows = evaluate.offline(small_run, {"T": untrained})
-    agents = ["T", *RULES.values()]
+    rows = evaluate.offline(small_run, {Agent("t0", "paper", 0): untrained})
+    agents = ["T^0 (icaa)", *RULES.values()]
     count = 1 + len(agents)
-    for rows_at, source in ((rows[:count], "random data"), (rows[count : 2 * count], "expert data")):
-        assert [r.agent for r in rows_at] == [source, *(f"{agent}, {source}" for agent in agents)]
-    expert = next(r for r in rows if r.agent == "expert data" and r.p == 0)
+    found = frame(*(row.block(small_run, "run", "evaluated") for row in rows), suite="offline")
+    named = [row["agent"] for row in summaries.result_rows(found)]
+    for names, source in ((named[:count], "random data"), (named[count : 2 * count], "expert data")):
+        assert names == [source, *(f"{agent}, {source}" for agent in agents)]
+    expert = next(r for r in rows if r.agent.key == ORACLE and r.p == 0)
     np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), expert.optimum)
-    informed = next(r for r in rows if r.agent == f"{RULES['paper']}, expert data" and r.p == 0)
+    informed = next(r for r in rows if (r.agent.key, r.data, r.p) == (KEYS["paper"], "expert", 0))
     np.testing.assert_array_equal(informed.returns, expert.returns)
 
 
 def test_exact_agents_find_the_goal_and_know_the_adversary_of_their_row(small_run):
     run = dataclasses.replace(small_run, evaluate=EvaluateConfig(episodes=6, seeds=20, p=(0.0, 0.4), prior="unseen"))
-    agents = {name: reference for name, reference in references(run).items() if name != "random"}
-    assert list(agents) == [*RULES.values(), ORACLE]
-    results = {(r.agent, r.p): r.returns for r in evaluate.online(run, agents)}
-    for name in RULES.values():
+    agents = {Agent(key): reference for key, reference in references(run).items() if key != "random"}
+    assert [agent.key for agent in agents] == [*KEYS.values(), ORACLE]
+    results = {(r.agent.key, r.p): r.returns for r in evaluate.online(run, agents)}
+    for name in KEYS.values():
         np.testing.assert_array_equal(results[name, 0.0][:, :, -1], results[ORACLE, 0.0][:, :, -1])
         error = results[name, 0.4].mean(axis=(0, 2)).std() / np.sqrt(20)
         assert abs(results[name, 0.4][:, :, -2:].mean() - results[ORACLE, 0.4].mean()) < 5 * error
-    early = {rule: results[name, 0.0][:, :, :2].mean() for rule, name in RULES.items()}
+    early = {rule: results[name, 0.0][:, :, :2].mean() for rule, name in KEYS.items()}
     assert early["paper"] < early["every step"] < early["committed"]
     rows = evaluate.variations(run, 0.4)
     goals = [room.task(divmod(cell, 3), 3, 8) for cell in range(9)]
@@ -197,7 +207,7 @@ def test_a_missing_or_damaged_checkpoint_is_refused_in_one_line(tmp_path):
 
 
 def test_a_result_has_the_exact_optimum_of_its_variations(small_run):
-    (result, *_) = evaluate.online(small_run, {"random": references(small_run)["random"]})
+    (result, *_) = evaluate.online(small_run, {Agent("random"): references(small_run)["random"]})
     np.testing.assert_allclose(result.optimum, optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
 
 
@@ -255,7 +265,6 @@ def test_an_impossible_setting_of_the_suite_is_refused_in_one_line(folder, capsy
 
 @pytest.mark.parametrize(("best", "share"), [([4.0, 8.0], "50%"), ([0.0, 0.0], "-")])
 def test_the_table_shows_returns_as_a_share_of_the_experts_even_if_that_is_0(best, share):
-    rows = {"T^1": [2.0, 4.0], EXPERT: best}
-    results = [evaluate.Result(name, 0.0, np.array([[row]]), None, ceiling=name == EXPERT) for name, row in rows.items()]
-    table = returns_table(results, "")
+    blocks = [block([[[2.0, 4.0]]], "t1"), block([[best]], EXPERT, ceiling=True)]
+    table = returns_table(frame(*({**one, "problem": "dmc-cheetah-run"} for one in blocks)), "")
     assert table.columns[-1].header == "of SAC expert" and next(iter(table.columns[-1].cells)) == share

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.config.sections import AdversaryConfig, EvaluateConfig
-from icrl_dist.interfaces import Batch, Policy
+from icrl_dist.interfaces import Batch, MakePolicy, Policy
 from icrl_dist.problems import registry
 from icrl_dist.results import posterior
-from icrl_dist.results.evaluate import Result
-from icrl_dist.types import NULL, Adversary, Variation
+from icrl_dist.results.evaluate import Agent
+from icrl_dist.types import NULL, Adversary, Task, Variation
+from tests.results.row_blocks import frame
 
 
 @pytest.fixture
@@ -23,21 +25,27 @@ def run(small_run: Run) -> Run:
     return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=2))
 
 
-def result(returns: np.ndarray, p: float = 0.0) -> Result:
-    """Returns of two episodes with these means, by goal and seed."""
-    return Result("x", p, returns[:, :, None] * [0.5, 1.5], np.ones(len(returns)))
+def gap(model: np.ndarray, exact: np.ndarray, p: float = 0.0) -> dict[str, Any]:
+    """The gap of two agents with these mean returns of two episodes, by goal and seed."""
+    return posterior.gap(model[:, :, None] * [0.5, 1.5], exact[:, :, None] * [0.5, 1.5], p, seed=0)
+
+
+def gaps(run: Run, act: MakePolicy, goals: Sequence[Task]) -> dict[str, dict[str, Any]]:
+    """The gaps of a policy to the exact agent on these goals, by way of result rows."""
+    found = posterior.online(run, (Agent("t0"), act), goals)
+    return posterior.gaps(frame(*(one.block(run, "run", "test") for one in found), suite="posterior"), run.seed)
 
 
 def test_a_gap_is_a_ratio_of_means_of_pairs() -> None:
     rng = np.random.default_rng(0)
     exact = rng.uniform(1, 100, size=(6, 2))
-    scaled = posterior.gap(result(0.8 * exact), result(exact), seed=0)
+    scaled = gap(0.8 * exact, exact)
     assert [scaled[k] for k in ("gap", "low", "high")] == pytest.approx([-0.2] * 3), (
         "goals and seeds were not resampled in pairs"
     )
     assert [scaled["model"], scaled["exact"]] == pytest.approx([0.8 * exact.mean(), exact.mean()])
     noisy = 0.8 * exact + rng.normal(0, 3, size=exact.shape) + [8, -8]
-    found = posterior.gap(result(noisy), result(exact), seed=0)
+    found = gap(noisy, exact)
     assert found["gap"] == pytest.approx(noisy.sum() / exact.sum() - 1)
     slow = []
     for _ in range(4000):
@@ -55,7 +63,7 @@ def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch: pytest.
     rng, covered, widths, gaps = np.random.default_rng(0), 0, [], []
     for _ in range(200):
         exact = rng.uniform(20, 100, size=(20, 1)) + rng.normal(0, 5, size=(20, 2))
-        found = posterior.gap(result(0.9 * exact + rng.normal(0, 5, size=(20, 2))), result(exact), seed=0)
+        found = gap(0.9 * exact + rng.normal(0, 5, size=(20, 2)), exact)
         covered += found["low"] <= -0.1 <= found["high"]
         widths.append(found["high"] - found["low"])
         gaps.append(found["gap"])
@@ -65,7 +73,7 @@ def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch: pytest.
 
 def test_a_return_of_0_of_the_exact_agent_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"return is 0 at p = 0\.4: no ratio to it; try more --episodes"):
-        posterior.gap(result(np.ones((2, 2)), 0.4), result(np.zeros((2, 2)), 0.4), seed=0)
+        gap(np.ones((2, 2)), np.zeros((2, 2)), 0.4)
 
 
 def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) -> None:
@@ -80,11 +88,11 @@ def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) ->
             met.append(tuple(rows))
             return exact(rows, env)
 
-        same = posterior.gaps(run, act, goals)
+        same = gaps(run, act, goals)
         assert list(same) == ["0", "0.4"]
         assert all(row["gap"] == row["low"] == row["high"] == 0 and row["exact"] > 0 for row in same.values())
         for p, rows in zip((0.0, 0.4), met, strict=True):
             adversary = Adversary.of("uniform", p=p) if p else NULL
             assert rows == tuple(Variation(problem.at_test_start(t), adversary) for t in goals for _ in range(5))
-    worse = posterior.gaps(run, problem.references(run)["random"].make, problem.split.test)
+    worse = gaps(run, problem.references(run)["random"].make, problem.split.test)
     assert all(row["high"] < 0 for row in worse.values())

@@ -1,0 +1,52 @@
+"""Result rows for tests, made from arrays of returns."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl_dist.results import rows
+
+
+def block(returns: Any, agent: str = "t0", p: float = 0.0, seed: int = 0, **others: Any) -> dict[str, Any]:
+    """A block of rows of one training.  ``returns``: by task, evaluation seed and episode; ``optimum``: by task."""
+    values = np.asarray(returns, float)
+    task, evaluation, episode = (index.ravel() for index in np.indices(values.shape))
+    optimum = np.asarray(others.pop("optimum", np.full(len(values), np.nan)), float)
+    return {
+        "run": f"run-{seed}",
+        "method": "dpt",
+        "problem": "darkroom",
+        "training_seed": seed,
+        "split_seed": 0,
+        "tasks": "evaluated",
+        "agent": agent,
+        "policy_version": int(agent[1:]) if agent[1:].isdigit() else -1,
+        "weights_digest": f"{agent}-{seed}" if agent[1:].isdigit() else "",
+        "ceiling": False,
+        "deployment": "paper" if agent[1:].isdigit() else "",
+        "data": "",
+        "prior": "uniform",
+        "task_index": task,
+        "task": np.array([json.dumps({"goal": int(i)}) for i in task], object),
+        "p": p,
+        "adversary_family": "uniform" if p else "null",
+        "adversary_index": task,
+        "adversary": json.dumps({"p": p} if p else {}),
+        "evaluation_seed": evaluation,
+        "episode": episode,
+        "return": values.ravel(),
+        "optimum": optimum[task],
+        "diverged": False,
+        **others,
+    }
+
+
+def frame(*blocks: dict[str, Any], suite: str = "online") -> Any:
+    """The blocks, written to a file and read again."""
+    with tempfile.TemporaryDirectory() as folder:
+        return rows.read([rows.append(Path(folder), suite, {}, blocks)])
