@@ -43,12 +43,12 @@ def standard_error(values: Float[np.ndarray, "n ..."]) -> np.ndarray:
     count = len(values)
     if count < 2:
         return np.full(values.shape[1:], np.nan)
-    return values.std(axis=0, ddof=1) / np.sqrt(count)
+    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(count))
 
 
 def mean(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
     """Mean over trainings and cells."""
-    return scores.mean(axis=(-2, -1))
+    return np.asarray(scores.mean(axis=(-2, -1)))
 
 
 def iqm(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
@@ -60,8 +60,7 @@ def iqm(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
     import scipy.stats  # imported here because it is slow to import, and the learner imports this module
 
     flat = scores.reshape(*scores.shape[:-2], -1)
-    found: np.ndarray = np.asarray(scipy.stats.trim_mean(flat, proportiontocut=0.25, axis=-1))
-    return found
+    return np.asarray(scipy.stats.trim_mean(flat, proportiontocut=0.25, axis=-1))
 
 
 def minimum(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
@@ -70,7 +69,7 @@ def minimum(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
     The minimum of noisy means lies below the smallest true mean, so compare only minima over equal numbers of cells
     and evaluations.
     """
-    return scores.min(axis=-1).mean(axis=-1)
+    return np.asarray(scores.min(axis=-1).mean(axis=-1))
 
 
 def probability_of_improvement(x: Float[np.ndarray, "*batch S C"], y: Float[np.ndarray, "*batch Z C"]) -> np.ndarray:
@@ -81,12 +80,12 @@ def probability_of_improvement(x: Float[np.ndarray, "*batch S C"], y: Float[np.n
     ``rliable.metrics.probability_of_improvement``).
     """
     one, two = x[..., :, None, :], y[..., None, :, :]
-    return ((one > two) + 0.5 * (one == two)).mean(axis=(-3, -2, -1))
+    return np.asarray(((one > two) + 0.5 * (one == two)).mean(axis=(-3, -2, -1)))
 
 
 def ratio(x: Float[np.ndarray, "*batch S C"], y: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
     """Mean of X divided by the mean of Y (a ratio of means, not a mean of ratios); nan where the mean of Y is not above 0."""
-    above, below = np.asarray(mean(x)), np.asarray(mean(y))
+    above, below = mean(x), mean(y)
     return np.divide(above, below, out=np.full(np.shape(below), np.nan), where=below > 0)
 
 
