@@ -100,7 +100,7 @@ def _arrays(agent: AgentKey, name: str, p: float, rows: pd.DataFrame) -> Returns
     index = [np.searchsorted(level, rows[column]) for level, column in zip(levels, _INDEX, strict=True)]
     places = np.ravel_multi_index(index, shape)
     if len(rows) != np.prod(shape) or len(np.unique(places)) != len(rows):
-        counts = ", ".join(f"{count} {column}s" for count, column in zip(shape, _INDEX, strict=True))
+        counts = "{} trainings, {} tasks, {} evaluations and {} episodes".format(*shape)
         raise ConfigError(
             f"result rows of {agent.agent}, p = {p:g}: {len(rows)} rows for {counts}, where there should be one row for each "
             "combination: choose rows of runs with different seeds, and of one evaluation by the column evaluation"

@@ -112,9 +112,7 @@ def test_the_bootstrap_equals_loops_over_its_indices(monkeypatch, shape, crossed
         return np.stack([statistics.mean(drawn[:, 0]), statistics.probability_of_improvement(drawn[:, 0], drawn[:, 1])], -1)
 
     found = statistics.bootstrap(scores, fast, np.random.default_rng(2), 50, crossed)
-    slow = slow_bootstrap(
-        scores, lambda x, y: (slow_mean(x), slow_improvement(x, y)), np.random.default_rng(2), 50, crossed
-    )
+    slow = slow_bootstrap(scores, lambda x, y: (slow_mean(x), slow_improvement(x, y)), np.random.default_rng(2), 50, crossed)
     np.testing.assert_allclose(found, slow)
     low, high = statistics.interval(found)
     for k in range(2):
