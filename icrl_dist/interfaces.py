@@ -412,10 +412,27 @@ class Weighted(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class LabelQuality:
+    """Quality of the labels that a model made itself in one round.  Returns are undiscounted, per episode."""
+
+    agreement: float
+    """Share of the labels that are optimal, 0 to 1."""
+    labelling: float
+    """Share of the variations whose trials gave labels, 0 to 1."""
+    context_return: float
+    """Mean return of the trials that became contexts."""
+    label_return: float
+    """Mean return of the later trials, which labels come from."""
+    optimum: float
+    """Mean optimal return of the variations."""
+
+
 class Method(abc.ABC):
     """An in-context method: its phases and jobs, its training batches, model, loss and deployed policy.
 
-    One object serves one run; it may cache results that it computed from the run's data.
+    An object may cache what it computed from the data of its run: the learner makes a new object after a repair of
+    the dataset, so no cached result is older than the data.
     """
 
     name: ClassVar[str]
@@ -485,6 +502,6 @@ class Method(abc.ABC):
         """
         return None
 
-    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> dict[str, float]:
-        """Quality of the labels that the model made itself in a phase; empty if it made none or quality is unknown."""
-        return {}
+    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> LabelQuality | None:
+        """Quality of the labels that the model made itself in a phase; None if it made none or quality is unknown."""
+        return None
