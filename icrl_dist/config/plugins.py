@@ -47,11 +47,11 @@ def find(group: Group, name: str) -> Any:
         owner = _entries(group)[name].load()
     except Exception as error:  # whatever another package's module raises while it is imported
         raise ConfigError(f"{kind} = {name!r}: its package cannot be imported ({error}); reinstall that package") from None
-    if owner.section:
-        try:
+    try:
+        if owner.section or group == "problems":
             _check_section(owner.Config)
-        except Exception as error:  # whatever the annotations and defaults of another package raise
-            raise ConfigError(f"{kind} = {name!r}: section [{owner.section}], {error}") from None
+    except Exception as error:  # whatever the class, its annotations and defaults raise
+        raise ConfigError(f"{kind} = {name!r}: section [{getattr(owner, 'section', '')}], {error}") from None
     return owner
 
 

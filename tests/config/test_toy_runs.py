@@ -105,6 +105,16 @@ def test_a_section_that_a_run_file_cannot_hold_is_refused(install: Callable[...,
         override(load("smoke"), ["problem=odd"], "--set")
 
 
+@pytest.mark.parametrize("group", ["problems", "methods"])
+def test_a_class_that_is_no_problem_or_method_is_an_error_only_for_its_own_runs(
+    install: Callable[..., None], group: str
+) -> None:
+    install(**{group: {"odd": type("Odd", (), {})}})
+    with pytest.raises(ConfigError, match=r"= 'odd': .*'Odd' has no attribute 'section'"):
+        override(load("smoke"), [f"{group.removesuffix('s')}=odd"], "--set")
+    assert load("smoke").problem == "darkroom"
+
+
 def test_a_section_may_have_tuples_and_frozen_dataclasses(toy_run: Make) -> None:
     inner = dataclasses.make_dataclass("Pair", [("left", float, 0.5)], frozen=True)
     made = dataclasses.make_dataclass(

@@ -87,6 +87,9 @@ class Walks(DiscretePolicy):
     def probabilities(self, observation):
         return self.left_right
 
+    def observe(self, *transition):
+        pass
+
 
 def label(variation: Variation, cells: int) -> LabelledQueries:
     states = np.arange(cells, dtype=np.float32)[:, None]
