@@ -38,7 +38,7 @@ _NAMES = {
     "dataset": r"segment-\d+\.frames",
     "report": _REPORTS,
     "tensorboard": r"events\.out\.tfevents\..+",
-    "": r"(\.replacement|run\.toml|env\.json|fork\.json|result\.json|metrics\.jsonl|agent\.npz|learner\.log|learner\.err|endpoint|\.lock)",
+    "": r"(run\.toml|(env|fork|result)\.json|metrics\.jsonl|agent\.npz|learner\.(log|err)|endpoint|\.lock|\.replacement)",
 }
 """The folders within a run folder, the deepest first, each with a pattern of the file names that this program writes."""
 _TOKEN = ".replacement"
@@ -232,8 +232,8 @@ class FolderTransaction:
     def set_aside(self) -> None:
         """Move the old run to ``aside_of(folder)``, keep it locked, and make an empty folder for the new run.
 
-        Both folders get the token of this replacement.  Raises ConfigError, and changes nothing, if the folder contains no run or other files, or if
-        a run is active in it.
+        Both folders get the token of this replacement.  Raises ConfigError, and changes nothing, if the
+        folder contains no run or other files, or if a run is active in it.
         """
         folder = self._folder
         _require_owned(folder)

@@ -287,7 +287,7 @@ def test_after_a_kill_before_the_new_run_wrote_anything_the_old_run_is_restored(
 
 @pytest.mark.parametrize("options", [(False, False), (True, False), (False, True)])
 def test_a_finished_run_that_the_user_moved_in_removes_no_replaced_run(tmp_path, module_run, options):
-    folder, aside, old = killed(tmp_path, module_run)
+    folder, *_ = killed(tmp_path, module_run)
     run_folder.remove(folder)
     write(folder, ["run.toml", "env.json", "result.json", "checkpoints/version-0000.npz"])
     before = files(tmp_path)
@@ -390,7 +390,7 @@ def test_the_versions_that_a_fork_starts_from_are_no_checkpoint_of_its_own(tmp_p
 @pytest.mark.parametrize("record", [None, "{", "{}"])
 @pytest.mark.parametrize("run_file", [False, True])
 def test_after_a_kill_during_a_fork_the_old_run_is_never_removed(tmp_path, module_run, record, run_file):
-    folder, aside, before = killed(tmp_path, module_run)
+    folder, _, before = killed(tmp_path, module_run)
     forked(folder, 1)  # the checkpoints of the parent are linked
     (folder / "fork.json").unlink() if record is None else (folder / "fork.json").write_text(record)
     if not run_file:
