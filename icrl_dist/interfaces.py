@@ -350,6 +350,14 @@ class Problem(abc.ABC):
         """
         return self.config
 
+    @classmethod
+    def translated(cls, tables: dict[str, Any]) -> dict[str, Any]:
+        """The tables of a run file that an older version wrote, with the problem's former values translated.
+
+        The names of sections and keys are the present ones already; sections of other problems are still there.
+        """
+        return tables
+
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         """The values that a run of this problem cannot have: key, value, remedy."""
         yield from ()

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from icrl_dist.agent.loading import load_agent
-from icrl_dist.config.run import ConfigError, Deployment, parse
+from icrl_dist.config.run import ConfigError, Deployment, parse_written
 from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.serve import application, serving
 from icrl_dist.problems import registry as problems
@@ -102,7 +102,7 @@ def play(
     Raises ConfigError if the agent is not for Dark Room, or if the address cannot be used.
     """
     agent = load_agent(what, seed, deploy)
-    run = parse(str(agent.manifest.get("run", "")), str(what))
+    run = parse_written(str(agent.manifest.get("run", "")), str(what))
     make_game = problems.of(run).game
     if make_game is None:
         raise ConfigError(f"play {what}: its agent is for {run.problem}, which cannot be played; use an agent of darkroom")
