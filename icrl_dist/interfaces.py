@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
+    from icrl_dist.problems.parts import MakeGame, PosteriorSuite
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -181,8 +182,16 @@ class BeliefReader(Protocol):
         ...
 
 
-MakeBehavior = Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
-"""See ``Problem.behavior``."""
+@dataclass(frozen=True)
+class Behaviors:
+    """Policies that collect pretraining contexts and are not given the task."""
+
+    names: tuple[str, ...]
+    """The names that ``pretrain.behaviors`` may hold."""
+    make: Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
+    """``make(names, rngs, env)``: row r follows the policy ``names[r]``, which draws from ``rngs[r]``."""
+
+
 MakeDrawing = Callable[[np.ndarray, np.ndarray, Mapping[str, Any], int], dict[str, Any]]
 """See ``Problem.drawing``."""
 
@@ -268,8 +277,8 @@ class Problem(abc.ABC):
         return None
 
     @property
-    def behavior(self) -> MakeBehavior | None:
-        """``behavior(names, rngs, env)``: one named behavior policy per row, for pretraining contexts."""
+    def behaviors(self) -> Behaviors | None:
+        """Behavior policies, which jobs of the kind ``behavior_context`` need."""
         return None
 
     @property
@@ -297,13 +306,13 @@ class Problem(abc.ABC):
         return None
 
     @property
-    def posterior(self) -> Any:
+    def posterior(self) -> PosteriorSuite | None:
         """Comparison of a model with the exact posterior (``icrl-dist evaluate --suite posterior``)."""
         return None
 
     @property
-    def game(self) -> Any:
-        """The interactive environment of ``icrl-dist play``."""
+    def game(self) -> MakeGame | None:
+        """``game(agent, run, seed)``: the interactive environment of ``icrl-dist play``."""
         return None
 
     @property
@@ -346,6 +355,14 @@ class Problem(abc.ABC):
         So a table that changes later does not change the run.  Raises ConfigError for a value that cannot be resolved.
         """
         return self.config
+
+    @classmethod
+    def translated(cls, tables: dict[str, Any]) -> dict[str, Any]:
+        """The tables of a run file that an older version wrote, with the problem's former values translated.
+
+        The names of sections and keys are the present ones already; sections of other problems are still there.
+        """
+        return tables
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         """The values that a run of this problem cannot have: key, value, remedy."""
@@ -415,6 +432,8 @@ class RatedVariation(NamedTuple):
     """Expected return of the optimal policy."""
     agreement: float | None
     """Share of the labels that are optimal; None if the trials gave no labels."""
+    context_trials: int
+    """The first so many trials became contexts; labels come from later ones."""
 
 
 Draw = Callable[[np.random.Generator], Any]
@@ -429,10 +448,27 @@ class Weighted(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class LabelQuality:
+    """Quality of the labels that a model made itself in one round.  Returns are undiscounted, per episode."""
+
+    agreement: float
+    """Share of the labels that are optimal, 0 to 1."""
+    labelling: float
+    """Share of the variations whose trials gave labels, 0 to 1."""
+    context_return: float
+    """Mean return of the trials that became contexts."""
+    label_return: float
+    """Mean return of the later trials, which labels come from."""
+    optimum: float
+    """Mean optimal return of the variations."""
+
+
 class Method(abc.ABC):
     """An in-context method: its phases and jobs, its training batches, model, loss and deployed policy.
 
-    One object serves one run; it may cache results that it computed from the run's data.
+    An object may cache what it computed from the data of its run: the learner makes a new object after a repair of
+    the dataset, so no cached result is older than the data.
     """
 
     name: ClassVar[str]

@@ -185,6 +185,8 @@ class Service:
                 self.store.repair()
                 self._report_repairs()
                 self._plan.recheck()
+                # The old object may have cached results from trajectories that are now replaced.
+                self._method = self._plan.method = self._fitting.method = methods.of(self._run)
         self.store.seal()
         return {
             "dataset_digest": self.store.digest(),
@@ -252,7 +254,8 @@ class Service:
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         if phase.next_version > self.version:
             rated = self._method.label_quality(self._run, phase, self.store)
-            if quality := training_rows.rate_labels(self._run, self._folder, phase, rated):
+            quality = training_rows.rate_labels(self._run, self._folder, phase, rated)
+            if quality is not None:
                 self._reporter.labels_rated(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:

@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, OK
-from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.run import ConfigError, load_folder
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def _learner_of(what: Path | None, connect: str | None, certificates: str | None
             f"no run is active in {what or 'runs/'}: start one with `icrl-dist train`, or name it with --connect tcp/HOST:PORT"
         )
     folder = files[-1].parent
-    stream = load(str(folder / "run.toml")).stream
+    stream = load_folder(folder).stream
     endpoint = stream.connect or files[-1].read_text().strip()
     return endpoint, certificates or stream.certificates, _run_name(folder)
 

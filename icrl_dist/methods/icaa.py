@@ -74,7 +74,8 @@ class ICAA(DPT):
             if self._has_labels(run, dataset, key, trials):
                 found = self._examples(run, dataset).get(key)
                 agreement = float(exact.optimal(trials[0].variation, found.queries, found.labels).mean())
-            yield RatedVariation(trials, float(exact.optimum([trials[0].variation])[0]), agreement)
+            optimum = float(exact.optimum([trials[0].variation])[0])
+            yield RatedVariation(trials, optimum, agreement, run.icaa.context_trials + 1)
 
     def _examples(self, run: Run, dataset: TrajectoryDataset) -> ExamplesCache[VariationKey]:
         from icrl_dist.methods import examples

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
 from icrl_dist.problems import registry
 from icrl_dist.results.rows import Block
-from icrl_dist.rollout.episode import OfflinePolicy, deploy_offline, deploy_online, episode
+from icrl_dist.rollout.episode import Episodes, OfflinePolicy, deploy_offline, deploy_online, episode
 from icrl_dist.types import Adversary, Identity, Task, Variation
 
 
@@ -149,24 +150,22 @@ def online(
 
 
 def offline(run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
-    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
+    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a D_off of each of the ``sources``.
 
-    Deploys every model, and every reference that accepts data of other policies.  Only for a problem with
-    exact answers.
+    Deploys every model, and every reference that accepts data of other policies.
     """
     problem, results = registry.of(run), []
-    assert problem.exact is not None
     references = {Agent(key): reference for key, reference in problem.references(run).items()}
-    expert = next(agent for agent, one in references.items() if one.ceiling)
     for p in run.evaluate.p:
         chosen = variations(run, p)
-        optimum = problem.exact.optimum(chosen)
+        optimum = None if problem.exact is None else problem.exact.optimum(chosen)
         rows, ids = _rows(run, chosen, p)
         env = problem.batch(rows)
         shape = (len(chosen), run.evaluate.seeds, 1)
-        for source, behavior in (("random", Agent("random")), ("expert", expert)):
+        for source, key in sources(run).items():
+            behavior = Agent(key)
             data = episode(env, references[behavior].make(rows, env), [i.rng(run.seed) for i in ids])
-            results.append(Result(behavior, p, data.returns.reshape(shape), chosen, optimum))
+            results.append(Result(behavior, p, data.returns.reshape(shape), chosen, optimum, diverged=_diverged(data, shape)))
             policies: dict[Agent, Policy] = {
                 name: in_context(one, run.context, deploy)(rows, env) for name, one in models.items()
             }
@@ -174,8 +173,21 @@ def offline(run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment |
             for name, policy in policies.items():
                 if _accepts_data(policy):
                     ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
-                    results.append(Result(name, p, ran.returns.reshape(shape), chosen, optimum, data=source))
+                    found = Result(name, p, ran.returns.reshape(shape), chosen, optimum, data=source)
+                    results.append(dataclasses.replace(found, diverged=_diverged(ran, shape)))
     return results
+
+
+def sources(run: Run) -> dict[str, str]:
+    """Keys of the references that collect D_off: ``random``, and as ``expert`` the first ceiling; those that there are."""
+    references = registry.of(run).references(run)
+    found = {"random": "random" if "random" in references else None}
+    found["expert"] = next((key for key, one in references.items() if one.ceiling), None)
+    return {name: key for name, key in found.items() if key is not None}
+
+
+def _diverged(ran: Episodes, shape: tuple[int, ...]) -> np.ndarray | None:
+    return None if ran.diverged is None else ran.diverged.reshape(shape)
 
 
 def _accepts_data(policy: Policy) -> TypeGuard[OfflinePolicy]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int64
 from rich.console import Console
 
 from icrl_dist.agent import ood_score
@@ -25,6 +25,7 @@ from icrl_dist.results import evaluate, plots, rows, summaries, training_rows
 from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.names import key_of
+from icrl_dist.results.summaries import Returns
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Dataset
@@ -93,6 +94,7 @@ def online(run: Run, what: Path, results: Path, display: Display, deploy: Deploy
     were trained for.  If that rule is not Algorithm 1, the newest model is deployed by Algorithm 1 as well.  Rows of
     the newest model have the OOD score after the last episode if it was calibrated.
     """
+    check_suite(run, "online")
     found, problem = models(what, deploy), registry.of(run)
     agents: dict[Agent, MakePolicy | Reference] = {
         agent: evaluate.in_context(model, run.context, deploy) for agent, model in found.items()
@@ -136,10 +138,15 @@ def _recorded(
 def check_suite(run: Run, suite: str) -> None:
     """Raises ConfigError if the run's problem or method does not support the suite."""
     problem, method = registry.of(run), methods.of(run)
-    if suite == "offline" and problem.exact is None:
-        raise ConfigError(f"--suite offline: {run.problem} has no exact answers for expert data; use --suite online")
+    if not problem.evaluated:
+        raise ConfigError(f"--suite {suite}: {run.problem} has no tasks to evaluate on: change [{problem.section}]")
+    if suite == "offline" and not evaluate.sources(run):
+        lacks = "has no reference 'random' and none that is given the task"
+        raise ConfigError(f"--suite offline: {run.problem} {lacks}, so nothing collects data; use --suite online")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
+    if suite == "posterior" and problem.exact is None:
+        raise ConfigError(f"--suite posterior: {run.problem} has no exact answers; use --suite online")
 
 
 def offline(run: Run, what: Path, results: Path, deploy: Deployment | None = None) -> pd.DataFrame:
@@ -156,15 +163,19 @@ def show_online(run: Run, report: Path, frame: pd.DataFrame, console: Console) -
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
     figure = plots.adaptation(numbers, report.with_name(f"{report.name}.png"), title)
     console.print(returns_table(frame, f"Return by online episode: {title}"))
-    for one in found:
-        if one.diverged:
-            text = f"{one.name}, p = {one.p:g}: the simulation diverged in {one.diverged} of {one.returns.size} episodes; "
-            console.print(text + "their return up to that step counts", highlight=False, markup=False)
+    _show_diverged(found, console)
     for p, score in scores.items():
         text = f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
         console.print(text, highlight=False, markup=False)
     console.print(f"figure {figure}", highlight=False, markup=False)
     return {**summaries.adaptation(frame), "surprise": scores, "rows": numbers, "figure": str(figure)}
+
+
+def _show_diverged(found: Sequence[Returns], console: Console) -> None:
+    for one in found:
+        if one.diverged:
+            text = f"{one.name}, p = {one.p:g}: the simulation diverged in {one.diverged} of {one.returns.size} episodes; "
+            console.print(text + "their return up to that step counts", highlight=False, markup=False)
 
 
 def show_experts(run: Run, folder: Path, console: Console) -> dict[str, Any]:
@@ -188,7 +199,16 @@ def posterior(run: Run, what: Path, results: Path, display: Display) -> dict[str
     """
     agent, model = _agent(load_checkpoint(checkpoint_file(what)), "paper")
     suite, split = registry.of(run).posterior, registry.of(run).split
-    decide = functools.partial(model.method.distributions, model.model)
+    assert suite is not None, "``check_suite`` refuses problems without one"
+
+    def decide(
+        transitions: Sequence[np.ndarray], queries: Float32[np.ndarray, "B N S"], prefix: Int64[np.ndarray, "B N"]
+    ) -> Float64[np.ndarray, "B N A"]:
+        probs = model.method.distributions(model.model, transitions, queries, prefix)
+        if probs is None:
+            raise ConfigError(f"--suite posterior: the model of {run.method} gives no distributions; use --suite online")
+        return probs
+
     act = evaluate.in_context(model, run.context, "paper")
     report: dict[str, Any] = {}
     total = len(suite.kinds) * len(suite.levels(run))
@@ -217,6 +237,7 @@ def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Conso
     title = f"{run.method.upper()} compared with the exact posterior: {problem.title(len(problem.evaluated))}"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
     figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
+    assert problem.posterior is not None, "``check_suite`` refuses problems without one"
     for prior, meaning in problem.posterior.priors.items():
         console.print(kl_table(found, prior, f"KL(exact || model) in nats, where {meaning}"))
     adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
@@ -241,7 +262,10 @@ def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str
     return progress
 
 
-def show_offline(frame: pd.DataFrame, console: Console) -> dict[str, Any]:
+def show_offline(run: Run, frame: pd.DataFrame, console: Console) -> dict[str, Any]:
     """Print the table; returns the numbers."""
-    console.print(returns_table(frame, "One episode given data collected before, on goals never trained on"))
+    found = summaries.returns(frame)
+    title = registry.of(run).title(found[0].returns.shape[1])
+    console.print(returns_table(frame, f"One episode given data collected before: {title}"))
+    _show_diverged(found, console)
     return {"rows": summaries.result_rows(frame)}

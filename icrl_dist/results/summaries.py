@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import ConfigError
+from icrl_dist.interfaces import LabelQuality
 from icrl_dist.results import statistics
 from icrl_dist.results.names import AgentKey, names
 
@@ -203,7 +204,7 @@ def _result_row(one: Returns, last: Interval) -> dict[str, Any]:
         "optimum": None if best is None else round(best, 3),
         "last5": round(last.value, 3),
         "last5_interval": [round(last.low, 3), round(last.high, 3)],
-        "last5_over_optimum": None if best is None else round(last.value / best, 4),
+        "last5_over_optimum": None if best is None else _share(last.value, best),
         **({"broken": one.diverged} if one.diverged else {}),
     }
 
@@ -226,9 +227,13 @@ def adaptation(frame: pd.DataFrame) -> dict[str, dict[str, float | int | None]]:
     }
 
 
-def first_over(one: Returns, oracle: Returns, episodes: int) -> float:
-    """Mean return over the first episodes, as a share of the oracle's in these episodes."""
-    return round(float(one.flat[:, :, :episodes].mean() / oracle.flat[:, :, :episodes].mean()), 4)
+def first_over(one: Returns, oracle: Returns, episodes: int) -> float | None:
+    """Mean return over the first episodes, as a share of the oracle's in these episodes; None if that is 0."""
+    return _share(float(one.flat[:, :, :episodes].mean()), float(oracle.flat[:, :, :episodes].mean()))
+
+
+def _share(value: float, whole: float) -> float | None:
+    return round(value / whole, 4) if whole else None
 
 
 def episode_of(one: Returns, oracle: Returns, share: float) -> int | None:
@@ -260,21 +265,19 @@ def experts(frame: pd.DataFrame) -> list[dict[str, Any]]:
     return answer
 
 
-def label_quality(frame: pd.DataFrame, context_trials: int) -> dict[str, float]:
+def label_quality(frame: pd.DataFrame, context_trials: int) -> LabelQuality:
     """Quality of the labels that T^j made in a round, from the rows of suite ``label_quality`` (Theorem E.5).
 
-    ``agreement``: share of labels that are optimal; ``labelling``: share of variations that gave labels;
-    ``context_return`` and ``label_return``: mean return of the first ``context_trials`` trials and of later ones;
-    ``optimum``: mean optimal return.
+    ``context_trials``: the first so many trials became contexts; labels come from later ones.
     """
     early = frame["episode"] < context_trials
     by = ["task_index", "adversary_index"]
     variations = frame.groupby(by)[["agreement", "optimum"]].first()
     rated = variations["agreement"].dropna()
-    return {
-        "agreement": float(rated.mean()) if len(rated) else 0.0,
-        "labelling": len(rated) / len(variations),
-        "context_return": float(frame[early].groupby(by)["return"].mean().mean()),
-        "label_return": float(frame[~early].groupby(by)["return"].mean().mean()),
-        "optimum": float(variations["optimum"].mean()),
-    }
+    return LabelQuality(
+        agreement=float(rated.mean()) if len(rated) else 0.0,
+        labelling=len(rated) / len(variations),
+        context_return=float(frame[early].groupby(by)["return"].mean().mean()),
+        label_return=float(frame[~early].groupby(by)["return"].mean().mean()),
+        optimum=float(variations["optimum"].mean()),
+    )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from icrl_dist.config.run import Run
-from icrl_dist.interfaces import Phase, RatedVariation
+from icrl_dist.interfaces import LabelQuality, Phase, RatedVariation
 from icrl_dist.methods import registry as methods
 from icrl_dist.results import rows, summaries
 from icrl_dist.results.evaluate import of_run, parameters
@@ -18,28 +18,29 @@ from icrl_dist.results.rows import Block
 from icrl_dist.types import Trajectory
 
 
-def rate_labels(run: Run, folder: Path, phase: Phase, rated: Iterable[RatedVariation]) -> dict[str, float]:
+def rate_labels(run: Run, folder: Path, phase: Phase, rated: Iterable[RatedVariation]) -> LabelQuality | None:
     """Write the trials of one round as rows of suite ``label_quality``; returns ``summaries.label_quality`` of them.
 
-    Without trials nothing is written and the result is empty.  Raises StoreError if the rows cannot be written.
+    Without trials nothing is written and the result is None.  Raises StoreError if the rows cannot be written.
     """
-    rule = methods.of(run).deployment(run)
-    blocks = [
-        {
-            **_of_trials(run, folder.name, one.trials),
-            "agent": np.array([key_of(trial.policy_version) for trial in one.trials], object),
-            "policy_version": np.array([trial.policy_version for trial in one.trials]),
-            "weights_digest": np.array([trial.weights_digest for trial in one.trials], object),
-            "deployment": rule,
-            "optimum": one.optimum,
-            "agreement": one.agreement,
-        }
-        for one in rated
-    ]
+    rule, blocks, context_trials = methods.of(run).deployment(run), [], 0
+    for one in rated:
+        context_trials = one.context_trials
+        blocks.append(
+            {
+                **_of_trials(run, folder.name, one.trials),
+                "agent": np.array([key_of(trial.policy_version) for trial in one.trials], object),
+                "policy_version": np.array([trial.policy_version for trial in one.trials]),
+                "weights_digest": np.array([trial.weights_digest for trial in one.trials], object),
+                "deployment": rule,
+                "optimum": one.optimum,
+                "agreement": one.agreement,
+            }
+        )
     if not blocks:
-        return {}
+        return None
     file = rows.append(folder / "results", "label_quality", {"round": phase.round}, blocks)
-    return summaries.label_quality(rows.read([file]), run.icaa.context_trials + 1)
+    return summaries.label_quality(rows.read([file]), context_trials)
 
 
 def of_expert(run: Run, name: str, trials: Sequence[Trajectory]) -> Block:

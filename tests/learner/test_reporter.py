@@ -3,23 +3,29 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from icrl_dist.config.sections import AlertsConfig
+from icrl_dist.interfaces import LabelQuality, RatedVariation
 from icrl_dist.launch import train as launch
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.telemetry.metrics import NAMES, TEXTS
 from learner import reporter, service
+from tests.toys.return_to_go import ReturnToGo
 
 METRICS = service.Metrics
 
 
 @pytest.fixture
 def train(small_run, tmp_path, monkeypatch):
-    """``train(**thresholds)``: a run; returns its monitor messages, rows of metrics, and events for the terminal."""
+    """``train(run, **thresholds)``: a run, by default ``small_run``.
 
-    def run_with(**thresholds):
+    Returns its monitor messages, rows of metrics, and events for the terminal.
+    """
+
+    def run_with(run=None, **thresholds):
         messages, events, publish = [], [], MemoryLink.publish
 
         def record(link, key, payload, droppable):
@@ -31,7 +37,7 @@ def train(small_run, tmp_path, monkeypatch):
         monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
         monkeypatch.setattr(reporter, "_DESCRIPTION_S", 0.0)
         monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
-        run = dataclasses.replace(small_run, alerts=AlertsConfig(**thresholds))
+        run = dataclasses.replace(run or small_run, alerts=AlertsConfig(**thresholds))
         launch.prepare(run, tmp_path / "run", resume=False, overwrite=False)
         launch.train_inline(run, tmp_path / "run", events.append)
         rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
@@ -56,6 +62,29 @@ def test_monitors_receive_all_documented_messages(train):
     assert stored == sorted(stored) and stored[-1] == len(identities) == len(set(identities))
     assert len(of["episode"]) < len(identities), "only some episodes are published completely"
     assert len(of["trajectories"]) < len(identities) / 2, "a message contains many trajectories"
+
+
+def test_labels_that_a_method_of_another_package_rates_are_reported(train, toy_run, install):
+    returns = []
+
+    class Rated(ReturnToGo):
+        def label_quality(self, run, phase, dataset):
+            if phase.stage == "adapt":
+                for key in dataset.variations("adapt", phase.round):
+                    trials = dataset.trials(key)
+                    returns.append([trial.episode_return for trial in trials])
+                    yield RatedVariation(trials, optimum=4.0, agreement=0.5, context_trials=1)
+
+    run = toy_run(method="return-to-go")
+    install(methods={"return-to-go": Rated})
+    _, rows, events = train(run)
+    early, late = np.mean(returns, axis=0)[:1].mean(), np.mean(returns, axis=0)[1:].mean()
+    quality = LabelQuality(agreement=0.5, labelling=1.0, context_return=early, label_return=late, optimum=4.0)
+    (shown,) = [event for event in events if event["event"] == "labels"]
+    assert (shown.pop("event"), shown.pop("round")) == ("labels", 0)
+    assert shown == pytest.approx(dataclasses.asdict(quality))
+    (row,) = [row for row in rows if row["stage"] == "labels"]
+    assert shown.items() <= row.items() and shown.keys() == NAMES["labels"].keys()
 
 
 def test_an_alert_reaches_terminal_monitors_and_metrics(train):
