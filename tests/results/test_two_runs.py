@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -214,6 +215,19 @@ def test_every_number_of_a_comparison_follows_from_the_rows(runs):
             assert cells[6] == " .. ".join(forms[i].format(bound) for bound in (low, high))
             neutral = 0.5 if i == 4 else 0.0
             assert cells[7] == ("not shown" if low <= neutral <= high else "higher" if low > neutral else "lower")
+
+
+def test_the_examples_of_the_page_run(runs, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
+    reading, comparing = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(reading.replace("runs/demo", str(runs["icaa", 0].folder)), {})
+    assert "oracle" in capsys.readouterr().out
+    folders = {f"runs/{method}-{seed}": str(run.folder) for (method, seed), run in runs.items()}
+    for name, folder in folders.items():
+        comparing = comparing.replace(name, folder)
+    comparing = re.sub(r', "runs/ica.-2"', "", comparing)  # two trainings of each were made
+    exec(comparing, {})
+    assert "not shown" in capsys.readouterr().out
 
 
 def test_an_effect_is_worded_by_its_interval():
