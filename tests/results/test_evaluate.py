@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from icrl_dist import InContextAgent, make
+from icrl_dist import InContextAgent, make, read_results
 from icrl_dist.agent.loading import load_agent
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.cli import main
@@ -246,6 +246,27 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
     assert all(len(c["kl"]) == 17 for c in kept["kl_heldout_any_curves"]["by_prefix"])
     assert Path(answer["figure"]).read_bytes().startswith(b"\x89PNG")
     assert all(meaning in printed.err for meaning in divergence.PRIORS.values()) and f"{answer['kl_nats']:.4f}" in printed.err
+
+
+def test_evaluations_add_rows_and_replace_no_report_of_other_settings(folder, capsys):
+    reports = {}
+    for words in (["--p", "0", "0.2"], ["--p", "0.2"], ["--p", "0.2", "--seeds", "1"], ["--suite", "offline"]):
+        assert main.main(["evaluate", str(folder), "--episodes", "2", *words]) == 0
+        for name, content in reports.items():
+            assert name.read_bytes() == content
+        reports = {path: path.read_bytes() for path in (folder / "report").iterdir()}
+    assert len(reports) == 3 * 2 and len(list((folder / "results").iterdir())) == 4
+    frame = read_results(folder)
+    online = frame[frame.suite == "online"]
+    assert set(online.p) == {0.0, 0.2} and set(frame.suite) == {"online", "offline"}
+    assert not online.duplicated(["agent", "p", "task_index", "evaluation_seed", "episode"]).any()
+    assert "not finished" not in capsys.readouterr().out
+    (folder / "run.toml").touch()
+    file = version_file(folder, 0)
+    assert main.main(["evaluate", str(file), "--episodes", "1", "--p", "0"]) == 0
+    assert len(list((folder / "results").iterdir())) == 5, "rows of a checkpoint file in a run folder belong to the run"
+    assert main.main(["evaluate", str(folder), "--episodes", "1", "--p", "0"]) == 0
+    assert f"{folder}: this run is not finished; the newest version so far is evaluated" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -111,13 +111,18 @@ def numbers(text):
     return [float(number) for number in re.findall(r"-?\d+\.?\d*", text)]
 
 
-@pytest.mark.parametrize("method", ["icag", "icaa"])
-def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method):
-    run = runs[method, 1]
-    rows = records(read_results(run.folder).to_dict("records"), suite="online")
-    header, body = cells_of(run.printed)
+@pytest.mark.parametrize(("method", "seeds"), [("icag", [1]), ("icaa", [1]), ("icaa", [0, 1])])
+def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method, seeds):
+    """What ``train`` printed for one training, and the same table of two trainings."""
+    found = read_results([runs[method, seed].folder for seed in seeds])
+    found = found[found.suite == "online"]
+    printed = runs[method, 1].printed if seeds == [1] else rendered(tables.returns_table(found, "two trainings"))
+    rows = found.to_dict("records")
+    header, body = cells_of(printed)
     assert header == ["p", "agent", "ep 1", "ep 2", "ep 3", "last 3", "of oracle"]
-    assert "one training: 95% interval over 2 tasks with their adversaries, 2 evaluations of each" in unwrapped(run.printed)
+    over = "95% interval over 2 tasks" if seeds == [1] else "95% interval over 2 training seeds, 2 tasks"
+    assert f"{over} with their adversaries, 2 evaluations of each, 3 episodes an evaluation" in unwrapped(printed)
+    assert ("one training: " in unwrapped(printed)) == (seeds == [1])
     agents = list(dict.fromkeys(AgentKey(row["agent"], row["deployment"], row["data"]) for row in rows))
     called = names(agents, "online", method, "darkroom")
     assert len(body) == len(agents) * len(LEVELS)
@@ -129,7 +134,7 @@ def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method):
         own = records(rows, p=p, agent=agent.agent)
         for episode in range(EPISODES):
             values = [row["return"] for row in records(own, episode=episode)]
-            assert len(values) == 2 * SEEDS and cells[2 + episode] == f"{sum(values) / len(values):.1f}"
+            assert len(values) == 2 * SEEDS * len(seeds) and cells[2 + episode] == f"{sum(values) / len(values):.1f}"
         scores, oracle = nested(own, LAST), nested(records(rows, p=p, agent="oracle"), LAST)
         resampled = drawn([scores, oracle], lambda one, two: (slow_mean(one), slow_ratio(one, two)))
         value, share = slow_mean(means(scores)), slow_mean(means(scores)) / slow_mean(means(oracle))
