@@ -265,7 +265,8 @@ class WorkerAPI:
                 self._jobs.pop(worker, None)
                 return wire.encode_message("wait", seconds=0.1)
             self._jobs[worker] = lease.job
-        return wire.encode_message("job", job=wire.encode_job(lease.job), deadline_s=lease.deadline_s)
+        job = lease.job
+        return wire.encode_message("job", name=list(job.name), job=wire.encode_job(job), deadline_s=lease.deadline_s)
 
     def _failed(self, worker: str, name: tuple[str, int, int, int], record: dict[str, Any], file: str) -> None:
         with self._lock:

@@ -101,6 +101,8 @@ class Wait:
 class LeasedJob:
     """Reply to a request for a job."""
 
+    name: tuple[Stage, Count, Count, Count]
+    """``Job.name``, by which a worker that cannot decode the job reports its failure."""
     job: bytes
     """For ``wire.decode_job``."""
     deadline_s: Annotated[float, Ge(0)]

@@ -10,8 +10,9 @@ import pytest
 import icrl_dist
 from icrl_dist import version
 from icrl_dist.config.run import parse
-from icrl_dist.stream import wire
+from icrl_dist.stream import messages, wire
 from icrl_dist.stream.link import Refused, StreamKeys
+from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from learner import worker_api as worker_api_module
 from learner.scheduler import LeaseScheduler
@@ -108,6 +109,7 @@ def test_requests_are_answered_with_jobs_then_wait_then_stop(server):
     for i, job in enumerate(server.jobs):
         kind, fields = server.ask(f"w{i}")
         assert (kind, decoded(server.run, fields["job"]), fields["deadline_s"]) == ("job", job, 60.0)
+        assert read(messages.LeasedJob, fields, kind).name == job.name
     assert server.ask("w3") == ("wait", {"seconds": 0.1})
     server.worker_api.finish()
     assert server.ask("w3") == ("stop", {})
