@@ -11,8 +11,9 @@ from __future__ import annotations
 import contextlib
 import functools
 from importlib import metadata
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, get_args
 
+from icrl_dist import version
 from icrl_dist.config.toml import ConfigError, nearest
 
 Group = Literal["problems", "methods"]
@@ -48,6 +49,33 @@ def importable(group: Group) -> dict[str, Any]:
     for name in names(group):
         with contextlib.suppress(ConfigError):
             found[name] = find(group, name)
+    return found
+
+
+class Source(NamedTuple):
+    """The distribution that has a problem or a method of another package, and the digest of its code."""
+
+    distribution: str
+    version: str
+    code: str
+    """``version.digest_of`` its module."""
+
+    def __str__(self) -> str:
+        return f"{self.distribution} {self.version} with code {self.code[:8]}"
+
+
+@functools.cache
+def sources() -> dict[str, Source]:
+    """The source of every installed problem and method of another package, by ``problems/NAME`` or ``methods/NAME``.
+
+    Problems and methods of this package are left out.  No package is imported, so one that is broken is here too.
+    """
+    found = {}
+    for group in get_args(Group):
+        for name, entry in _entries(group).items():
+            if entry.module.partition(".")[0] not in version.PACKAGES:
+                distribution = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
+                found[f"{group}/{name}"] = Source(*distribution, version.digest_of(entry.module))
     return found
 
 
