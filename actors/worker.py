@@ -21,6 +21,7 @@ from actors.watchdog import Watchdog
 from actors.weight_cache import WeightCache
 from icrl_dist import version as code
 from icrl_dist.collect import kinds
+from icrl_dist.config import plugins
 from icrl_dist.config.run import parse
 from icrl_dist.interfaces import Problem
 from icrl_dist.methods import registry as methods
@@ -66,7 +67,9 @@ class Worker:
         longer than ``patience_s``.
         """
         self._link.announce(self._keys.alive(self.name))
-        _, hello = self._request("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
+        sources = {name: list(source) for name, source in plugins.sources().items()}
+        identity = {"version": icrl_dist.__version__, "code": code.digest(), "plugins": sources, "pid": os.getpid()}
+        _, hello = self._request("hello", **identity)
         run = parse(read(messages.Welcome, hello, "hello").run, "the learner's run")
         problem, method = problems.of(run), methods.of(run)
         weights = WeightCache(self._link, self._keys, method.build(problem.spec, run), run.stream.max_message_bytes)

@@ -10,6 +10,7 @@ from typing import Any
 
 import icrl_dist
 from icrl_dist import version
+from icrl_dist.config import plugins
 from icrl_dist.config.run import Run, dumps
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.dispatch import Dispatcher
@@ -238,14 +239,7 @@ class WorkerAPI:
         worker = request.worker
         match request:
             case messages.Hello():
-                if request.version != icrl_dist.__version__:
-                    theirs, ours = request.version, icrl_dist.__version__
-                    raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
-                if request.code != version.digest():
-                    theirs, ours = request.code[:8], version.digest()[:8]
-                    raise ValueError(
-                        f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code"
-                    )
+                self._require_same_code(request)
                 return wire.encode_message("hello", run=dumps(self._run))
             case messages.Progress():
                 self._update_counters(fields)
@@ -255,6 +249,29 @@ class WorkerAPI:
             case messages.Note():
                 self._report({"event": "note", "text": f"worker {worker}: {request.text[:200]}"})
         return wire.encode_message("noted")
+
+    def _require_same_code(self, hello: messages.Hello) -> None:
+        """Raises ValueError, with the remedy, for a worker with other code than the learner's.
+
+        Of other packages only those with the run's problem and method count.
+        """
+        worker = hello.worker
+        if hello.version != icrl_dist.__version__:
+            theirs, ours = hello.version, icrl_dist.__version__
+            raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
+        if hello.code != version.digest():
+            theirs, ours = hello.code[:8], version.digest()[:8]
+            raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code")
+        for group, name in (("problems", self._run.problem), ("methods", self._run.method)):
+            key = f"{group}/{name}"
+            here, there = plugins.sources().get(key), hello.plugins.get(key)
+            if here != there:
+                theirs = str(plugins.Source(*there)) if there else "no other package with it"
+                ours = str(here) if here else "no other package with it"
+                raise ValueError(
+                    f"{group.removesuffix('s')} {name!r}: worker {worker} has {theirs}, the learner has {ours}: "
+                    "install the same version on every node"
+                )
 
     def _lease(self, worker: str) -> bytes:
         if self._finished.is_set():

@@ -25,6 +25,9 @@ class Hello:
     """Version of the package that the worker runs."""
     code: str
     """Digest of the code that the worker runs."""
+    plugins: dict[str, tuple[str, str, str]]
+    """Distribution, version and digest of the code of every installed problem and method of another package, by
+    ``problems/NAME`` or ``methods/NAME``; the worker does not know yet which of them the run has."""
     pid: Count
 
 

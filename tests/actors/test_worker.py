@@ -17,6 +17,7 @@ from actors.weight_cache import WeightCache
 from actors.worker import Worker
 from icrl_dist.collect import kinds
 from icrl_dist.collect.behavior import BehaviorContexts
+from icrl_dist.config import plugins
 from icrl_dist.config.run import dumps
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
@@ -28,6 +29,7 @@ from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 from tests.contracts.link_battery import eventually
 from tests.jobs import jobs_of
+from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 KEYS = StreamKeys("test")
 
@@ -206,6 +208,18 @@ def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, sm
     assert counters[1] == {"episodes": count, "steps": count * small_run.darkroom.horizon, "trajectories": count, "resent": 0}
     assert {kind for kind, _ in heartbeats} == {"worker"}
     assert all(fields["worker"] == "w0" and fields["memory_mb"] > 10 and fields["waited_s"] >= 0 for _, fields in heartbeats)
+
+
+def test_hello_names_the_code_of_problems_and_methods_of_other_packages(small_run, tmp_path):
+    said = []
+    for name, text in (("one", CORRIDOR), ("other", SLIPPERY)):
+        network = MemoryHub().link
+        learner = ScriptedLearner(network(), small_run, [STOP])
+        with installed(tmp_path / name, {"toy_problem.py": text}):
+            Worker(network(), "test", "w0").run()
+            assert learner.requests[0][1]["plugins"] == {"problems/toy": list(plugins.sources()["problems/toy"])}
+        said.append(learner.requests[0][1]["plugins"]["problems/toy"])
+    assert said[0][:2] == said[1][:2] == ["toys", "1.0"] and said[0][2] != said[1][2]
 
 
 def test_a_refused_hello_ends_the_worker_with_the_reason(hub):
