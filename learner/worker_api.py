@@ -262,15 +262,12 @@ class WorkerAPI:
         if hello.code != version.digest():
             theirs, ours = hello.code[:8], version.digest()[:8]
             raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code")
-        for group, name in (("problems", self._run.problem), ("methods", self._run.method)):
-            key = f"{group}/{name}"
-            here, there = plugins.sources().get(key), hello.plugins.get(key)
+        for name, what in plugins.of_run(self._run.problem, self._run.method).items():
+            here, there = plugins.sources().get(name), hello.plugins.get(name)
             if here != there:
-                theirs = str(plugins.Source(*there)) if there else "no other package with it"
-                ours = str(here) if here else "no other package with it"
+                theirs, ours = plugins.text(there), plugins.text(here)
                 raise ValueError(
-                    f"{group.removesuffix('s')} {name!r}: worker {worker} has {theirs}, the learner has {ours}: "
-                    "install the same version on every node"
+                    f"{what}: worker {worker} has {theirs}, the learner has {ours}: install the same version on every node"
                 )
 
     def _lease(self, worker: str) -> bytes:

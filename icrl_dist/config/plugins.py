@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Sequence
 from importlib import metadata
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -60,9 +61,6 @@ class Source(NamedTuple):
     code: str
     """``version.digest_of`` its module."""
 
-    def __str__(self) -> str:
-        return f"{self.distribution} {self.version} with code {self.code[:8]}"
-
 
 @functools.cache
 def sources() -> dict[str, Source]:
@@ -77,6 +75,16 @@ def sources() -> dict[str, Source]:
                 distribution = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
                 found[f"{group}/{name}"] = Source(*distribution, version.digest_of(entry.module))
     return found
+
+
+def of_run(problem: str, method: str) -> dict[str, str]:
+    """The names in ``sources`` that a run of this problem and method may have, with their text for messages."""
+    return {f"problems/{problem}": f"problem {problem!r}", f"methods/{method}": f"method {method!r}"}
+
+
+def text(source: Sequence[str] | None) -> str:
+    """A source, or its fields, for messages; None: the problem or method is not one of another package."""
+    return f"{source[0]} {source[1]} with code {source[2][:8]}" if source else "no other package with it"
 
 
 @functools.cache
