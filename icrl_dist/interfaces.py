@@ -214,6 +214,9 @@ class Problem(abc.ABC):
     """Packaged run file that problems of this class share, if any: ``dmc`` for ``dmc.toml`` and ``dmc-laptop.toml``."""
     free_in_forks: ClassVar[tuple[str, ...]] = ()
     """Fields of the section that a fork may change, because neither the tasks nor their split depend on them."""
+    libraries: ClassVar[tuple[str, ...]] = ()
+    """Distributions, beside numpy, whose versions decide the bytes of the environments' episodes, as in ``("mujoco",)``.
+    A cached expert is used with the same versions only."""
     job_kinds: ClassVar[Mapping[str, JobKind]] = {}
     """Kinds of jobs that only this problem has."""
     earns_in_contexts: ClassVar[bool] = True
@@ -233,7 +236,11 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def batch(self, variations: Sequence[Variation]) -> Batch:
-        """These variation environments as one batch."""
+        """These variation environments as one batch.
+
+        What decides an environment belongs in the parameters of its task and adversary: ``icrl_dist.make``, live
+        views and the cache of experts know only these.
+        """
 
     @abc.abstractmethod
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:

@@ -18,6 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
@@ -191,7 +192,8 @@ def train_ray(
                 raise (TrainInterrupted if interrupted.is_set() else _failed(error)) from None
             stack.callback(fleet.close)
             stack.enter_context(_on_signals(interrupted.set))  # again, because Ray replaces the handlers
-            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
+            needed = plugins.of_run(run.problem, run.method)
+            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed)
             if address is not None and interrupted.is_set():
                 raise TrainInterrupted
         if address is not None:

@@ -98,29 +98,6 @@ def test_a_history_delivers_at_most_the_episodes_of_its_training_and_keeps_all_o
     assert len(cache.load(few.variations[0], HORIZON, run.sac, run.seed, "lockstep").rewards) == 6
 
 
-def test_every_number_that_decides_a_history_is_part_of_its_key(run, monkeypatch):
-    job = jobs_of(run)[0]
-    one = cache.key(job.variations[0], HORIZON, run.sac, 0, "lockstep")
-    changed = [
-        cache.key(job.variations[1], HORIZON, run.sac, 0, "lockstep"),
-        cache.key(job.variations[2], HORIZON, run.sac, 0, "lockstep"),
-        cache.key(job.variations[0], HORIZON, run.sac, 1, "lockstep"),
-        cache.key(job.variations[0], HORIZON, run.sac, 0, "stable-baselines3"),
-        *(
-            cache.key(job.variations[0], HORIZON, dataclasses.replace(run.sac, **{name: value}), 0, "lockstep")
-            for name, value in {"hidden": (8, 9), "gamma": 0.5, "steps": 400, "update_every": 3}.items()
-        ),
-    ]
-    assert len({one, *changed}) == 1 + len(changed)
-    again = cache.key(job.variations[0], HORIZON, dataclasses.replace(run.sac, cache="/elsewhere"), 0, "lockstep")
-    assert again == one
-    with monkeypatch.context() as patched:
-        patched.setattr(cache.metadata, "version", lambda name: "0")
-        assert cache.key(job.variations[0], HORIZON, run.sac, 0, "lockstep") != one, "other physics is other data"
-    monkeypatch.setattr(cache.version, "digest_of", lambda parts: "other")
-    assert cache.key(job.variations[0], HORIZON, run.sac, 0, "lockstep") != one, "so is other code"
-
-
 def test_a_killed_training_continues_from_its_checkpoint_to_the_same_bytes(run, monkeypatch):
     job = jobs_of(run)[0]
     undisturbed = digests(do(run, jobs_of(dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache="")))[0]))
