@@ -109,13 +109,13 @@ Arguments: the model's final hidden state (B, D), observation, action, reward, n
 
 
 class LabelledQueries(NamedTuple):
-    """Query states of one trajectory with their labels, and action windows (zeta of eq. 6)."""
+    """Query states of one trajectory with their labels, and action windows (zeta_h of eq. 6)."""
 
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
-    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
+    prev_actions: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     """Actions at the last R query states, which form action windows."""
-    gained: Float32[np.ndarray, " R"]
+    prev_rewards: Float32[np.ndarray, " R"]
     """Reward after each of these actions."""
     origin: str
     """Source of the labels: see ``Trajectory.origin``."""

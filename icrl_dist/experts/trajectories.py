@@ -92,8 +92,8 @@ def _labelled_queries(
     return {
         "queries": np.concatenate([history.observations[:, :-1][query], windows.observations[:, :-1][cut]]),
         "labels": np.concatenate([history.labels[query], windows.labels[cut]]),
-        "taken": windows.actions[cut],
-        "gained": windows.rewards[cut],
+        "prev_actions": windows.actions[cut],
+        "prev_rewards": windows.rewards[cut],
     }
 
 

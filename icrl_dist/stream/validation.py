@@ -20,7 +20,7 @@ from icrl_dist.types import ARRAYS
 
 _T = TypeVar("_T")
 
-VERSION = 1
+VERSION = 2
 """Version of the wire format, in every message; other versions are refused."""
 
 REASONS: dict[str, str] = {

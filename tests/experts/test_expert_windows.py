@@ -102,21 +102,25 @@ def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_anoth
         row = job.variations.index(t.variation)
         own, other = policies[row], policies[(row + 2) % 4]  # two variations of each of two tasks
         assert t.variation.task != job.variations[(row + 2) % 4].task
-        assert len(t.queries) == 6 + 5 * 4 and len(t.taken) == 20
-        states, taken, labels = t.queries[6:].reshape(5, 4, 6), t.taken.reshape(5, 4, 2), t.labels[6:].reshape(5, 4, 2)
+        assert len(t.queries) == 6 + 5 * 4 and len(t.prev_actions) == 20
+        states, prev_actions, labels = (
+            t.queries[6:].reshape(5, 4, 6),
+            t.prev_actions.reshape(5, 4, 2),
+            t.labels[6:].reshape(5, 4, 2),
+        )
         whole = found[row].led_observations[:, :-1]
         for n in range(5):
             np.testing.assert_allclose(labels[n], own.act(states[n], unused), atol=1e-5)
-            decoy = np.abs(taken[n] - labels[n]).max() > 1e-4
+            decoy = np.abs(prev_actions[n] - labels[n]).max() > 1e-4
             led[bool(decoy)] += 1
-            np.testing.assert_allclose(taken[n], (other if decoy else own).act(states[n], unused), atol=1e-5)
+            np.testing.assert_allclose(prev_actions[n], (other if decoy else own).act(states[n], unused), atol=1e-5)
             places = [
                 (g, h) for g in range(WINDOW_EPISODES) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states[n]).all()
             ]
             assert bool(places) != decoy, "four states in a row of an episode that its own expert led, or of another"
             if places:
                 g, h = places[0]
-                np.testing.assert_array_equal(t.gained.reshape(5, 4)[n], found[row].led_rewards[g, h : h + 4])
+                np.testing.assert_array_equal(t.prev_rewards.reshape(5, 4)[n], found[row].led_rewards[g, h : h + 4])
     assert min(led.values()) > 0.25 * sum(led.values())
 
 
@@ -134,8 +138,8 @@ def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed
     draw = method.data(run, method.phases(run)[0], data)
     torch.manual_seed(0)
     model = method.build(registry.of(run).spec, run)
-    taken = draw(np.random.default_rng(0)).windows.actions
-    assert taken.shape == (8, 2, 4, 2) and taken.dtype == np.float32
+    prev_actions = draw(np.random.default_rng(0)).windows.prev_actions
+    assert prev_actions.shape == (8, 2, 4, 2) and prev_actions.dtype == np.float32
 
     def loss(step):
         return batch_loss(model, draw(np.random.default_rng(step)))
