@@ -220,7 +220,7 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def make_split(self) -> Split:
-        """Compute the training and test tasks, from the section alone; use ``split``, which keeps the result."""
+        """Compute the training and test tasks, only from the section; use ``split``, which keeps the result."""
 
     @abc.abstractmethod
     def batch(self, variations: Sequence[Variation]) -> Batch:
@@ -404,8 +404,8 @@ Draw = Callable[[np.random.Generator], Any]
 """Draws one training batch; the same generator state gives the same batch."""
 
 
-class Weighted(Protocol):
-    """Source of models by policy version."""
+class WeightSource(Protocol):
+    """Gives the model of a policy version, for example from a worker's weight cache."""
 
     def at(self, version: int) -> tuple[torch.nn.Module, str]:
         """The model of exactly this policy version, and its weights digest.  Blocks until it is available."""

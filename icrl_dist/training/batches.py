@@ -50,7 +50,7 @@ def _actions(actions: np.ndarray) -> np.ndarray:
 class Examples:
     """Training data of one variation: episodes for contexts, labelled queries and action windows.
 
-    Any query can be paired with any context, because a label depends on (tau, phi) alone.
+    Any query can be paired with any context, because a label depends only on (tau, phi).
     ``history``: a context holds the first episodes in order, as in deployment; otherwise it
     holds any episodes in any order.
     """

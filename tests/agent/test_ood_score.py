@@ -132,16 +132,16 @@ def test_calibration_deploys_in_training_tasks_under_new_adversaries_and_repeats
     assert {index for index, _ in rows} == set(range(len(train)))
     goals = {task["goal"] for task in train}
     assert {variation.task["goal"] for _, variation in rows} == goals
-    met = {v.adversary for i, task in enumerate(train) for v in registry.training_variations(small_run, i, task)}
-    assert {variation.adversary for _, variation in rows} & met <= {NULL}
+    trained_on = {v.adversary for i, task in enumerate(train) for v in registry.training_variations(small_run, i, task)}
+    assert {variation.adversary for _, variation in rows} & trained_on <= {NULL}
 
 
 def test_each_method_is_calibrated_under_the_disturbances_that_it_trains_on(small_run):
     task = registry.of(small_run).split.train[0]
     for name in methods.names():
         method = methods.of(dataclasses.replace(small_run, method=name))
-        met = {v.adversary.kind for v in method.training_variations(small_run, 0, task, 5)}
-        assert met == ({"null"} if name == "dpt" else {"null", "dirichlet"})
+        trained_on = {v.adversary.kind for v in method.training_variations(small_run, 0, task, 5)}
+        assert trained_on == ({"null"} if name == "dpt" else {"null", "dirichlet"})
 
 
 class Mirrored:

@@ -35,10 +35,15 @@ def pretraining_jobs(run, decoy_fraction):
 
 def followed(run, t):
     """Cells, actions, rewards and labels of a trajectory's windows."""
-    alone = len(t.queries) - len(t.prev_actions)
-    assert (alone, len(t.prev_actions)) == (run.pretrain.queries, 2 * LENGTH)
-    cells = cell_numbers(t.queries[alone:], 3).reshape(2, LENGTH)
-    return cells, t.prev_actions.reshape(2, LENGTH), t.prev_rewards.reshape(2, LENGTH), t.labels[alone:].reshape(2, LENGTH, -1)
+    outside = len(t.queries) - len(t.prev_actions)
+    assert (outside, len(t.prev_actions)) == (run.pretrain.queries, 2 * LENGTH)
+    cells = cell_numbers(t.queries[outside:], 3).reshape(2, LENGTH)
+    return (
+        cells,
+        t.prev_actions.reshape(2, LENGTH),
+        t.prev_rewards.reshape(2, LENGTH),
+        t.labels[outside:].reshape(2, LENGTH, -1),
+    )
 
 
 @pytest.mark.parametrize("decoy_fraction", [0.0, 1.0])
@@ -66,8 +71,8 @@ def test_a_trajectorys_windows_do_not_depend_on_the_other_variations_of_the_job(
     whole = {t.identity: t for t in do(run, job)}
     count = len(job.variations) // job.tasks
     for row, (task, k) in enumerate(job.rows()):
-        alone = dataclasses.replace(job, task=task, first=k, variations=job.variations[row : row + 1], tasks=1)
-        for t in do(run, alone):
+        single = dataclasses.replace(job, task=task, first=k, variations=job.variations[row : row + 1], tasks=1)
+        for t in do(run, single):
             for name, array in t.arrays().items():
                 np.testing.assert_array_equal(array, getattr(whole[t.identity], name), err_msg=name)
     assert count > 1

@@ -85,8 +85,8 @@ class ContinuousProblem(Problem):
                     "return that the undisturbed expert loses",
                 )
         yield from self._own_objections(run)
-        alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
-        if run.pretrain.windows and run.pretrain.decoy_fraction and alone:
+        single_task_job = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
+        if run.pretrain.windows and run.pretrain.decoy_fraction and single_task_job:
             remedy = (
                 f"use 0, or a stream.job_tasks with at least two of the {count} tasks in every job: decoys need a second expert"
             )
