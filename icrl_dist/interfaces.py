@@ -110,13 +110,13 @@ Arguments: the model's final hidden state (B, D), observation, action, reward, n
 
 
 class LabelledQueries(NamedTuple):
-    """Query states of one trajectory with their labels, and action windows (zeta of eq. 6)."""
+    """Query states of one trajectory with their labels, and action windows (zeta_h of eq. 6)."""
 
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
-    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
+    prev_actions: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     """Actions at the last R query states, which form action windows."""
-    gained: Float32[np.ndarray, " R"]
+    prev_rewards: Float32[np.ndarray, " R"]
     """Reward after each of these actions."""
     origin: str
     """Source of the labels: see ``Trajectory.origin``."""
@@ -232,7 +232,7 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def make_split(self) -> Split:
-        """Compute the training and test tasks, from the section alone; use ``split``, which keeps the result."""
+        """Compute the training and test tasks, only from the section; use ``split``, which keeps the result."""
 
     @abc.abstractmethod
     def batch(self, variations: Sequence[Variation]) -> Batch:
@@ -428,8 +428,8 @@ Draw = Callable[[np.random.Generator], Any]
 """Draws one training batch; the same generator state gives the same batch."""
 
 
-class Weighted(Protocol):
-    """Source of models by policy version."""
+class WeightSource(Protocol):
+    """Gives the model of a policy version, for example from a worker's weight cache."""
 
     def at(self, version: int) -> tuple[torch.nn.Module, str]:
         """The model of exactly this policy version, and its weights digest.  Blocks until it is available."""
