@@ -1,4 +1,7 @@
-"""Mutations of valid messages, like those of a defective or malicious sender.  docs/decisions/fuzz.md: why not hypothesis."""
+"""Mutations of valid messages, like those of a defective or malicious sender.
+
+Why not hypothesis: docs/decisions/087-fuzz-mutations.md.
+"""
 
 from __future__ import annotations
 

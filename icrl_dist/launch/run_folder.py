@@ -3,7 +3,8 @@
 User files are never deleted.  Only files that this program writes are removed; the list of their
 names is in this file only.  A folder with any other file is refused, and the message names the file.
 A replaced run is kept beside its folder as ``.NAME.replaced`` until the new run has its first
-checkpoint, and is restored if the new run ends before that.
+checkpoint, and is restored if the new run ends before that.  Both folders hold the same random token
+meanwhile, so that after a kill no other folder is mistaken for one of the two.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import contextlib
 import json
 import os
 import re
+import secrets
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -36,9 +38,11 @@ _NAMES = {
     "dataset": r"segment-\d+\.frames",
     "report": _REPORTS,
     "tensorboard": r"events\.out\.tfevents\..+",
-    "": r"(run\.toml|env\.json|fork\.json|result\.json|metrics\.jsonl|agent\.npz|learner\.log|learner\.err|endpoint|\.lock)",
+    "": r"(run\.toml|(env|fork|result)\.json|metrics\.jsonl|agent\.npz|learner\.(log|err)|endpoint|\.lock|\.replacement)",
 }
 """The folders within a run folder, the deepest first, each with a pattern of the file names that this program writes."""
+_TOKEN = ".replacement"
+"""In a replaced run and in the run that replaces it: a random text that only these two folders hold."""
 
 
 def owned(place: str, name: str) -> bool:
@@ -77,8 +81,9 @@ def _foreign(folder: Path, place: str) -> Iterator[str]:
 def remove(folder: Path) -> None:
     """Remove a run folder if it exists and contains only files of this program.
 
-    ``run.toml`` is removed first, so that a half removed folder does not count as a run.  Raises
-    ConfigError, and removes nothing, if the folder is a link or contains other files.
+    ``run.toml`` is removed first, so that a half removed folder does not count as a run, and the
+    token of a replacement last, so that an interrupted removal can be finished.  Raises ConfigError,
+    and removes nothing, if the folder is a link or contains other files.
     """
     if not os.path.lexists(folder):
         return
@@ -91,7 +96,7 @@ def remove(folder: Path) -> None:
         if directory.is_dir():
             with os.scandir(directory) as entries:
                 names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False) and owned(place, entry.name)]
-            for name in names:
+            for name in sorted(names, key=_TOKEN.__eq__):
                 (directory / name).unlink(missing_ok=True)
             directory.rmdir()  # fails if another file has appeared meanwhile
 
@@ -142,24 +147,38 @@ def aside_of(folder: Path) -> Path:
 def recover(folder: Path) -> None:
     """Finish a replacement of the run in ``folder`` that was interrupted by a kill.
 
-    If the new run has a checkpoint, the old run is removed.  If the folder does not exist, the old
-    run is restored.  If both exist and the new run has no checkpoint, neither is changed and
-    ConfigError is raised; also while the command that replaces the run is still active.
+    If the run in ``folder`` replaced the old one and has a checkpoint, the old run is removed.  If
+    ``folder`` does not exist or is empty, the old run is restored.  In every other case nothing is
+    changed and ConfigError is raised; also while the command that replaces the run is still active.
     """
     aside = aside_of(folder)
     if not os.path.lexists(aside):
         return
     if held(aside) or held(folder):
         raise ConfigError(f"--out {folder}: a run is active in this folder; end it, or use another --out")
-    if not (aside / "run.toml").is_file() or _has_checkpoint(folder):
+    token, removing = _token(aside), not (aside / "run.toml").exists()
+    if not token and not (removing and _is_empty(aside)):
+        raise ConfigError(f"{aside}: is not a run that --overwrite replaced; move it away, then repeat the command")
+    if removing or (token == _token(folder) and _has_checkpoint(folder)):
         remove(aside)
-    elif not os.path.lexists(folder):
-        aside.rename(folder)
+    elif not os.path.lexists(folder) or _is_empty(folder):
+        aside.rename(folder)  # this replaces an empty folder
+        (folder / _TOKEN).unlink()
     else:
         raise ConfigError(
             f"{folder}: a command that was replacing this run was killed; the old run is in {aside}: "
             f"delete {folder} to restore the old run, or {aside} to keep the new run, then repeat the command"
         )
+
+
+def _token(folder: Path) -> bytes:
+    """The token of the replacement that the run in a folder belongs to; empty if it belongs to none."""
+    path = folder / _TOKEN
+    return b"" if folder.is_symlink() or path.is_symlink() or not path.is_file() else path.read_bytes()
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
 
 
 def _has_checkpoint(folder: Path) -> bool:
@@ -211,22 +230,30 @@ class FolderTransaction:
         self._deciding = threading.Lock()
 
     def set_aside(self) -> None:
-        """Move the old run to ``aside_of(folder)`` and keep it locked.
+        """Move the old run to ``aside_of(folder)``, keep it locked, and make an empty folder for the new run.
 
-        Raises ConfigError, and changes nothing, if the folder contains no run or other files, or if
-        a run is active in it.
+        Both folders get the token of this replacement.  Raises ConfigError, and changes nothing, if the
+        folder contains no run or other files, or if a run is active in it.
         """
         folder = self._folder
         _require_owned(folder)
         if not all((folder / name).is_file() for name in ("run.toml", "env.json")):
             raise ConfigError(f"--overwrite: {folder} holds no run; empty it, or use another --out")
         lock = take(folder)
+        token = secrets.token_hex()
         try:
+            (folder / _TOKEN).write_text(token)
             folder.rename(aside_of(folder))
         except OSError as error:
             lock.close()
             raise ConfigError(f"--overwrite: {folder} cannot be moved aside ({error.strerror}); use another --out") from None
         self._lock = lock
+        try:
+            folder.mkdir()
+            (folder / _TOKEN).write_text(token)
+        except OSError as error:
+            self.roll_back()
+            raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
 
     def commit_at_checkpoint(self, report: ReportEvent) -> ReportEvent:
         """Wrap ``report`` so that the event of the new run's first checkpoint also removes the old run."""
@@ -248,6 +275,7 @@ class FolderTransaction:
         with lock:
             try:
                 remove(aside_of(self._folder))
+                (self._folder / _TOKEN).unlink(missing_ok=True)
             except (OSError, ConfigError) as error:
                 self._note(f"the replaced run could not be removed from {aside_of(self._folder)}: {error}")
 
@@ -261,6 +289,7 @@ class FolderTransaction:
             try:
                 remove(self._folder)
                 aside_of(self._folder).rename(self._folder)
+                (self._folder / _TOKEN).unlink(missing_ok=True)
             except (OSError, ConfigError) as error:
                 self._note(f"the old run of {self._folder} is kept in {aside_of(self._folder)}: {error}")
             else:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-PAGES = [Path("README.md"), *sorted(Path("docs").rglob("*.md"))]
+PAGES = [Path("README.md"), Path("CONTRIBUTING.md"), *sorted(Path("docs").rglob("*.md"))]
 DECISIONS = [page for page in sorted(Path("docs/decisions").glob("*.md")) if "*Status: replaced" not in page.read_text()]
 """Without those that are replaced, which keep the names of their time."""
-OF_CODE = [Path("docs/architecture.md"), Path("docs/glossary.md"), *DECISIONS]
+OF_CODE = [Path("CONTRIBUTING.md"), Path("docs/architecture.md"), Path("docs/glossary.md"), *DECISIONS]
 ROOTS = Path("icrl_dist"), Path()
 
 

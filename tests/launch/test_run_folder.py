@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -20,7 +21,14 @@ from icrl_dist.storage.files import hold
 
 OURS = (
     *("run.toml", "env.json", "fork.json", "result.json", "metrics.jsonl", "agent.npz", "learner.log", "learner.err"),
-    *("endpoint", ".lock", ".run.toml.123.part", "dataset/segment-000000.frames", "dataset/.segment-000001.frames.9.part"),
+    *(
+        "endpoint",
+        ".lock",
+        ".replacement",
+        ".run.toml.123.part",
+        "dataset/segment-000000.frames",
+        "dataset/.segment-000001.frames.9.part",
+    ),
     *("checkpoints/version-0000.npz", "checkpoints/partial.npz", "checkpoints/.version-0001.npz.7.part"),
     *("crashes/w0-1.json", "crashes/w0.stacks", "tensorboard/events.out.tfevents.1.host.2.0"),
     *("report/online-T2-0a1b2c3d-paper-unseen-p0_0.2-3episodes-2seeds.json", "report/adaptation.png", "report/online.json"),
@@ -44,6 +52,11 @@ def files(folder):
     """Every file and link below a folder, with its content or target."""
     below = sorted(folder.rglob("*"))
     return {str(p.relative_to(folder)): p.readlink() if p.is_symlink() else p.read_bytes() for p in below if not p.is_dir()}
+
+
+def replaced(folder):
+    """The files of the run that is kept beside a folder while another run replaces it, without the token."""
+    return {name: content for name, content in files(run_folder.aside_of(folder)).items() if name != ".replacement"}
 
 
 @pytest.fixture(autouse=True)
@@ -181,9 +194,9 @@ def test_the_old_run_is_removed_at_the_first_checkpoint_and_not_before(tmp_path,
     with launch.prepare(module_run, folder, resume=False, overwrite=True) as transaction:
         report, aside = transaction.commit_at_checkpoint(events.append), run_folder.aside_of(folder)
         report({"event": "progress", "version": -1})
-        assert files(aside) == before
+        assert replaced(folder) == before
         report({"event": "progress", "version": 0})
-        assert files(aside) == before, "the event alone is not enough"
+        assert replaced(folder) == before, "the event alone is not enough"
         with pytest.raises(ConfigError, match="a run is active"):
             launch.prepare(module_run, folder, resume=False, overwrite=True)
         write(folder, ["checkpoints/version-0000.npz"])
@@ -222,7 +235,7 @@ def test_no_run_is_removed_if_the_new_folder_contains_a_user_file(tmp_path, modu
         transaction.commit_at_checkpoint(events.append)
         write(folder, ["notes.md"])
         raise ConfigError("it failed")
-    assert not transaction.rolled_back and (folder / "notes.md").exists() and files(run_folder.aside_of(folder)) == before
+    assert not transaction.rolled_back and (folder / "notes.md").exists() and replaced(folder) == before
     assert str(run_folder.aside_of(folder)) in events[0]["text"] and "notes.md" in events[0]["text"]
 
 
@@ -261,6 +274,83 @@ def test_after_a_kill_during_the_removal_the_old_run_is_not_restored(tmp_path, m
     assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
 
 
+def test_after_a_kill_before_the_new_run_wrote_anything_the_old_run_is_restored(tmp_path, module_run):
+    for missing in (True, False):
+        folder, aside, old = killed(tmp_path / str(missing), module_run)
+        for path in folder.iterdir():
+            path.unlink()
+        if missing:
+            folder.rmdir()
+        launch.prepare(module_run, folder, resume=True, overwrite=False)
+        assert files(folder) == old and not aside.exists()
+
+
+@pytest.mark.parametrize("options", [(False, False), (True, False), (False, True)])
+def test_a_finished_run_that_the_user_moved_in_removes_no_replaced_run(tmp_path, module_run, options):
+    folder, *_ = killed(tmp_path, module_run)
+    run_folder.remove(folder)
+    write(folder, ["run.toml", "env.json", "result.json", "checkpoints/version-0000.npz"])
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match="to restore the old run, or"):
+        launch.prepare(module_run, folder, *options)
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("names", [["result.json"], ["agent.npz", "run.toml"], ["checkpoints/version-0000.npz"]])
+def test_a_folder_with_the_name_of_a_replaced_run_is_kept(tmp_path, module_run, names):
+    folder, _ = started(tmp_path, module_run)
+    aside = write(run_folder.aside_of(folder), names)
+    before = files(tmp_path)
+    with pytest.raises(ConfigError, match="is not a run that --overwrite replaced; move it away"):
+        launch.prepare(module_run, folder, resume=False, overwrite=True)
+    assert files(tmp_path) == before
+    shutil.rmtree(aside)
+    with launch.prepare(module_run, folder, resume=False, overwrite=True):
+        pass
+
+
+def test_the_removal_of_a_replaced_run_is_finished_after_each_possible_interruption(tmp_path, module_run, monkeypatch):
+    unlink, rmdir = Path.unlink, Path.rmdir
+    for last in range(1, 30):
+        folder, aside, _ = killed(tmp_path / str(last), module_run)
+        write(folder, ["checkpoints/version-0000.npz"])
+        count = iter(range(last))
+
+        def at_most(do, count=count):
+            def step(path, **options):
+                if next(count, None) is None:
+                    raise OSError(5, "killed")
+                do(path, **options)
+
+            return step
+
+        monkeypatch.setattr(Path, "unlink", at_most(unlink))
+        monkeypatch.setattr(Path, "rmdir", at_most(rmdir))
+        with contextlib.suppress(OSError):
+            run_folder.recover(folder)
+        monkeypatch.undo()
+        monkeypatch.setattr(run_folder, "WAIT_S", 0.05)
+        if not aside.exists():
+            break
+        new = files(folder)
+        launch.prepare(module_run, folder, resume=True, overwrite=False)
+        assert not aside.exists() and new.items() <= files(folder).items() | {"env.json": new["env.json"]}.items()
+    assert last > 3, "each of the files was the last one removed before the kill"
+
+
+def test_a_full_disk_at_the_start_of_a_replacement_restores_the_old_run(tmp_path, module_run, monkeypatch):
+    folder, before = started(tmp_path, module_run)
+
+    def full(path, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "mkdir", full)
+    with pytest.raises(ConfigError, match="No space left"):
+        launch.prepare(module_run, folder, resume=False, overwrite=True)
+    monkeypatch.undo()
+    assert files(tmp_path) == {f"run/{name}": content for name, content in before.items()}
+
+
 def test_a_chaos_campaign_removes_only_its_own_files(tmp_path, module_run):
     folder = write(tmp_path / "undisturbed", [*OURS, "notes.md"])
     training = Training("smoke", module_run, (), folder, 1, 1.0)
@@ -291,7 +381,7 @@ def test_the_versions_that_a_fork_starts_from_are_no_checkpoint_of_its_own(tmp_p
     launch.prepare(module_run, folder, **given)._lock.close()  # killed
     with pytest.raises(ConfigError, match="was killed"):
         launch.prepare(module_run, folder, resume=True, overwrite=False)
-    assert files(run_folder.aside_of(folder)) == before
+    assert replaced(folder) == before
     write(folder, ["checkpoints/version-0002.npz"])
     launch.prepare(module_run, folder, resume=True, overwrite=False)
     assert not run_folder.aside_of(folder).exists()
@@ -300,7 +390,7 @@ def test_the_versions_that_a_fork_starts_from_are_no_checkpoint_of_its_own(tmp_p
 @pytest.mark.parametrize("record", [None, "{", "{}"])
 @pytest.mark.parametrize("run_file", [False, True])
 def test_after_a_kill_during_a_fork_the_old_run_is_never_removed(tmp_path, module_run, record, run_file):
-    folder, aside, before = killed(tmp_path, module_run)
+    folder, _, before = killed(tmp_path, module_run)
     forked(folder, 1)  # the checkpoints of the parent are linked
     (folder / "fork.json").unlink() if record is None else (folder / "fork.json").write_text(record)
     if not run_file:
@@ -310,7 +400,7 @@ def test_after_a_kill_during_a_fork_the_old_run_is_never_removed(tmp_path, modul
     for resume, overwrite in ((False, False), (True, False), (False, True)):
         with pytest.raises(ConfigError, match="was killed"):
             launch.prepare(module_run, folder, resume, overwrite)
-    assert files(aside) == before
+    assert replaced(folder) == before
     run_folder.remove(folder)  # the remedy
     launch.prepare(module_run, folder, resume=True, overwrite=False)
     assert files(folder) == before
@@ -335,7 +425,7 @@ def test_a_kill_while_a_fork_is_made_keeps_the_old_run(tmp_path, module_run, mon
     monkeypatch.undo()
     with pytest.raises(ConfigError, match="was killed"):
         launch.prepare(module_run, folder, resume=False, overwrite=True)
-    assert files(run_folder.aside_of(folder)) == before
+    assert replaced(folder) == before
 
 
 def test_an_interrupted_removal_leaves_no_run(tmp_path, monkeypatch):
