@@ -260,7 +260,10 @@ def interruptible() -> contextlib.AbstractContextManager[object]:
 def _on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
     """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them."""
     signals = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
-    handle = lambda: [signal.signal(number, lambda *_: stop()) for number in signals]  # noqa: E731
+
+    def handle() -> list[Any]:
+        return [signal.signal(number, lambda *_: stop()) for number in signals]
+
     before = handle()
     try:
         yield handle
