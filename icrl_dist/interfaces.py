@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
+    from icrl_dist.problems.parts import MakeGame, PosteriorSuite
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -181,8 +182,16 @@ class BeliefReader(Protocol):
         ...
 
 
-MakeBehavior = Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
-"""See ``Problem.behavior``."""
+@dataclass(frozen=True)
+class Behaviors:
+    """Policies that collect pretraining contexts and are not given the task."""
+
+    names: tuple[str, ...]
+    """The names that ``pretrain.behaviors`` may hold."""
+    make: Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
+    """``make(names, rngs, env)``: row r follows the policy ``names[r]``, which draws from ``rngs[r]``."""
+
+
 MakeDrawing = Callable[[np.ndarray, np.ndarray, Mapping[str, Any], int], dict[str, Any]]
 """See ``Problem.drawing``."""
 
@@ -262,8 +271,8 @@ class Problem(abc.ABC):
         return None
 
     @property
-    def behavior(self) -> MakeBehavior | None:
-        """``behavior(names, rngs, env)``: one named behavior policy per row, for pretraining contexts."""
+    def behaviors(self) -> Behaviors | None:
+        """Behavior policies, which jobs of the kind ``behavior_context`` need."""
         return None
 
     @property
@@ -291,13 +300,13 @@ class Problem(abc.ABC):
         return None
 
     @property
-    def posterior(self) -> Any:
+    def posterior(self) -> PosteriorSuite | None:
         """Comparison of a model with the exact posterior (``icrl-dist evaluate --suite posterior``)."""
         return None
 
     @property
-    def game(self) -> Any:
-        """The interactive environment of ``icrl-dist play``."""
+    def game(self) -> MakeGame | None:
+        """``game(agent, run, seed)``: the interactive environment of ``icrl-dist play``."""
         return None
 
     @property
@@ -412,10 +421,27 @@ class Weighted(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class LabelQuality:
+    """Quality of the labels that a model made itself in one round.  Returns are undiscounted, per episode."""
+
+    agreement: float
+    """Share of the labels that are optimal, 0 to 1."""
+    labelling: float
+    """Share of the variations whose trials gave labels, 0 to 1."""
+    context_return: float
+    """Mean return of the trials that became contexts."""
+    label_return: float
+    """Mean return of the later trials, which labels come from."""
+    optimum: float
+    """Mean optimal return of the variations."""
+
+
 class Method(abc.ABC):
     """An in-context method: its phases and jobs, its training batches, model, loss and deployed policy.
 
-    One object serves one run; it may cache results that it computed from the run's data.
+    An object may cache what it computed from the data of its run: the learner makes a new object after a repair of
+    the dataset, so no cached result is older than the data.
     """
 
     name: ClassVar[str]
@@ -485,6 +511,6 @@ class Method(abc.ABC):
         """
         return None
 
-    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> dict[str, float]:
-        """Quality of the labels that the model made itself in a phase; empty if it made none or quality is unknown."""
-        return {}
+    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> LabelQuality | None:
+        """Quality of the labels that the model made itself in a phase; None if it made none or quality is unknown."""
+        return None

@@ -254,6 +254,8 @@ class Payload:
 
     kind: ClassVar[str] = ""
     """Name of the kind."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Optional parts of ``Problem`` that a job of this kind needs."""
     arrives_at_once: ClassVar[bool] = False
     """Whether all trajectories of a job arrive together, after hours of training or immediately from a cache.
     The time between two trajectories then does not predict when the next one arrives."""

@@ -104,9 +104,9 @@ def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[
 def paper_env() -> tuple[Batch, SACConfig]:
     """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the settings of its SAC."""
     paper = load(PAPER)
-    tasks = registry.of(paper).split.train
-    rows = [row for index, task in enumerate(tasks) for row in registry.training_variations(paper, index, task)]
-    return registry.batch(rows), paper.sac
+    problem = registry.of(paper)
+    rows = [row for index, task in enumerate(problem.split.train) for row in registry.training_variations(paper, index, task)]
+    return problem.batch(rows), paper.sac
 
 
 def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) -> dict[str, Any]:

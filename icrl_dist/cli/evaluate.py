@@ -76,7 +76,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
             divergences = heldout.posterior(run, what, display)
         answer |= heldout.show_posterior(run, report, divergences, console)
     else:
-        answer |= heldout.show_offline(heldout.offline(run, what, arguments.deploy), console)
+        answer |= heldout.show_offline(run, heldout.offline(run, what, arguments.deploy), console)
     if arguments.json:
         print(json.dumps(answer))
     return OK

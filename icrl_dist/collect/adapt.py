@@ -35,6 +35,7 @@ class LabelledRollouts(Rollouts):
     """Histories of T^j that the problem labels: a DAgger round."""
 
     kind: ClassVar[str] = "adapt_labelled"
+    needs: ClassVar[tuple[str, ...]] = ("labeller",)
     labelling: Any
     """The problem's ``Labelling``."""
 
@@ -60,7 +61,7 @@ def rollouts(
     policy = method.policy(model, env.batch, context, payload.deploy, watch if look else None)
     labeller = None
     if isinstance(payload, LabelledRollouts):
-        assert problem.labeller is not None, "validation refuses DAgger rounds of problems without exact answers"
+        assert problem.labeller is not None
         labeller = problem.labeller(job, payload.labelling)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from icrl_dist.config import plugins
+from icrl_dist.config.sections import PretrainConfig
 from icrl_dist.config.toml import ConfigError
 from icrl_dist.stream import endpoints, schema
 
@@ -32,7 +33,10 @@ def validate(run: Run, source: str) -> None:
 
 def _objections(run: Run, problem: Any) -> Iterator[Objection]:
     """Incompatible values that no problem or method allows."""
-    icaa, horizon, train = run.icaa, problem.horizon, problem.train_count
+    train = problem.train_count
+    if not train:
+        yield "problem", run.problem, "its split has no training tasks: change its section"
+    icaa, horizon = run.icaa, problem.horizon
     if run.pretrain.contexts < train:
         yield "pretrain.contexts", run.pretrain.contexts, f"use at least one per training task ({train})"
     if icaa.context_trials >= icaa.trials:
@@ -48,7 +52,23 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
         yield "context.max", run.context.max, f"must be at least one episode ({horizon} steps)"
     if run.dagger.rounds and problem.labeller is None:
         yield "dagger.rounds", run.dagger.rounds, "only a problem with exact answers can label new histories"
+    yield from _context_objections(run, problem)
     yield from _address_objections(run)
+
+
+def _context_objections(run: Run, problem: Any) -> Iterator[Objection]:
+    behaviors, named = problem.behaviors, run.pretrain.behaviors
+    if behaviors is None and named != PretrainConfig().behaviors:
+        yield "pretrain.behaviors", named, f"{run.problem} has no behavior policies; leave it out"
+    if behaviors is not None and not set(named) <= set(behaviors.names):
+        yield "pretrain.behaviors", named, f"choose from {', '.join(behaviors.names)}"
+    payload = problem.contexts(run).payload
+    for part in payload.needs:
+        if getattr(problem, part) is None:
+            remedy = (
+                f"its contexts (jobs {payload.kind}) need Problem.{part}, which is None; define it in {type(problem).__name__}"
+            )
+            yield "problem", run.problem, remedy
 
 
 def _address_objections(run: Run) -> Iterator[Objection]:
