@@ -23,6 +23,7 @@ from icrl_dist.config.run import ConfigError
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # else the end of Ray resets SIGTERM: a second one kills the command at once
     "RAY_worker_niceness": "0",  # with Ray's default of 15, any other process starves the workers
 }
 JOIN_S = 600.0
