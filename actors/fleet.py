@@ -129,8 +129,7 @@ class Fleet:
         """Wait until the cluster's nodes have joined and can reach the learner's endpoint; without a cluster do nothing.
 
         ``endpoint`` and ``connect`` as in ``config.StreamConfig``, ``needed`` as in ``Cluster.require``.  Returns
-        early once ``stopped()``.  After ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others are
-        enough.
+        early once ``stopped()``.  After ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others suffice.
         Raises ConfigError for a node that fails the check, or if there are too few after ``JOIN_S``.
         """
         if self._cluster is None:

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
+    from icrl_dist.problems.parts import MakeGame, PosteriorSuite
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -109,13 +110,13 @@ Arguments: the model's final hidden state (B, D), observation, action, reward, n
 
 
 class LabelledQueries(NamedTuple):
-    """Query states of one trajectory with their labels, and action windows (zeta of eq. 6)."""
+    """Query states of one trajectory with their labels, and action windows (zeta_h of eq. 6)."""
 
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
-    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
+    prev_actions: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     """Actions at the last R query states, which form action windows."""
-    gained: Float32[np.ndarray, " R"]
+    prev_rewards: Float32[np.ndarray, " R"]
     """Reward after each of these actions."""
     origin: str
     """Source of the labels: see ``Trajectory.origin``."""
@@ -181,8 +182,16 @@ class BeliefReader(Protocol):
         ...
 
 
-MakeBehavior = Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
-"""See ``Problem.behavior``."""
+@dataclass(frozen=True)
+class Behaviors:
+    """Policies that collect pretraining contexts and are not given the task."""
+
+    names: tuple[str, ...]
+    """The names that ``pretrain.behaviors`` may hold."""
+    make: Callable[[Sequence[str], Sequence[np.random.Generator], Batch], Policy]
+    """``make(names, rngs, env)``: row r follows the policy ``names[r]``, which draws from ``rngs[r]``."""
+
+
 MakeDrawing = Callable[[np.ndarray, np.ndarray, Mapping[str, Any], int], dict[str, Any]]
 """See ``Problem.drawing``."""
 
@@ -223,11 +232,15 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def make_split(self) -> Split:
-        """Compute the training and test tasks, from the section alone; use ``split``, which keeps the result."""
+        """Compute the training and test tasks, only from the section; use ``split``, which keeps the result."""
 
     @abc.abstractmethod
     def batch(self, variations: Sequence[Variation]) -> Batch:
-        """These variation environments as one batch; the variations alone decide them, not the section."""
+        """These variation environments as one batch.
+
+        What decides an environment belongs in the parameters of its task and adversary: ``icrl_dist.make``, live
+        views and the cache of experts know only these.
+        """
 
     @abc.abstractmethod
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
@@ -265,8 +278,8 @@ class Problem(abc.ABC):
         return None
 
     @property
-    def behavior(self) -> MakeBehavior | None:
-        """``behavior(names, rngs, env)``: one named behavior policy per row, for pretraining contexts."""
+    def behaviors(self) -> Behaviors | None:
+        """Behavior policies, which jobs of the kind ``behavior_context`` need."""
         return None
 
     @property
@@ -294,13 +307,13 @@ class Problem(abc.ABC):
         return None
 
     @property
-    def posterior(self) -> Any:
+    def posterior(self) -> PosteriorSuite | None:
         """Comparison of a model with the exact posterior (``icrl-dist evaluate --suite posterior``)."""
         return None
 
     @property
-    def game(self) -> Any:
-        """The interactive environment of ``icrl-dist play``."""
+    def game(self) -> MakeGame | None:
+        """``game(agent, run, seed)``: the interactive environment of ``icrl-dist play``."""
         return None
 
     @property
@@ -343,6 +356,14 @@ class Problem(abc.ABC):
         So a table that changes later does not change the run.  Raises ConfigError for a value that cannot be resolved.
         """
         return self.config
+
+    @classmethod
+    def translated(cls, tables: dict[str, Any]) -> dict[str, Any]:
+        """The tables of a run file that an older version wrote, with the problem's former values translated.
+
+        The names of sections and keys are the present ones already; sections of other problems are still there.
+        """
+        return tables
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         """The values that a run of this problem cannot have: key, value, remedy."""
@@ -407,18 +428,35 @@ Draw = Callable[[np.random.Generator], Any]
 """Draws one training batch; the same generator state gives the same batch."""
 
 
-class Weighted(Protocol):
-    """Source of models by policy version."""
+class WeightSource(Protocol):
+    """Gives the model of a policy version, for example from a worker's weight cache."""
 
     def at(self, version: int) -> tuple[torch.nn.Module, str]:
         """The model of exactly this policy version, and its weights digest.  Blocks until it is available."""
         ...
 
 
+@dataclass(frozen=True)
+class LabelQuality:
+    """Quality of the labels that a model made itself in one round.  Returns are undiscounted, per episode."""
+
+    agreement: float
+    """Share of the labels that are optimal, 0 to 1."""
+    labelling: float
+    """Share of the variations whose trials gave labels, 0 to 1."""
+    context_return: float
+    """Mean return of the trials that became contexts."""
+    label_return: float
+    """Mean return of the later trials, which labels come from."""
+    optimum: float
+    """Mean optimal return of the variations."""
+
+
 class Method(abc.ABC):
     """An in-context method: its phases and jobs, its training batches, model, loss and deployed policy.
 
-    One object serves one run; it may cache results that it computed from the run's data.
+    An object may cache what it computed from the data of its run: the learner makes a new object after a repair of
+    the dataset, so no cached result is older than the data.
     """
 
     name: ClassVar[str]
@@ -488,6 +526,6 @@ class Method(abc.ABC):
         """
         return None
 
-    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> dict[str, float]:
-        """Quality of the labels that the model made itself in a phase; empty if it made none or quality is unknown."""
-        return {}
+    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> LabelQuality | None:
+        """Quality of the labels that the model made itself in a phase; None if it made none or quality is unknown."""
+        return None

@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.storage.files import StoreError, explained
 from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def _serve(folder: Path, endpoint: str, report: Any) -> int:
-    run = load(str(folder / "run.toml"))
+    run = load_folder(folder)
     with ZenohLink.listen(endpoint, security.learner(run.stream.certificates, folder.name)) as link:
         service = Service(run, folder, link, report)
         for name in (signal.SIGINT, signal.SIGTERM):

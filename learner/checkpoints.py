@@ -16,8 +16,9 @@ from icrl_dist.agent.loading import spec_from
 from icrl_dist.config.run import ConfigError, Run, dumps
 from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.problems import registry
-from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_format, save_checkpoint, version_file
 from icrl_dist.stream import wire
+from icrl_dist.stream.validation import VERSION
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.types import Spec, Weights
 
@@ -38,6 +39,7 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
         "window": run.model.window,
         **registry.of(run).manifest(),
         "threads": threads,
+        "format": VERSION,
         "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},
     }
 
@@ -63,9 +65,10 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
 def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping[str, Any]:
     """Load a checkpoint of ``save`` into model and optimizer; returns the manifest.
 
-    Raises ConfigError for a checkpoint of another spec, another model size or another optimizer.
+    Raises ConfigError for a checkpoint of another spec, data format, model size or optimizer.
     """
     checkpoint = load_checkpoint(path)
+    require_format(checkpoint.manifest, str(path))
     found = spec_from(checkpoint.manifest["spec"])
     if found != spec:
         raise ConfigError(f"{path}: a checkpoint of another spec ({found}), this run needs {spec}: use another --out")

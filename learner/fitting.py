@@ -28,7 +28,9 @@ class Fitting:
 
         ``threads``: CPU threads of fits.
         """
-        self._run, self._folder, self._method, self._spec, self._threads = run, folder, method, spec, threads
+        self._run, self._folder, self._spec, self._threads = run, folder, spec, threads
+        self.method = method
+        """The method whose loss a fit minimizes."""
         self._partial = folder / "checkpoints" / checkpoints.PARTIAL
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
@@ -71,7 +73,7 @@ class Fitting:
             assert draw is not None
             rng = generator(self._run.seed, RandomKey.FIT, phase.next_version, step)
             torch.manual_seed(int(rng.integers(2**31)))
-            return self._method.loss(self._model, draw(rng))
+            return self.method.loss(self._model, draw(rng))
 
         def progress(step: int, loss: float) -> None:
             self._steps_done = step  # if damaged data ends this fit, the next call continues from here

@@ -14,6 +14,7 @@ class PhasePlan:
 
     def __init__(self, run: Run, lineage: Lineage, store: Dataset, method: Method) -> None:
         self.method = method
+        """The method that makes the jobs."""
         self.phases = self.method.phases(run)
         self.quarantined: dict[str, str] = {}
         """The cause of each quarantined variation, by its name, such as ``adapt/0/3/1``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import threading
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import Run
-from icrl_dist.interfaces import Phase
+from icrl_dist.interfaces import LabelQuality, Phase
 from icrl_dist.problems import registry
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Link, LinkError, StreamKeys
@@ -93,15 +94,16 @@ class Reporter:
         self._metrics.write(version, "version", loss=loss, seconds=seconds)
         self.log("version", f"T^{version} is fitted: loss {loss:.3f}, {seconds:.0f} s", version=version)
 
-    def labels_rated(self, round: int, quality: Mapping[str, float]) -> None:
-        """Report the quality of a round's self-made labels: ``agreement`` with optimal labels, and ``label_return``."""
-        self._metrics.write(round, "labels", **quality)
-        q = quality
-        text = f"labels of round {round}: {q['agreement']:.0%} optimal; return {q['label_return']:.1f} in the labeling trials"
-        self._report({"event": "labels", "round": round, **quality})
+    def labels_rated(self, round: int, quality: LabelQuality) -> None:
+        """Report the quality of a round's self-made labels."""
+        fields = dataclasses.asdict(quality)
+        self._metrics.write(round, "labels", **fields)
+        optimal = f"{quality.agreement:.0%} optimal"
+        text = f"labels of round {round}: {optimal}; return {quality.label_return:.1f} in the labeling trials"
+        self._report({"event": "labels", "round": round, **fields})
         self.log("labels", text)
         with self._lock:
-            self._alerts.add_label_quality(round, quality["agreement"])
+            self._alerts.add_label_quality(round, quality.agreement)
 
     def progress(self, fields: dict[str, Any], force: bool, totals: Mapping[str, Any]) -> None:
         """Send the progress of a phase, if ``force`` is set or ``PERIOD_S`` have passed.

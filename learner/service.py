@@ -184,6 +184,8 @@ class Service:
                 self.store.repair()
                 self._report_repairs()
                 self._plan.recheck()
+                # The old object may have cached results from trajectories that are now replaced.
+                self._method = self._plan.method = self._fitting.method = methods.of(self._run)
         self.store.seal()
         return {
             "dataset_digest": self.store.digest(),
@@ -249,9 +251,10 @@ class Service:
                 f"quarantined; first: {next(iter(causes.values()))}"
             )
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
-        quality = self._method.label_quality(self._run, phase, self.store) if phase.next_version > self.version else {}
-        if quality:
-            self._reporter.labels_rated(phase.round, quality)
+        if phase.next_version > self.version:
+            quality = self._method.label_quality(self._run, phase, self.store)
+            if quality is not None:
+                self._reporter.labels_rated(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
         """Fit the model to the data of a phase, write its checkpoint and publish its weights."""

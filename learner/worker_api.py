@@ -165,7 +165,7 @@ class WorkerAPI:
             "time": time.time(),
             "job": job.label if job else "",
             "seed": self._run.seed,
-            "last_said": self.counters.get(worker, {}),
+            "last_heartbeat": self.counters.get(worker, {}),
             "stacks": stacks,
         }
         cause = stacks[0] if stacks else "no stacks were written: it was killed or disconnected"

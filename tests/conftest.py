@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -104,6 +105,58 @@ def module_run() -> Run:
         stream=StreamConfig(job_tasks=2),
         learner=LearnerConfig(threads=1),
     )
+
+
+@pytest.fixture
+def install(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """``install(problems={name: class}, methods={name: class})``: these are found until the test ends."""
+    from tests.toys import installed
+
+    with contextlib.ExitStack() as stack:
+        yield lambda **groups: stack.enter_context(installed(monkeypatch, **groups))
+
+
+@pytest.fixture
+def toy_run(install: Callable[..., None]) -> Callable[..., Run]:
+    """``toy_run(method="icag", problem=CLASS, *settings)``: a run in the corridor of ``tests/toys``, or in ``problem``."""
+    from icrl_dist.config.run import override, parse
+    from tests.toys.corridor import CorridorProblem
+    from tests.toys.return_to_go import ReturnToGo
+
+    def make(*settings: str, method: str = "icag", problem: type = CorridorProblem) -> Run:
+        install(problems={"toy-corridor": problem}, methods={"return-to-go": ReturnToGo})
+        return override(parse(f'problem = "toy-corridor"\nmethod = "{method}"\n{_TOY_RUN}', "toy.toml"), settings, "--set")
+
+    return make
+
+
+_TOY_RUN = """
+[corridor]
+cells = 5
+[adversary]
+count = 2
+[pretrain]
+contexts = 32
+steps = 5
+[icaa]
+rounds = 0
+trials = 3
+context_trials = 1
+steps = 5
+[model]
+width = 8
+layers = 1
+[optim]
+batch = 8
+episodes = 2
+[evaluate]
+episodes = 3
+seeds = 2
+[learner]
+threads = 1
+[stream]
+job_tasks = 2
+"""
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import Any
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
 from icrl_dist.agent.trained_model import TrainedModel
-from icrl_dist.config.run import ConfigError, Deployment, parse
+from icrl_dist.config.run import ConfigError, Deployment, parse_written
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
 from icrl_dist.models.weights import load_weights
@@ -92,7 +92,7 @@ def trained(checkpoint: Checkpoint) -> TrainedModel:
     Raises StoreError if the arrays do not fit the model that the manifest describes.
     """
     try:
-        run = parse(checkpoint.manifest["run"], "checkpoint")
+        run = parse_written(checkpoint.manifest["run"], "checkpoint")
         spec, method = spec_from(checkpoint.manifest["spec"]), methods.of(run)
         model = method.build(spec, run)
         load_weights(model, checkpoint.part("model"))

@@ -74,7 +74,7 @@ def _rows(trained: TrainedModel) -> Iterator[tuple[int, Variation]]:
 def _decisions(trained: TrainedModel, rows: Sequence[tuple[int, Variation]]) -> Iterator[list[Decisions]]:
     """The decisions of each episode, by the deployment rule that the model was trained for."""
     steps: list[Decisions] = []
-    env = problems.batch([variation for _, variation in rows])
+    env = problems.of(trained.run).batch([variation for _, variation in rows])
     watch = lambda *decision: steps.append(decision)  # noqa: E731
     policy = trained.method.policy(trained.model, len(rows), trained.run.context, None, watch)
     for number in range(EPISODES):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist.bench.experts import REPLAY, ExpertSizes, alone, lockstep
+from icrl_dist.bench.experts import REPLAY, ExpertSizes, lockstep, single
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch, pick, train
@@ -73,7 +73,7 @@ def run(quick: bool = False, steps: int | None = None, device: str = "cuda", siz
 
 def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[str, Any], list[str]]:
     """Updates/s of all experts, of each kind, and of stable-baselines3 (medians over ``turns``); and reasons for a failure."""
-    theirs, their_rates, rates, reasons = alone(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
+    theirs, their_rates, rates, reasons = single(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
     theirs(sizes.theirs)  # warms the caches
     for kind, (matmul_dtype, graph) in _KINDS.items():
         try:
@@ -104,9 +104,9 @@ def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[
 def paper_env() -> tuple[Batch, SACConfig]:
     """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the settings of its SAC."""
     paper = load(PAPER)
-    tasks = registry.of(paper).split.train
-    rows = [row for index, task in enumerate(tasks) for row in registry.training_variations(paper, index, task)]
-    return registry.batch(rows), paper.sac
+    problem = registry.of(paper)
+    rows = [row for index, task in enumerate(problem.split.train) for row in registry.training_variations(paper, index, task)]
+    return problem.batch(rows), paper.sac
 
 
 def expert_set(env: Batch, config: SACConfig, steps: int, device: torch.device) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.diagnostics.estimate import PhaseRates, Rates
 from icrl_dist.experts.payloads import ExpertHistories
-from icrl_dist.interfaces import Phase, Reference
+from icrl_dist.interfaces import Phase, Problem, Reference
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
@@ -137,7 +137,8 @@ class _RandomWeights:
 def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[Trajectory]]:
     """Seconds of the job, and trajectories like its own: all trials of some of its variations."""
     if isinstance(job.payload, ExpertHistories):
-        return _training(job, job.payload.sac, budget_s), random_trajectories(job)
+        problem = registry.of(trained.run)
+        return _training(job, problem, job.payload.sac, budget_s), random_trajectories(job, problem)
     run, by_model = trained.run, isinstance(job.payload, Rollouts)
     rows, trajectories, times = len(job.variations), [], [time.perf_counter()]
     work = kinds.do(job, registry.of(run), trained.method, _RandomWeights(trained.model), "plan")
@@ -161,12 +162,12 @@ def _extrapolated(spent: np.ndarray, count: int, longest: int) -> float:
     return float(spent.sum() + later.sum())
 
 
-def _training(job: Job, config: SACConfig, budget_s: float) -> float:
+def _training(job: Job, problem: Problem, config: SACConfig, budget_s: float) -> float:
     """Seconds of a job's SAC training, extrapolated from episodes with updates."""
     from icrl_dist.experts.sac.batched import train
     from icrl_dist.experts.train import sac_backend
 
-    env = registry.batch(job.variations)
+    env = problem.batch(job.variations)
     horizon = env.spec.horizon
     short = dataclasses.replace(config, random_steps=horizon, warmup=max(horizon, config.batch // len(job.variations) + 1))
     times: list[float] = []

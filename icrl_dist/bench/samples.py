@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from icrl_dist.experts.payloads import ExpertHistories
-from icrl_dist.interfaces import VariationKey
-from icrl_dist.problems import registry
+from icrl_dist.interfaces import Problem, VariationKey
 from icrl_dist.rollout.episode import episode
 from icrl_dist.rollout.policies import RandomVectorPolicy
 from icrl_dist.types import Job, Trajectory
@@ -28,14 +27,14 @@ def all_trials(job: Job, trajectories: Sequence[Trajectory]) -> list[Trajectory]
     ]
 
 
-def random_trajectories(job: Job) -> list[Trajectory]:
+def random_trajectories(job: Job, problem: Problem) -> list[Trajectory]:
     """Trajectories with the shapes of a job of experts, and random actions and labels: costs do not depend on the content."""
     payload = job.payload
     assert isinstance(payload, ExpertHistories)
     rng, trajectories = np.random.default_rng(0), []
     rows = job.rows()[: max(2, job.tasks)]
     chosen = list(job.variations[: len(rows)])
-    ran = episode(registry.batch(chosen), RandomVectorPolicy(), [np.random.default_rng(r) for r in range(len(rows))])
+    ran = episode(problem.batch(chosen), RandomVectorPolicy(), [np.random.default_rng(r) for r in range(len(rows))])
     of = payload.labelling
     labelled = of.windows * of.window
     count, actions = of.queries + labelled, ran.actions.shape[-1]
@@ -54,8 +53,8 @@ def random_trajectories(job: Job) -> list[Trajectory]:
                     adversary=ran.adversary[row],
                     queries=ran.observations[row][rng.integers(0, len(ran.actions[row]), count)],
                     labels=rng.uniform(-1, 1, (count, actions)).astype(np.float32),
-                    taken=np.zeros((labelled, actions), np.float32),
-                    gained=np.zeros(labelled, np.float32),
+                    prev_actions=np.zeros((labelled, actions), np.float32),
+                    prev_rewards=np.zeros(labelled, np.float32),
                     origin="expert",
                 )
             )

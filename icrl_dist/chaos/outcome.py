@@ -12,7 +12,7 @@ from typing import Any
 from rich.table import Table
 
 from icrl_dist.chaos.disk import allocated
-from icrl_dist.config.run import ConfigError, Run, load
+from icrl_dist.config.run import ConfigError, Run, load_folder
 
 SAME = ("dataset_digest", "weights_digest", "trajectories")
 """Fields of ``result.json`` that must be equal in every run."""
@@ -37,7 +37,7 @@ class ReferenceRun:
             result = json.loads((folder / "result.json").read_text())
         except (OSError, ValueError) as error:
             raise ConfigError(f"--reference {folder}: holds no result of a finished run ({error})") from None
-        if dataclasses.replace(load(str(folder / "run.toml")), evaluate=run.evaluate) != run:
+        if dataclasses.replace(load_folder(folder), evaluate=run.evaluate) != run:
             raise ConfigError(f"--reference {folder}: is a run with other settings; omit --reference to run one with these")
         return cls(result, allocated(folder) - allocated(folder / "report"), float(result["seconds"]))
 

@@ -48,7 +48,7 @@ class EvaluateArguments:
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     """Evaluate, print the table and keep the report.  Returns the exit code."""
     from icrl_dist.agent.loading import checkpoint_file
-    from icrl_dist.config.run import parse
+    from icrl_dist.config.run import parse_written
     from icrl_dist.console.display import Display
     from icrl_dist.methods import registry as methods
     from icrl_dist.results import heldout
@@ -56,7 +56,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
 
     what, folder = _source_and_report(arguments)
     checkpoint = load_checkpoint(checkpoint_file(what))
-    run = parse(str(checkpoint.manifest.get("run", "")), str(what))
+    run = parse_written(str(checkpoint.manifest.get("run", "")), str(what))
     options = {name: getattr(arguments, name) for name in ("episodes", "seeds", "p", "prior")}
     chosen = {name: value for name, value in options.items() if value not in (None, ())}
     if arguments.suite == "posterior":
@@ -76,7 +76,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
             divergences = heldout.posterior(run, what, display)
         answer |= heldout.show_posterior(run, report, divergences, console)
     else:
-        answer |= heldout.show_offline(heldout.offline(run, what, arguments.deploy), console)
+        answer |= heldout.show_offline(run, heldout.offline(run, what, arguments.deploy), console)
     if arguments.json:
         print(json.dumps(answer))
     return OK

@@ -17,7 +17,8 @@ from rich.console import Console
 from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, train
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
-from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config import former_names
+from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_type, with_problem
 from icrl_dist.storage.fork import parse_source
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
@@ -34,6 +35,9 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "plan": (plan.PlanArguments, plan.plan),
 }
 
+_RENAMED = {"bench": {"--bite": "--drop"}}
+"""For each command the former names of options, and the present ones."""
+
 
 def _help() -> str:
     lines = ["icrl-dist: robust in-context reinforcement learning, distributed", "", "usage: icrl-dist COMMAND ...", ""]
@@ -42,15 +46,32 @@ def _help() -> str:
 
 
 def _parse(name: str, words: Sequence[str]) -> Any:
+    """The arguments of a command.  Raises ConfigError for a flag with a former name or of another problem's section."""
     kind, prog = COMMANDS[name][0], f"icrl-dist {name}"
+    for option in (word.partition("=")[0] for word in words):
+        if option in _RENAMED.get(name, {}):
+            raise ConfigError(f"{option} is now called {_RENAMED[name][option]}: rename it")
+    if kind is TrainArguments:
+        _check_settings(words, run_type(None))
     found: Any = tyro.cli(kind, prog=prog, args=list(words))
     if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
-        base = load(found.run or str(parse_source(found.source or "")[0] / "run.toml"))
+        base = load(found.run) if found.run else load_folder(parse_source(found.source or "")[0])
+        if "--problem" in (word.partition("=")[0] for word in words):
+            base = with_problem(base, found.config.problem)
+        _check_settings(words, type(base), base.problem)
         return tyro.cli(
             kind, prog=prog, args=list(words), default=TrainArguments(run=found.run, given=tuple(words), config=base)
         )
     return found
+
+
+def _check_settings(words: Sequence[str], kind: type[Run], problem: str = "") -> None:
+    """Check the names in flags ``--SECTION.NAME`` as those in a run file.  Raises ConfigError with the flag."""
+    for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
+        section, dot, key = flag.removeprefix("--").replace("-", "_").partition(".")
+        if dot:
+            former_names.check({section: {key: None}}, names_of(kind), problem, flag)
 
 
 def main(words: Sequence[str] | None = None) -> int:

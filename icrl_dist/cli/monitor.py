@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, OK
-from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.run import ConfigError, load_folder
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _is_active(folder: Path, console: Console) -> bool:
 def _learner_of(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, str]:
     """The endpoint of the learner, the folder of certificates for it, and the name of its run.
 
-    The name is empty with ``--connect``, because the endpoint alone identifies the run.  Raises
+    The name is empty with ``--connect``, because the endpoint identifies the run.  Raises
     ConfigError if no run is active, or if a TLS endpoint has no certificates.
     """
     from icrl_dist.storage.files import held
@@ -163,7 +163,7 @@ def _learner_of(what: Path | None, connect: str | None, certificates: str | None
             f"no run is active in {what or 'runs/'}: start one with `icrl-dist train`, or name it with --connect tcp/HOST:PORT"
         )
     folder = files[-1].parent
-    stream = load(str(folder / "run.toml")).stream
+    stream = load_folder(folder).stream
     endpoint = stream.connect or files[-1].read_text().strip()
     return endpoint, certificates or stream.certificates, _run_name(folder)
 

@@ -11,7 +11,7 @@ import numpy as np
 from icrl_dist.collect.trajectories import trajectory, unlabelled
 from icrl_dist.config.ranges import Positive
 from icrl_dist.config.sections import ContextConfig, Deployment
-from icrl_dist.interfaces import Method, Policy, Problem, Weighted
+from icrl_dist.interfaces import Method, Policy, Problem, WeightSource
 from icrl_dist.rollout.episode import deploy_online
 from icrl_dist.types import Identity, Job, Payload, Trajectory, Variation
 
@@ -35,12 +35,13 @@ class LabelledRollouts(Rollouts):
     """Histories of T^j that the problem labels: a DAgger round."""
 
     kind: ClassVar[str] = "adapt_labelled"
+    needs: ClassVar[tuple[str, ...]] = ("labeller",)
     labelling: Any
     """The problem's ``Labelling``."""
 
 
 def rollouts(
-    job: Job, problem: Problem, method: Method, weights: Weighted, worker: str, look: Look | None = None
+    job: Job, problem: Problem, method: Method, weights: WeightSource, worker: str, look: Look | None = None
 ) -> Iterator[Trajectory]:
     """N + 1 trials in each variation, all by T^j of the version that the job names.
 
@@ -60,7 +61,7 @@ def rollouts(
     policy = method.policy(model, env.batch, context, payload.deploy, watch if look else None)
     labeller = None
     if isinstance(payload, LabelledRollouts):
-        assert problem.labeller is not None, "validation refuses DAgger rounds of problems without exact answers"
+        assert problem.labeller is not None
         labeller = problem.labeller(job, payload.labelling)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]

@@ -17,6 +17,7 @@ class BehaviorContexts(Payload):
     """Episodes of the problem's behavior policies, which are not given the task."""
 
     kind: ClassVar[str] = "behavior_context"
+    needs: ClassVar[tuple[str, ...]] = ("labeller", "behaviors")
     behaviors: tuple[str, ...]
     """Names of the policies; trial n uses name n modulo their number."""
     labelling: Any
@@ -26,12 +27,12 @@ class BehaviorContexts(Payload):
 def behavior_contexts(job: Job, problem: Problem, worker: str, progress: Progress) -> Iterator[Trajectory]:
     """Contexts D^{i,k} of behavior policies, with query states and their labels."""
     payload = job.payload
-    assert isinstance(payload, BehaviorContexts) and problem.labeller is not None and problem.behavior is not None
+    assert isinstance(payload, BehaviorContexts) and problem.labeller is not None and problem.behaviors is not None
     labeller = problem.labeller(job, payload.labelling)
     identities = list(job.identities())
     rngs = [identity.rng(job.seed) for identity in identities]
     env = problem.batch([job.variation(identity) for identity in identities])
     names = [payload.behaviors[identity.trial % len(payload.behaviors)] for identity in identities]
-    ran = episode(env, problem.behavior(names, rngs, env), rngs)
+    ran = episode(env, problem.behaviors.make(names, rngs, env), rngs)
     for row, (identity, labelled) in enumerate(zip(identities, labeller(identities, rngs), strict=True)):
         yield trajectory(job, identity, ran, row, worker, "", labelled)

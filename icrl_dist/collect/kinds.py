@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,7 +11,7 @@ from icrl_dist.collect.adapt import LabelledRollouts, Look, Rollouts, rollouts
 from icrl_dist.collect.behavior import BehaviorContexts, behavior_contexts
 from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.experts.train import train_expert
-from icrl_dist.interfaces import JobKind, Method, Problem, Progress, Weighted, no_progress
+from icrl_dist.interfaces import JobKind, Method, Problem, Progress, WeightSource, no_progress
 from icrl_dist.stream import schema
 from icrl_dist.stream.excerpts import nearest
 from icrl_dist.types import Job, Payload, Trajectory
@@ -31,9 +32,8 @@ def read_payload(kind: str, problem: Problem, data: Any) -> Payload:
     if kind not in found:
         raise ValueError(f"job kind {kind!r}{nearest(kind, list(found))}: this worker has {', '.join(found)}")
     payload = schema.read(found[kind], data, "payload")
-    labelling = getattr(payload, "labelling", None)
-    if isinstance(labelling, dict):
-        labelling = schema.read(problem.Labelling, labelling, "payload.labelling")
+    if typing.get_type_hints(found[kind]).get("labelling") is Any:
+        labelling: Any = schema.read(problem.Labelling, payload.labelling, "payload.labelling")  # type: ignore[attr-defined]
         payload = dataclasses.replace(payload, labelling=labelling)  # type: ignore[call-arg]
     return payload
 
@@ -42,7 +42,7 @@ def do(
     job: Job,
     problem: Problem,
     method: Method,
-    weights: Weighted,
+    weights: WeightSource,
     worker: str,
     progress: Progress = no_progress,
     look: Look | None = None,
@@ -50,8 +50,11 @@ def do(
     """Do the job; yields each trajectory when its episode ends.
 
     ``look`` is called with the in-context policy after every decision and must not change it.  Raises
-    ValueError for a job of an unknown kind.
+    ValueError for a job of an unknown kind, or of one that needs a part which the problem lacks.
     """
+    for part in job.payload.needs:
+        if getattr(problem, part) is None:
+            raise ValueError(f"job kind {job.kind!r}: {problem.name} lacks Problem.{part}; use another kind, or define it")
     if isinstance(job.payload, Rollouts):
         return rollouts(job, problem, method, weights, worker, look)
     kinds = {**_WITHOUT_MODEL, **problem.job_kinds}

@@ -9,13 +9,16 @@ A package adds a problem with one line in its ``pyproject.toml``::
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
-from collections.abc import Sequence
+import typing
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from typing import Any, Literal, NamedTuple, get_args
 
 from icrl_dist import version
 from icrl_dist.config.toml import ConfigError, nearest
+from icrl_dist.stream import schema
 
 Group = Literal["problems", "methods"]
 
@@ -33,15 +36,47 @@ def names(group: Group) -> tuple[str, ...]:
 
 @functools.cache
 def find(group: Group, name: str) -> Any:
-    """The class of this name.  Raises ConfigError if there is none (with the nearest name) or it cannot be imported."""
+    """The class of this name.
+
+    Raises ConfigError if there is none (with the nearest name), if it cannot be imported, or if its section is unsuitable.
+    """
     kind = group.removesuffix("s")
     if name not in names(group):
         known = f"choose one of {', '.join(names(group))}"
         raise ConfigError(f"{kind} = {name!r}{nearest(name, names(group))}: {known}")
     try:
-        return _entries(group)[name].load()
+        owner = _entries(group)[name].load()
     except Exception as error:  # whatever another package's module raises while it is imported
         raise ConfigError(f"{kind} = {name!r}: its package cannot be imported ({error}); reinstall that package") from None
+    try:
+        if owner.section or group == "problems":
+            _check_section(owner.Config)
+    except Exception as error:  # whatever the class, its annotations and defaults raise
+        raise ConfigError(f"{kind} = {name!r}: section [{getattr(owner, 'section', '')}], {error}") from None
+    return owner
+
+
+def _check_section(cls: Any) -> None:
+    """Raises an error if a run file cannot hold this section, or if it cannot be hashed, which the cache of problems needs."""
+    if not dataclasses.is_dataclass(cls) or cls.__hash__ is None:
+        raise TypeError(f"class {cls.__name__}: use @dataclass(frozen=True)")
+    for name, hint in typing.get_type_hints(cls).items():
+        for part in _classes(hint):
+            if part.__hash__ is None:
+                raise TypeError(
+                    f"field {name}: a {part.__name__} can change, so it has no hash; use a tuple or a frozen dataclass"
+                )
+    schema.check(typing.cast(Any, cls)())  # each field has a type that can be decoded, and a default in its range
+
+
+def _classes(hint: Any) -> Iterator[type]:
+    """The classes in a type annotation, those of a dataclass's fields included."""
+    origin = typing.get_origin(hint) or hint
+    if isinstance(origin, type):
+        yield origin
+    fields = typing.get_type_hints(hint).values() if dataclasses.is_dataclass(hint) else ()
+    for part in (*typing.get_args(hint), *fields):
+        yield from _classes(part)
 
 
 def importable(group: Group) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, cast
 
-from icrl_dist.config import plugins
+from icrl_dist.config import former_names, plugins
 from icrl_dist.config.ranges import Seed
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import (
@@ -37,7 +37,18 @@ from icrl_dist.config.sections import (
 from icrl_dist.config.toml import ConfigError, build, dumps, nearest
 from icrl_dist.config.validation import validate
 
-__all__ = ["ConfigError", "Deployment", "Run", "dumps", "load", "override", "parse", "validate"]
+__all__ = [
+    "ConfigError",
+    "Deployment",
+    "Run",
+    "dumps",
+    "load",
+    "load_folder",
+    "override",
+    "parse",
+    "parse_written",
+    "validate",
+]
 
 
 @dataclass(frozen=True)
@@ -89,19 +100,15 @@ def make_run(problem: str = "darkroom", **fields: Any) -> Run:
 def load(name_or_path: str) -> Run:
     """Read the packaged run file of this name, or the one at this path; ``experts-NAME``: with method ``experts``.
 
-    Raises ConfigError if there is no such file, or if a key or value in it is impossible.
+    The ``run.toml`` of a run folder is read as by ``load_folder``.  Raises ConfigError if there is no such file, or
+    if a key or value in it is impossible.
     """
     if name_or_path.startswith("experts-"):
         return replace(load(name_or_path.removeprefix("experts-")), method="experts")
     path = Path(name_or_path)
     if path.suffix == ".toml" or "/" in name_or_path:
-        if not path.is_file():
-            raise ConfigError(f"run file {name_or_path!r}: no such file")
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"run file {name_or_path!r}: cannot be read: {error}") from None
-        return parse(text, name_or_path)
+        written = path.name == _RUN_FILE and (path.parent / "env.json").is_file()  # the program writes both
+        return (parse_written if written else parse)(_text(path, name_or_path), name_or_path)
     runs = _packaged()
     if name_or_path not in runs:
         raise ConfigError(
@@ -111,6 +118,27 @@ def load(name_or_path: str) -> Run:
     file, problem = runs[name_or_path]
     text = (resources.files("icrl_dist.config.runs") / f"{file}.toml").read_text(encoding="utf-8")
     return parse(f'problem = "{problem}"\n{text}' if problem else text, name_or_path)
+
+
+_RUN_FILE = "run.toml"
+
+
+def load_folder(folder: Path) -> Run:
+    """The settings of the run in a folder; an older version may have written them, see ``parse_written``.
+
+    Raises ConfigError if the folder holds no run, or if its settings cannot be read.
+    """
+    path = folder / _RUN_FILE
+    return parse_written(_text(path, str(path)), str(path))
+
+
+def _text(path: Path, name: str) -> str:
+    if not path.is_file():
+        raise ConfigError(f"run file {name!r}: no such file")
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"run file {name!r}: cannot be read: {error}") from None
 
 
 def packaged_runs() -> list[str]:
@@ -129,27 +157,43 @@ def _packaged() -> dict[str, tuple[str, str]]:
         for size in ("", "-laptop")
         if template and f"{template}{size}" in files
     }
-    alone = files - {file for file, _ in shared.values()} - {"__init__.py", "__pycache__"}
-    return dict(sorted({**shared, **{name: (name, "") for name in alone}}.items()))
+    unshared = files - {file for file, _ in shared.values()} - {"__init__.py", "__pycache__"}
+    return dict(sorted({**shared, **{name: (name, "") for name in unshared}}.items()))
 
 
 def parse(text: str, source: str) -> Run:
-    """The run that TOML ``text`` describes.  Raises ConfigError with ``source`` and the key."""
+    """The run that TOML ``text`` of a user describes.  Raises ConfigError with ``source`` and the key."""
+    return _from_tables(_tables(text, source), source)
+
+
+def parse_written(text: str, source: str) -> Run:
+    """The run in a text that this program wrote, in this version or an older one.
+
+    Former names and values are translated, and sections of other problems are left out.  Raises ConfigError with
+    ``source`` and the key.
+    """
+    return _from_tables(_tables(text, source), source, written=True)
+
+
+def _tables(text: str, source: str) -> dict[str, Any]:
     try:
-        tables = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also a number or a nesting beyond Python's limits
         raise ConfigError(f"{source}: not valid TOML: {error}") from None
-    return _from_tables(tables, source)
 
 
-def _from_tables(tables: dict[str, Any], source: str) -> Run:
-    """The run that TOML tables describe.  Raises ConfigError with ``source`` and the key."""
+def _from_tables(tables: dict[str, Any], source: str, written: bool = False) -> Run:
+    """The run that TOML tables describe; ``written``: by this program.  Raises ConfigError with ``source`` and the key."""
     problem = tables.get("problem", Run.problem)
     try:
         kind = run_type(problem) if isinstance(problem, str) else Run
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
-    run = cast(Run, build(kind, _known(tables, kind, source), source))
+    if written and isinstance(problem, str):
+        tables = former_names.translated(tables, names_of(kind), plugins.find("problems", problem))
+    else:
+        former_names.check(tables, names_of(kind), problem, source)
+    run = cast(Run, build(kind, tables, source))
     validate(run, source)
     try:
         owner = plugins.find("problems", run.problem)
@@ -158,30 +202,19 @@ def _from_tables(tables: dict[str, Any], source: str) -> Run:
         raise ConfigError(f"{source}: {error}") from None
 
 
-_RENAMED = {
-    "practice": "dagger",
-    "model.stretch": "model.window",
-    "pretrain.stretches": "pretrain.windows",
-    "pretrain.misled": "pretrain.decoy_fraction",
-    "pretrain.behaviours": "pretrain.behaviors",
-    "optim.stretches": "optim.windows",
-}
-"""Former names of sections and keys, and the present ones."""
+def names_of(kind: type[Run]) -> set[str]:
+    """The names of the sections of a run, and of its keys outside sections."""
+    return {item.name for item in dataclasses.fields(kind)}
 
 
-def _known(tables: dict[str, Any], kind: type[Run], source: str) -> dict[str, Any]:
-    """The tables as they are.  Raises ConfigError for a former name, with the present one, or another problem's section."""
-    for old, new in _RENAMED.items():
-        section, _, key = old.partition(".")
-        table = tables.get(section)
-        if (not key and section in tables) or (isinstance(table, dict) and key in table):
-            raise ConfigError(f"{source}: {old} is now called {new}: rename it")
-    known = {item.name for item in dataclasses.fields(kind)}
-    for name in tables:
-        if name not in known and name in plugins.sections(None):
-            problem = tables.get("problem", Run.problem)
-            raise ConfigError(f"{source}: section [{name}]: problem = {problem!r} has no such section; leave it out")
-    return tables
+def with_problem(run: Run, problem: str) -> Run:
+    """The run with another problem, without the sections that this problem lacks; the run is not validated.
+
+    Raises ConfigError for a problem that is not installed.
+    """
+    kind = run_type(problem)
+    shared = {name: getattr(run, name) for name in names_of(kind) if hasattr(run, name)}
+    return kind(**{**shared, "problem": problem})
 
 
 def override(run: Run, settings: Sequence[str], source: str) -> Run:

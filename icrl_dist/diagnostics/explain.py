@@ -11,7 +11,7 @@ from torch import nn
 
 from icrl_dist.agent.loading import checkpoint_file, trained
 from icrl_dist.collect import kinds
-from icrl_dist.config.run import ConfigError, Run, load
+from icrl_dist.config.run import ConfigError, Run, load_folder
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
 from icrl_dist.storage.checkpoint import load_checkpoint, newest_version
@@ -115,7 +115,7 @@ def describe(answer: dict[str, Any]) -> str:
 def _open(folder: Path) -> tuple[Dataset, Lineage]:
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"{folder}: no such run folder")
-    run = load(str(folder / "run.toml"))
+    run = load_folder(folder)
     return Dataset(folder / "dataset", readonly=True), Lineage.of(folder, run)
 
 

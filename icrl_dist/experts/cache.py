@@ -63,11 +63,11 @@ class History:
     adversary: Float32[np.ndarray, "E H F"]
     labels: Float32[np.ndarray, "E H A"]
     """The right action at each of the first H states: the expert's mean action, or that of the scripted policy."""
-    led_actions: Float32[np.ndarray, "G H A"]
+    window_actions: Float32[np.ndarray, "G H A"]
     """G episodes after training from which action windows (zeta of eq. 6) are cut: the expert acts by its mean actions."""
-    led_observations: Float32[np.ndarray, "G H+1 S"]
-    led_rewards: Float32[np.ndarray, "G H"]
-    led_labels: Float32[np.ndarray, "G H A"]
+    window_observations: Float32[np.ndarray, "G H+1 S"]
+    window_rewards: Float32[np.ndarray, "G H"]
+    window_labels: Float32[np.ndarray, "G H A"]
     """The right action at each of their first H states."""
     actor: Float32[np.ndarray, " P"]
     """The expert's parameters, in the layout of ``experts.sac.stacked.Shape``."""

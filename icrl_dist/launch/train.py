@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config import plugins
-from icrl_dist.config.run import ConfigError, Run, dumps, load
+from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.learner_process import TrainFailed
@@ -68,7 +68,7 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
     file = folder / "run.toml"
     if resume and not file.exists():
         raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to start one")
-    before = load(str(file)) if resume else None
+    before = load_folder(folder) if resume else None
     if before is not None and _with_endpoints_of(before, run) != run:
         raise ConfigError(
             f"--resume: {file} has other settings than this command; resume without overrides, or use another --out"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from icrl_dist.config.run import Run
-from icrl_dist.interfaces import Draw, Phase, TrajectoryDataset, VariationKey
+from icrl_dist.interfaces import Draw, LabelQuality, Phase, TrajectoryDataset, VariationKey
 from icrl_dist.methods import jobs
 from icrl_dist.methods.dpt import DPT, pretrain_phase
 from icrl_dist.problems import registry
@@ -63,16 +63,14 @@ class ICAA(DPT):
         self_labelled = Pool(share, CachedExamples(cache, labelling), episodes)
         return examples.draw(run, [Pool(1 - share, pretrain, episodes), self_labelled])
 
-    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> dict[str, float]:
+    def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> LabelQuality | None:
         """Quality of the labels that T^j gave in a round, measured with exact answers (Theorem E.5).
 
-        ``agreement``: share of labels that are optimal; ``labelling``: share of variations that gave labels;
-        ``context_return`` and ``label_return``: mean return of the first N_ + 1 trials and of later ones;
-        ``optimum``: mean optimal return.  Empty for D^0, and for a problem without exact answers.
+        The context trials are the first N_ + 1.  None for D^0, and for a problem without exact answers.
         """
         exact = registry.of(run).exact
         if phase.stage != "adapt" or exact is None:
-            return {}
+            return None
         agreement, early, late, best = [], [], [], []
         cut = run.icaa.context_trials + 1
         for key in dataset.variations(phase.stage, phase.round):
@@ -83,13 +81,13 @@ class ICAA(DPT):
             early.append(np.mean([t.episode_return for t in trials[:cut]]))
             late.append(np.mean([t.episode_return for t in trials[cut:]]))
             best.append(exact.optimum([trials[0].variation])[0])
-        return {
-            "agreement": float(np.mean(agreement)) if agreement else 0.0,
-            "labelling": len(agreement) / len(early),
-            "context_return": float(np.mean(early)),
-            "label_return": float(np.mean(late)),
-            "optimum": float(np.mean(best)),
-        }
+        return LabelQuality(
+            agreement=float(np.mean(agreement)) if agreement else 0.0,
+            labelling=len(agreement) / len(early),
+            context_return=float(np.mean(early)),
+            label_return=float(np.mean(late)),
+            optimum=float(np.mean(best)),
+        )
 
     def _examples(self, run: Run, dataset: TrajectoryDataset) -> ExamplesCache[VariationKey]:
         from icrl_dist.methods import examples

@@ -10,10 +10,13 @@ A drawing is one of
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 
+from icrl_dist.config.run import ConfigError
+from icrl_dist.interfaces import Problem
 from icrl_dist.monitor import validation
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.problems import registry
@@ -34,16 +37,25 @@ def of(message: dict[str, Any]) -> dict[str, Any]:
         raise InvalidMessageError("schema")
     parameters = validation.parameters(message.get("task"))
     every = validation.integer(message.get("every"), 1, 512)
-    draw = registry.problem(kind).drawing if kind in registry.names() else None
-    if draw is None:
+    problem = _problem(kind)
+    if problem is None or problem.drawing is None:
         raise InvalidMessageError("schema")
     try:
-        return draw(states, adversary, parameters, every)
+        return problem.drawing(states, adversary, parameters, every)
     except ValueError:
         raise InvalidMessageError("schema") from None
 
 
 def optimum(problem: str, task: dict[str, Any], adversary: dict[str, Any]) -> float | None:
     """The optimal undiscounted return of a variation, over its start cells; None where it cannot be computed."""
-    found = registry.problem(problem).message_optimum if problem in registry.names() else None
-    return None if found is None else found(task, adversary)
+    found = _problem(problem)
+    return None if found is None or found.message_optimum is None else found.message_optimum(task, adversary)
+
+
+@functools.lru_cache(maxsize=64)
+def _problem(name: str) -> Problem | None:
+    """The problem of this name; None if it is not installed here, or if its package cannot be imported: tried once."""
+    try:
+        return registry.problem(name)
+    except ConfigError:
+        return None

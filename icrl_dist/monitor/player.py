@@ -12,10 +12,11 @@ from typing import Any
 from rich.console import Console
 
 from icrl_dist.agent.loading import load_agent
-from icrl_dist.config.run import ConfigError, Deployment, parse
+from icrl_dist.config.run import ConfigError, Deployment, parse_written
 from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.serve import application, serving
 from icrl_dist.problems import registry as problems
+from icrl_dist.problems.parts import Game
 
 FRAME_S, BELIEF_S, HURRY_S = 0.05, 0.15, 0.25
 """Minimum time between two states sent, between two beliefs, and between two states while steps run at full speed."""
@@ -28,12 +29,12 @@ class Player:
     Only the thread in ``run`` accesses the game; ``command`` may be called from any thread.
     """
 
-    def __init__(self, game: Any, stream: EventStream) -> None:
+    def __init__(self, game: Game, stream: EventStream) -> None:
         self._game, self._stream = game, stream
         self._orders: queue.SimpleQueue[tuple[dict[str, Any], Future[None]]] = queue.SimpleQueue()
 
     def command(self, fields: dict[str, Any]) -> None:
-        """Execute a command in the thread of the game and wait for it.  Raises ValueError as ``PlayGame.command`` does."""
+        """Execute a command in the thread of the game and wait for it.  Raises ValueError as ``Game.command`` does."""
         done: Future[None] = Future()
         self._orders.put((fields, done))
         try:
@@ -101,7 +102,7 @@ def play(
     Raises ConfigError if the agent is not for Dark Room, or if the address cannot be used.
     """
     agent = load_agent(what, seed, deploy)
-    run = parse(str(agent.manifest.get("run", "")), str(what))
+    run = parse_written(str(agent.manifest.get("run", "")), str(what))
     make_game = problems.of(run).game
     if make_game is None:
         raise ConfigError(f"play {what}: its agent is for {run.problem}, which cannot be played; use an agent of darkroom")

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from icrl_dist.config.run import ConfigError, load
+from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.methods import registry as methods
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.index import Row
@@ -41,7 +41,7 @@ class Recording:
         """Raises ConfigError if the folder is not a run folder, or contains nothing to play."""
         if not (folder / "run.toml").is_file():
             raise ConfigError(f"{folder}: not a run folder (no run.toml); name a run folder, or a live run with --connect")
-        self._run, self._folder, self._keys = load(str(folder / "run.toml")), folder, StreamKeys(folder.absolute().name)
+        self._run, self._folder, self._keys = load_folder(folder), folder, StreamKeys(folder.absolute().name)
         self._rows = sorted(_read(folder / "metrics.jsonl"), key=lambda row: float(row["time"]))
         self._store = Dataset(folder / "dataset", readonly=True)
         self._ordered = sorted(self._store.index, key=lambda row: (row.segment, row.offset))

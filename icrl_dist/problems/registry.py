@@ -44,7 +44,10 @@ def of_task(task: Task) -> Problem:
 
 
 def batch(variations: Sequence[Variation]) -> Batch:
-    """The variations as one batch.  Raises ValueError for an unknown problem or a mixed batch."""
+    """The variations as one batch, with a default section; where there is a run, use the ``batch`` of its problem.
+
+    Raises ValueError for an unknown problem or a mixed batch.
+    """
     kinds = sorted({v.task.kind for v in variations})
     if len(kinds) != 1:
         raise ValueError(f"a batch holds variations of one problem, not {kinds}")
@@ -52,13 +55,14 @@ def batch(variations: Sequence[Variation]) -> Batch:
 
 
 def spec(task: Task) -> Spec:
-    """Spec of the task's observations and actions."""
+    """Spec of the task's observations and actions, with a default section."""
     return of_task(task).spec_of(task)
 
 
 def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
     """One variation environment (tau, phi) as a ``gymnasium.Env``; ``render_mode="rgb_array"``: it can render images.
 
+    The problem has a default section: a problem whose environments depend on more than the task needs ``Problem.batch``.
     The adversary is part of the environment: observations contain neither it nor its action, but
     ``info["adversary"]`` has the action (see ``Step.adversary``).
     """

@@ -15,7 +15,7 @@ from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
 from icrl_dist.problems import registry
 from icrl_dist.results.statistics import mean_and_error
-from icrl_dist.rollout.episode import OfflinePolicy, deploy_offline, deploy_online, episode
+from icrl_dist.rollout.episode import Episodes, OfflinePolicy, deploy_offline, deploy_online, episode
 from icrl_dist.types import Identity, Task, Variation
 
 
@@ -37,9 +37,9 @@ class Result:
         """Mean return over the last episodes."""
         return float(self.returns[:, :, -episodes:].mean())
 
-    def first_over(self, oracle: Result, episodes: int) -> float:
+    def first_over(self, oracle: Result, episodes: int) -> float | None:
         """Mean return over the first episodes (or all, if there are fewer), as a share of the oracle's in these episodes."""
-        return round(float(self.returns[:, :, :episodes].mean() / oracle.returns[:, :, :episodes].mean()), 4)
+        return _share(*(float(one.returns[:, :, :episodes].mean()) for one in (self, oracle)))
 
     def episode_of(self, oracle: Result, share: float) -> int | None:
         """First episode, from 1, whose mean return is at least this share of the oracle's mean over all episodes; or None."""
@@ -57,9 +57,14 @@ class Result:
             "standard_error": [None if np.isnan(e) else round(float(e), 3) for e in error],
             "optimum": None if best is None else round(best, 3),
             "last5": round(self.last(5), 3),
-            "last5_over_optimum": None if best is None else round(self.last(5) / best, 4),
+            "last5_over_optimum": None if best is None else _share(self.last(5), best),
             **({"broken": self.broken} if self.broken else {}),
         }
+
+
+def _share(value: float, whole: float) -> float | None:
+    """``value`` as a share of ``whole``; None if that is 0."""
+    return round(value / whole, 4) if whole else None
 
 
 def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple[Variation, ...]:
@@ -102,7 +107,7 @@ def online(
             made, ceiling = (agent.make, agent.ceiling) if isinstance(agent, Reference) else (agent, False)
             for ran in deploy_online(env, made(rows, env), trials):
                 returns.append(ran.returns)
-                broken += 0 if ran.diverged is None else int(ran.diverged.sum())
+                broken += _broken(ran)
                 progress(name, p, len(returns))
             shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
             results.append(Result(name, p, np.stack(returns, axis=1).reshape(shape), optimum, ceiling, broken))
@@ -110,24 +115,21 @@ def online(
 
 
 def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
-    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a random or expert D_off.
+    """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a D_off of each of the ``sources``.
 
-    Deploys every model, and every reference that accepts data of other policies.  Only for a problem with
-    exact answers.
+    Deploys every model, and every reference that accepts data of other policies.
     """
     problem, results = registry.of(run), []
-    assert problem.exact is not None
     references = problem.references(run)
-    sources = {"random": references["random"], "expert": next(one for one in references.values() if one.ceiling)}
     for level, p in enumerate(run.evaluate.p):
         chosen = variations(run, p)
-        optimum = problem.exact.optimum(chosen)
+        optimum = None if problem.exact is None else problem.exact.optimum(chosen)
         rows, ids = _rows(run, chosen, level)
         env = problem.batch(rows)
-        for source, behavior in sources.items():
+        for source, behavior in sources(run).items():
             data = episode(env, behavior.make(rows, env), [i.rng(run.seed) for i in ids])
             shape = (len(chosen), run.evaluate.seeds, 1)
-            results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum))
+            results.append(Result(f"{source} data", p, data.returns.reshape(shape), optimum, broken=_broken(data)))
             policies: dict[str, Policy] = {
                 name: in_context(one, run.context, deploy)(rows, env) for name, one in models.items()
             }
@@ -135,8 +137,20 @@ def offline(run: Run, models: Mapping[str, TrainedModel], deploy: Deployment | N
             for name, policy in policies.items():
                 if _accepts_data(policy):
                     ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
-                    results.append(Result(f"{name}, {source} data", p, ran.returns.reshape(shape), optimum))
+                    returns = ran.returns.reshape(shape)
+                    results.append(Result(f"{name}, {source} data", p, returns, optimum, broken=_broken(ran)))
     return results
+
+
+def sources(run: Run) -> dict[str, Reference]:
+    """The references that collect D_off: ``random``, and ``expert``, the first that is a ceiling; those that there are."""
+    references = registry.of(run).references(run)
+    found = {"random": references.get("random"), "expert": next((one for one in references.values() if one.ceiling), None)}
+    return {name: one for name, one in found.items() if one is not None}
+
+
+def _broken(ran: Episodes) -> int:
+    return 0 if ran.diverged is None else int(ran.diverged.sum())
 
 
 def _accepts_data(policy: Policy) -> TypeGuard[OfflinePolicy]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 from collections.abc import Callable, Sequence
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Float64, Int64
 from rich.console import Console
 
 from icrl_dist.agent import ood_score
@@ -86,6 +85,7 @@ def online(
     Algorithm 1, the newest model is deployed by Algorithm 1 as well.  The second result is the OOD score
     of the newest model after the last episode, by p; empty if it was not calibrated.
     """
+    check_suite(run, "online")
     found, problem = models(what), registry.of(run)
     policies = {name: evaluate.in_context(model, run.context, deploy) for name, model in found.items()}
     newest, model = next(iter(found.items()))
@@ -113,10 +113,15 @@ def _spread(values: Float[np.ndarray, " B"]) -> dict[str, float]:
 def check_suite(run: Run, suite: str) -> None:
     """Raises ConfigError if the run's problem or method does not support the suite."""
     problem, method = registry.of(run), methods.of(run)
-    if suite == "offline" and problem.exact is None:
-        raise ConfigError(f"--suite offline: {run.problem} has no exact answers for expert data; use --suite online")
+    if not problem.evaluated:
+        raise ConfigError(f"--suite {suite}: {run.problem} has no tasks to evaluate on: change [{problem.section}]")
+    if suite == "offline" and not evaluate.sources(run):
+        lacks = "has no reference 'random' and none that is given the task"
+        raise ConfigError(f"--suite offline: {run.problem} {lacks}, so nothing collects data; use --suite online")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
+    if suite == "posterior" and problem.exact is None:
+        raise ConfigError(f"--suite posterior: {run.problem} has no exact answers; use --suite online")
 
 
 def offline(run: Run, what: Path, deploy: Deployment | None = None) -> list[evaluate.Result]:
@@ -134,15 +139,19 @@ def show_online(
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(rows, indent=1).encode()))
     figure = plots.adaptation(rows, report.with_name(f"{report.name}.png"), title)
     console.print(returns_table(results, f"Return by online episode: {title}"))
-    for one in results:
-        if one.broken:
-            text = f"{one.agent}, p = {one.p:g}: the simulation diverged in {one.broken} of {one.returns.size} episodes; "
-            console.print(text + "their return up to that step counts", highlight=False, markup=False)
+    _show_broken(results, console)
     for p, score in scores.items():
         text = f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
         console.print(text, highlight=False, markup=False)
     console.print(f"figure {figure}", highlight=False, markup=False)
     return {**adapted, "surprise": scores, "rows": rows, "figure": str(figure)}
+
+
+def _show_broken(results: list[evaluate.Result], console: Console) -> None:
+    for one in results:
+        if one.broken:
+            text = f"{one.agent}, p = {one.p:g}: the simulation diverged in {one.broken} of {one.returns.size} episodes; "
+            console.print(text + "their return up to that step counts", highlight=False, markup=False)
 
 
 def _adaptation(results: list[evaluate.Result]) -> dict[str, dict[str, float | int | None]]:
@@ -175,7 +184,16 @@ def posterior(run: Run, what: Path, display: Display) -> dict[str, Any]:
     """Comparison of the newest model with the exact posterior, on training and on held-out tasks."""
     model = trained(load_checkpoint(checkpoint_file(what)))
     suite = registry.of(run).posterior
-    decide = functools.partial(model.method.distributions, model.model)
+    assert suite is not None, "``check_suite`` refuses problems without one"
+
+    def decide(
+        transitions: Sequence[np.ndarray], queries: Float32[np.ndarray, "B N S"], prefix: Int64[np.ndarray, "B N"]
+    ) -> Float64[np.ndarray, "B N A"]:
+        probs = model.method.distributions(model.model, transitions, queries, prefix)
+        if probs is None:
+            raise ConfigError(f"--suite posterior: the model of {run.method} gives no distributions; use --suite online")
+        return probs
+
     act = evaluate.in_context(model, run.context, "paper")
     report: dict[str, Any] = {}
     total = len(suite.kinds) * len(suite.levels(run))
@@ -202,6 +220,7 @@ def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Conso
     title = f"{run.method.upper()} compared with the exact posterior: {problem.title(len(problem.evaluated))}"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
     figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
+    assert problem.posterior is not None, "``check_suite`` refuses problems without one"
     for prior, meaning in problem.posterior.priors.items():
         console.print(kl_table(found, prior, f"KL(exact || model) in nats, where {meaning}"))
     adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
@@ -226,7 +245,9 @@ def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str
     return progress
 
 
-def show_offline(results: list[evaluate.Result], console: Console) -> dict[str, Any]:
+def show_offline(run: Run, results: list[evaluate.Result], console: Console) -> dict[str, Any]:
     """Print the table; returns the rows."""
-    console.print(returns_table(results, "One episode given data collected before, on goals never trained on"))
+    title = registry.of(run).title(len(results[0].returns))
+    console.print(returns_table(results, f"One episode given data collected before: {title}"))
+    _show_broken(results, console)
     return {"rows": [result.row() for result in results]}

@@ -49,7 +49,9 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
         axis.set_title("no disturbance" if p == 0 else f"{_disturbed(here)} = {p:g}", fontsize=10)
         axis.set_xlabel("online episode")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.set_ylim(0, 1.08 * max(row["optimum"] or max(row["episodes"]) for row in rows))
+        top, lowest = max(row["optimum"] or max(row["episodes"]) for row in rows), min(min(row["episodes"]) for row in rows)
+        if lowest >= 0 < top:
+            axis.set_ylim(0, 1.08 * top)
         axis.grid(alpha=0.25)
     axes[0][0].set_ylabel("return on goals never trained on" if rows[0]["optimum"] is not None else "return")
     figure.legend(*axes[0][0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4, frameon=False)

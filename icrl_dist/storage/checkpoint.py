@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from icrl_dist.config.toml import ConfigError
 from icrl_dist.storage.files import StoreError, atomic_write
+from icrl_dist.stream.validation import VERSION
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,19 @@ class Checkpoint:
     def part(self, prefix: str) -> dict[str, np.ndarray]:
         """The arrays whose name begins with ``prefix/``, by the rest of the name."""
         return {k.removeprefix(prefix + "/"): v for k, v in self.arrays.items() if k.startswith(prefix + "/")}
+
+
+def require_format(manifest: Mapping[str, Any], source: str) -> None:
+    """Raises ConfigError, beginning with ``source``, for a checkpoint that was fitted to data of another format.
+
+    Digests of equal data differ between formats, so training cannot continue from it; its agent can be deployed.
+    """
+    found = manifest.get("format", 1)  # 0.1.0 stored none
+    if found != VERSION:
+        raise ConfigError(
+            f"{source}: trained on data of format {found!r}, this version of icrl-dist continues only runs of format {VERSION}"
+            ": start a new run with another --out; `icrl-dist evaluate` and `export` still read the old one"
+        )
 
 
 def version_file(folder: Path, version: int) -> Path:
@@ -43,8 +59,16 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     atomic_write(path, lambda file: np.savez(file, manifest=manifest, **arrays))
 
 
+_RENAMED = {"stretch": "window", "produces": "next_version"}
+"""Former names of manifest entries, and the present ones."""
+_FORMER_PREFIX = re.compile("^optimiser/")
+
+
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint without executing anything in it.  Raises StoreError if it is missing or not a checkpoint."""
+    """Read a checkpoint, also of an older version, without executing anything in it.
+
+    Raises StoreError if it is missing or not a checkpoint.
+    """
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             size, unpacked = path.stat().st_size, sum(member.file_size for member in file.zip.infolist())
@@ -54,6 +78,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
             arrays = {name.removeprefix("a/"): file[name] for name in file.files if name.startswith("a/")}
             if not isinstance(manifest, dict) or not all(isinstance(array, np.ndarray) for array in arrays.values()):
                 raise ValueError("expected a manifest that is a table, and arrays")
+            manifest = {_RENAMED.get(name, name): value for name, value in manifest.items()}
+            arrays = {_FORMER_PREFIX.sub("optimizer/", name): array for name, array in arrays.items()}
     except FileNotFoundError:
         raise StoreError(f"{path}: no such checkpoint") from None
     except Exception as error:

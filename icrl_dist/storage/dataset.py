@@ -17,6 +17,7 @@ from typing import Any
 from icrl_dist.storage import segment
 from icrl_dist.storage.files import StoreError, atomic_write, sync_folder, unwritten
 from icrl_dist.storage.index import Index, Row
+from icrl_dist.stream.validation import VERSION
 from icrl_dist.types import Identity, Trajectory
 
 _PATTERN = "segment-*.frames"
@@ -76,9 +77,12 @@ class Dataset:
             if unnamed and not self._readonly:
                 self.repaired.append(f"{path.name}: removed {len(unnamed)} trajectories whose names were damaged")
                 found = self._remove_damage(path, found.without(unnamed), sealed=not last)
+        except segment.OtherFormat as error:
+            raise StoreError(f"{path}: {error}") from None
         except (ValueError, OSError) as error:
             raise StoreError(
-                f"{path}: not a dataset of this version of icrl-dist ({error}): restore the file, or start a new run"
+                f"{path}: not a dataset of this version of icrl-dist, format {VERSION} ({error}): restore the file, or start a "
+                "new run with another --out; `icrl-dist evaluate` and `export` of the old run do not need it"
             ) from None
         self._names[number] = found.names
         if found.sealed:

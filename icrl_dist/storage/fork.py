@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config import plugins
-from icrl_dist.config.run import ConfigError, Run, dumps, load, parse
-from icrl_dist.storage.checkpoint import load_checkpoint, newest_version, version_file
+from icrl_dist.config.run import ConfigError, Run, dumps, load_folder, parse_written
+from icrl_dist.storage.checkpoint import load_checkpoint, newest_version, require_format, version_file
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.sharing import adopt
@@ -42,7 +42,9 @@ class Lineage:
             return cls(run)
         try:
             fields = json.loads(path.read_text())
-            return cls(run, tuple((int(item["version"]), parse(item["run"], str(path))) for item in fields["ancestors"]))
+            return cls(
+                run, tuple((int(item["version"]), parse_written(item["run"], str(path))) for item in fields["ancestors"])
+            )
         except (KeyError, TypeError, ValueError) as error:
             raise StoreError(f"{path}: not the record of a fork ({error}); restore the file, or make the fork again") from None
 
@@ -72,9 +74,10 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
     Files are linked, not copied, if the file system supports it.  Raises ConfigError if the runs differ in what
     a fork may not change, StoreError if the digest of the data is not the one in the checkpoint.
     """
-    parent = load(str(theirs / "run.toml"))
+    parent = load_folder(theirs)
     _check_same(parent, run, f"--from {theirs}@{version}")
     manifest: Mapping[str, Any] = load_checkpoint(version_file(theirs, version)).manifest
+    require_format(manifest, f"--from {theirs}@{version}")
     if "dataset_digest" not in manifest:
         problem = "its checkpoint, of an older version of icrl-dist, holds no dataset digest; train that run again"
         raise ConfigError(f"--from {theirs}@{version}: {problem}")

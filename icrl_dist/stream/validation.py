@@ -20,8 +20,10 @@ from icrl_dist.types import ARRAYS
 
 _T = TypeVar("_T")
 
-VERSION = 1
-"""Version of the wire format, in every message; other versions are refused."""
+VERSION = 2
+"""Version of the wire format and of the dataset, in every message and checkpoint.
+
+Messages of other versions are refused; runs of other versions can be evaluated, but not continued."""
 
 REASONS: dict[str, str] = {
     "oversized": "longer than the reader's limit",

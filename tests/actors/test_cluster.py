@@ -132,10 +132,10 @@ def test_a_loopback_endpoint_is_refused_on_a_cluster_of_several_nodes(new_fleet)
     with pytest.raises(ConfigError, match=r"stream.endpoint = 'tcp/127.0.0.1:0': other nodes cannot reach it.*tls/HEAD_IP"):
         gather(new_fleet(ray, 2), [], LOOPBACK)
     assert not ray.placed
-    alone = FakeRay(2)
-    fleet = new_fleet(alone, 2)
+    one_node = FakeRay(2)
+    fleet = new_fleet(one_node, 2)
     gather(fleet, [], LOOPBACK)
-    assert fleet.watch(print, 0) == 2 and len(alone.placed) == 2
+    assert fleet.watch(print, 0) == 2 and len(one_node.placed) == 2
 
 
 def test_an_occupied_port_is_refused(new_fleet):

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from icrl_dist.config import plugins
+from icrl_dist.config import former_names, plugins
 from icrl_dist.config import run as config
 from icrl_dist.config.run import ConfigError, make_run, override, run_type
 
@@ -22,7 +22,7 @@ def refusal(text: str) -> str:
     return message
 
 
-@pytest.mark.parametrize(("old", "new"), config._RENAMED.items())
+@pytest.mark.parametrize(("old", "new"), former_names.RENAMED.items())
 def test_a_renamed_key_is_refused_with_its_new_name(old: str, new: str) -> None:
     section, _, key = old.partition(".")
     text = f"[{section}]\n{key or 'rounds'} = 1"
@@ -31,7 +31,7 @@ def test_a_renamed_key_is_refused_with_its_new_name(old: str, new: str) -> None:
         override(make_run(), [f"{section}.{key or 'rounds'}=1"], "--set")
 
 
-@pytest.mark.parametrize(("old", "new"), config._RENAMED.items())
+@pytest.mark.parametrize(("old", "new"), former_names.RENAMED.items())
 def test_the_new_name_of_a_renamed_key_exists(old: str, new: str) -> None:
     sections = {item.name: item.default_factory for item in dataclasses.fields(run_type(None))}
     section, _, key = new.partition(".")
@@ -47,7 +47,9 @@ def test_a_section_of_another_problem_is_refused(problem: str) -> None:
     own = plugins.find("problems", problem).section
     assert own in {item.name for item in dataclasses.fields(run_type(problem))}
     for section in SECTIONS - {own}:
-        message = f"section [{section}]: problem = '{problem}' has no such section; leave it out"
+        owners = [name for name in PROBLEMS if plugins.find("problems", name).section == section]
+        owner = owners[0] + (f" and {len(owners) - 1} other problems" if len(owners) > 1 else "")
+        message = f"section [{section}]: problem = '{problem}' has no such section, it belongs to {owner}; leave it out"
         assert refusal(f'problem = "{problem}"\n[{section}]\nhorizon = 3') == f"mine.toml: {message}"
         with pytest.raises(ConfigError) as caught:
             override(make_run(problem), [f"{section}.horizon=3"], "--set")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from importlib import metadata
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,21 +13,12 @@ from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 
 @pytest.fixture(params=["raise ImportError('no simulator')", "1 / 0"])
-def broken(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def broken(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, install: Callable[..., None]
+) -> None:
     (tmp_path / "broken_plugin.py").write_text(request.param)
     monkeypatch.syspath_prepend(tmp_path)
-    extra = {
-        group: metadata.EntryPoint("broken", "broken_plugin:It", f"icrl_dist.{group}") for group in ("problems", "methods")
-    }
-    caches = (plugins.find, plugins.sections, run._packaged)
-    with monkeypatch.context() as patch:
-        entries = plugins._entries
-        patch.setattr(plugins, "_entries", lambda group: {**entries(group), "broken": extra[group]})
-        for cache in caches:
-            cache.cache_clear()
-        yield
-    for cache in caches:
-        cache.cache_clear()
+    install(problems={"broken": "broken_plugin:It"}, methods={"broken": "broken_plugin:It"})
 
 
 def test_a_broken_package_is_an_error_only_for_a_run_that_uses_it(broken: None) -> None:

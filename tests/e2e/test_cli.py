@@ -38,7 +38,7 @@ def refused(capsys, *arguments):
         ("[adversary]\np_max = 1.5", r"adversary.p_max = 1.5: a probability lies in \[0, 1\]"),
         ("[evaluate]\np = [0.0, -0.1]", r"evaluate.p = -0.1: a probability lies in \[0, 1\]"),
         ('method = "ppo"', r"method = 'ppo': choose one of dpt, experts, icaa, icag"),
-        ("[icaa]\ntrials = 5\ncontext_trials = 5", r"icaa.context_trials = 5: must be below icaa.trials"),
+        ("[icaa]\ntrials = 5\ncontext_trials = 5", r"icaa.context_trials = 5: use 0 to 4: it must be below icaa.trials"),
         ("darkroom = [", r"not valid TOML"),
     ],
 )
@@ -78,8 +78,8 @@ def test_more_workers_than_cores(capsys, tmp_path):
 
 
 def test_a_port_in_use(capsys, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        port = occupied.getsockname()[1]
         line = refused(capsys, "train", "smoke", "--out", tmp_path / "out", "--stream.endpoint", f"tcp/127.0.0.1:{port}")
     assert f"tcp/127.0.0.1:{port}" in line and "free that port" in line
 
@@ -98,6 +98,39 @@ def test_a_port_in_use(capsys, tmp_path):
 def test_an_invalid_setting(capsys, tmp_path, setting, expected):
     assert expected in refused(capsys, "train", "smoke", "--set", setting, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--practice.rounds", "2"], "--practice.rounds: practice is now called dagger: rename it"),
+        (["--model.stretch=3"], "--model.stretch: model.stretch is now called model.window: rename it"),
+        (["--pretrain.behaviours", "goals"], "pretrain.behaviours is now called pretrain.behaviors: rename it"),
+        (["--control.train-tasks", "4"], "section [control]: problem = 'darkroom' has no such section, it belongs to dmc-"),
+        (
+            ["--problem", "dmc-hopper-hop", "--darkroom.size=4"],
+            "--darkroom.size: section [darkroom]: problem = 'dmc-hopper-hop' has no such section, it belongs to darkroom;",
+        ),
+        (["--problem", "dmc-hopper-hop", "--control.train_tasks", "5"], "control.train_tasks = 5: use 4, 16 or 36"),
+        (["--problem", "dmc-hoper-hop"], "problem = 'dmc-hoper-hop'; did you mean 'dmc-hopper-hop'?"),
+        (["--set", "practice.rounds=1"], "--set: practice is now called dagger: rename it"),
+    ],
+)
+def test_a_flag_with_a_former_name_or_of_another_problem_has_the_hint_of_run_files(capsys, tmp_path, flags, expected):
+    assert expected in refused(capsys, "train", "smoke", *flags, "--engine", "inline", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_flags_of_a_run_that_is_forked_are_checked_by_its_problem(capsys, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "version-0000.npz").touch()
+    (tmp_path / "run.toml").write_text("[darkroom]\nsize = 4")
+    words = ["--from", f"{tmp_path}@0", "--out", tmp_path / "out", "--control.horizon", "3"]
+    assert "--control.horizon: section [control]: problem = 'darkroom'" in refused(capsys, "train", *words)
+
+
+def test_a_former_option_is_refused_with_its_new_name(capsys):
+    assert refused(capsys, "bench", "disturbance", "--bite", "0.25") == "icrl-dist: --bite is now called --drop: rename it"
 
 
 def test_a_home_in_the_run_folder_is_expanded(capsys, tmp_path, monkeypatch):

@@ -76,8 +76,8 @@ def test_nothing_is_trained_that_is_in_the_cache(run, trained, caplog):
 
 def test_a_method_takes_the_experts_that_another_method_trained_and_ends_with_the_same_bytes(run, trained, tmp_path):
     """DPT needs the undisturbed ones of ICAG's experts, which train with other experts."""
-    alone = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=str(tmp_path / "other")))
-    own = [digests(do(run, job)) for job in jobs_of(alone, "dpt")]
+    other_cache = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=str(tmp_path / "other")))
+    own = [digests(do(run, job)) for job in jobs_of(other_cache, "dpt")]
     assert trained == [2, 2]
     for job in jobs_of(run, "icag"):
         do(run, job)

@@ -4,12 +4,15 @@ import dataclasses
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from icrl_dist.collect import kinds
 from icrl_dist.config.run import ConfigError, override
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch import train
+from icrl_dist.methods import examples
+from icrl_dist.methods.icaa import ICAA
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError, hold
 from icrl_dist.storage.fork import parse_source
@@ -78,6 +81,43 @@ def test_damage_of_data_in_memory_changes_no_result_and_is_found_when_the_run_is
     assert same(run_inline(parent[2], folder, damage), parent[1]) and len(happened) == 1
     assert same(run_inline(parent[2], folder, damage, resume=True), parent[1])
     assert len(happened) == 2 and "segment-000000.frames: removed a damaged range" in happened[1]
+
+
+def test_examples_of_removed_trajectories_are_made_anew_from_those_that_replace_them(parent, tmp_path, monkeypatch):
+    """Round 1 finds damage; the repair also removes a trajectory of round 0, whose examples are in memory."""
+    folder, flipped, replaced = tmp_path / "run", [], []
+    work, draw, data = kinds.do, examples.draw, ICAA.data
+
+    def damage(event):
+        if event.get("phase") == "adapt" and event.get("round") == 1 and event["step"] == event["steps"] and not flipped:
+            flipped.extend(sorted((folder / "dataset").glob("segment-*"))[1:])
+            for path in flipped:
+                flip(path, path.stat().st_size // 2)
+
+    def do(*args):
+        for trajectory in work(*args):
+            if flipped and trajectory.identity[:2] == ("adapt", 0):  # as under ``stream.staleness``, with other weights
+                replaced.append(trajectory.identity)
+                trajectory = dataclasses.replace(trajectory, actions=(trajectory.actions + 1) % 5)
+            yield trajectory
+
+    pools = []
+
+    def compare(method, run, phase, dataset):
+        drawn = data(method, run, phase, dataset)
+        if phase.round == 1:
+            keys = [key for j in (0, 1) for key in dataset.variations("adapt", j)]
+            for key, found in zip(keys, pools[-1][1].examples, strict=True):
+                made = examples.self_labelled(run, dataset.trials(key))
+                np.testing.assert_array_equal(found.actions, made.actions, str(key))
+                np.testing.assert_array_equal(found.labels, made.labels, str(key))
+        return drawn
+
+    monkeypatch.setattr(kinds, "do", do)
+    monkeypatch.setattr(examples, "draw", lambda run, chosen: pools.append(chosen) or draw(run, chosen))
+    monkeypatch.setattr(ICAA, "data", compare)
+    result = run_inline(parent[2], folder, damage)
+    assert result["repaired"] == len(flipped) == 2 and replaced and len(pools) == 3
 
 
 def test_a_folder_has_at_most_one_learner(parent, monkeypatch):

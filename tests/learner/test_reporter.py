@@ -6,20 +6,25 @@ import json
 import pytest
 
 from icrl_dist.config.sections import AlertsConfig
+from icrl_dist.interfaces import LabelQuality
 from icrl_dist.launch import train as launch
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.telemetry.metrics import NAMES, TEXTS
 from learner import reporter, service
+from tests.toys.return_to_go import ReturnToGo
 
 METRICS = service.Metrics
 
 
 @pytest.fixture
 def train(small_run, tmp_path, monkeypatch):
-    """``train(**thresholds)``: a run; returns its monitor messages, rows of metrics, and events for the terminal."""
+    """``train(run, **thresholds)``: a run, by default ``small_run``.
 
-    def run_with(**thresholds):
+    Returns its monitor messages, rows of metrics, and events for the terminal.
+    """
+
+    def run_with(run=None, **thresholds):
         messages, events, publish = [], [], MemoryLink.publish
 
         def record(link, key, payload, droppable):
@@ -31,7 +36,7 @@ def train(small_run, tmp_path, monkeypatch):
         monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
         monkeypatch.setattr(reporter, "_DESCRIPTION_S", 0.0)
         monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
-        run = dataclasses.replace(small_run, alerts=AlertsConfig(**thresholds))
+        run = dataclasses.replace(run or small_run, alerts=AlertsConfig(**thresholds))
         launch.prepare(run, tmp_path / "run", resume=False, overwrite=False)
         launch.train_inline(run, tmp_path / "run", events.append)
         rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
@@ -56,6 +61,22 @@ def test_monitors_receive_all_documented_messages(train):
     assert stored == sorted(stored) and stored[-1] == len(identities) == len(set(identities))
     assert len(of["episode"]) < len(identities), "only some episodes are published completely"
     assert len(of["trajectories"]) < len(identities) / 2, "a message contains many trajectories"
+
+
+def test_labels_that_a_method_of_another_package_rates_are_reported(train, toy_run, install):
+    quality = LabelQuality(agreement=0.5, labelling=1.0, context_return=1.0, label_return=2.0, optimum=4.0)
+
+    class Rated(ReturnToGo):
+        def label_quality(self, run, phase, dataset):
+            return quality if phase.stage == "adapt" else None
+
+    run = toy_run(method="return-to-go")
+    install(methods={"return-to-go": Rated})
+    _, rows, events = train(run)
+    (shown,) = [event for event in events if event["event"] == "labels"]
+    assert shown == {"event": "labels", "round": 0, **dataclasses.asdict(quality)}
+    (row,) = [row for row in rows if row["stage"] == "labels"]
+    assert dataclasses.asdict(quality).items() <= row.items() and dataclasses.asdict(quality).keys() == NAMES["labels"].keys()
 
 
 def test_an_alert_reaches_terminal_monitors_and_metrics(train):

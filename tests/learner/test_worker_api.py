@@ -189,7 +189,7 @@ def test_a_worker_that_ends_without_a_report_gets_a_crash_record(server, worker)
     assert event["text"] == f"worker w0 ended without a report ({cause}); {path}"
     (record,) = records(server).values()
     assert (record["what"], record["job"], record["seed"]) == ("vanished", server.jobs[0].label, server.run.seed)
-    assert record["last_said"]["episodes"] == 7 and record["stacks"] == []
+    assert record["last_heartbeat"]["episodes"] == 7 and record["stacks"] == []
     joined, ended = (event["text"] for event in server.wait("worker", 2))
     assert joined == "worker w0 joined" and ended == "worker w0 is gone; its job will be leased again: pretrain/0/0"
     assert decoded(server.run, server.ask("w1")[1]["job"]) == server.jobs[0]
@@ -271,34 +271,34 @@ def test_a_quarantine_is_reported_once_and_the_run_continues(server):
 
 
 def test_the_cause_of_a_quarantine_by_death_names_worker_and_stacks(server, worker):
-    alone = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
-    server.scheduler.open([alone], lambda job: ())
-    for life in range(3):
-        link = worker(f"w{life}")
-        server.ask(f"w{life}")
-        stacks = crash_reports.stacks_of(server.folder, f"w{life}")
+    single = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
+    server.scheduler.open([single], lambda job: ())
+    for death in range(3):
+        link = worker(f"w{death}")
+        server.ask(f"w{death}")
+        stacks = crash_reports.stacks_of(server.folder, f"w{death}")
         stacks.parent.mkdir(exist_ok=True)
         stacks.write_text("Fatal Python error: Segmentation fault\n")
         link.close()
-        server.wait("crash", life + 1)
+        server.wait("crash", death + 1)
     assert server.wait("quarantine")[0]["cause"] == "worker w2 died: Fatal Python error: Segmentation fault"
 
 
 def test_a_quarantine_is_released_when_workers_were_lost_with_their_nodes(server, worker):
-    alone = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
-    server.scheduler.open([alone], lambda job: ())
+    single = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
+    server.scheduler.open([single], lambda job: ())
     keep = server.jobs[1]
     server.scheduler.open([dataclasses.replace(keep, stage="adapt")], lambda job: ())
     server.worker_api.lost_with_node(["w0"])
-    for life in range(4):
-        link = worker(f"w{life}")
-        assert decoded(server.run, server.ask(f"w{life}")[1]["job"]) == alone
+    for death in range(4):
+        link = worker(f"w{death}")
+        assert decoded(server.run, server.ask(f"w{death}")[1]["job"]) == single
         link.close()
-        server.wait("crash", life + 1)
+        server.wait("crash", death + 1)
     server.wait("quarantine")
     server.worker_api.lost_with_node(["w1", "w2", "w3"])
     assert server.wait("released")[0]["text"].startswith("variation pretrain/0/0/0 is leased again")
-    assert decoded(server.run, server.ask("w4")[1]["job"]) == alone and not server.scheduler.quarantined
+    assert decoded(server.run, server.ask("w4")[1]["job"]) == single and not server.scheduler.quarantined
 
 
 def test_a_run_in_which_every_job_fails_ends_with_the_cause(server):
@@ -312,12 +312,12 @@ def test_a_run_in_which_every_job_fails_ends_with_the_cause(server):
 
 
 def test_a_phase_with_only_quarantined_variations_ends_the_run(server):
-    alone = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
-    server.scheduler.open([alone], lambda job: ())
+    single = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
+    server.scheduler.open([single], lambda job: ())
     for _ in range(3):
         assert not server.failures
         server.ask("w0")
-        server.fail("w0", alone)
+        server.fail("w0", single)
     assert server.failures[0].startswith("pretrain/0: no trajectory was stored, and 1 of")
 
 

@@ -133,13 +133,15 @@ def test_each_variation_is_labelled_once_a_run(small_run: Run, collected: Collec
     monkeypatch.setattr(examples, "self_labelled", count)
     method, data = methods.of(run), InMemoryDataset(collected.trajectories)
     pretrain, *rounds = method.phases(run)
-    assert method.label_quality(run, pretrain, data) == {}
+    assert method.label_quality(run, pretrain, data) is None
     method.data(run, pretrain, data)(np.random.default_rng(0))
     assert not labelled, "D^0 has labels of the exact solver"
     assert len(rounds) == run.icaa.rounds + 1 > 1
     shares = []
     for phase in rounds:
-        shares.append(method.label_quality(run, phase, data)["labelling"])
+        quality = method.label_quality(run, phase, data)
+        assert quality is not None
+        shares.append(quality.labelling)
         draw = method.data(run, phase, data)
         for seed in range(20):
             draw(np.random.default_rng(seed))
@@ -163,4 +165,6 @@ def test_label_quality_compares_labels_with_the_exact_answer(small_run: Run, col
         optimum.append(exact.optimum([trials[0].variation])[0])
     expected = {"agreement": agreement, "context_return": early, "label_return": late, "optimum": optimum}
     found = method.label_quality(small_run, phase, data)
-    assert found == pytest.approx({name: np.mean(values) for name, values in expected.items()} | {"labelling": 1.0})
+    assert found is not None and dataclasses.asdict(found) == pytest.approx(
+        {name: np.mean(values) for name, values in expected.items()} | {"labelling": 1.0}
+    )

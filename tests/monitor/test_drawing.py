@@ -107,3 +107,11 @@ def test_the_optimum_is_computed_for_small_valid_rooms_only():
     assert drawing.optimum("darkroom", task, {"kind": "dirichlet", "p": 3.0}) is None
     assert drawing.optimum("dmc-cheetah-run", {}, {}) is None
     assert {registry.spec(Variation(domains.task("dmc-walker-run")).task).observation} == {24}
+
+
+def test_a_broken_package_ends_no_view(install):
+    install(problems={"broken": "no_such_module:It"})
+    for problem in ("broken", "not-installed"):
+        with pytest.raises(InvalidMessageError, match="schema"):
+            drawing.of(message(problem, {}, np.zeros((4, 2))))
+        assert drawing.optimum(problem, {}, {}) is None

@@ -6,8 +6,8 @@ import numpy as np
 
 from icrl_dist.collect.behavior import BehaviorContexts
 from icrl_dist.config.ranges import Positive
-from icrl_dist.interfaces import Contexts, LabelledQueries, Problem, Reference
-from icrl_dist.rollout.policies import RandomPolicy
+from icrl_dist.interfaces import Behaviors, Contexts, LabelledQueries, Problem, Reference
+from icrl_dist.rollout.policies import DiscretePolicy, RandomPolicy
 from icrl_dist.types import NULL, Adversary, Spec, Split, Step, Task, Variation
 
 
@@ -69,14 +69,26 @@ class CorridorProblem(Problem):
         return lambda job, labelling: lambda identities, rngs: [label(job.variation(i), labelling.cells) for i in identities]
 
     @property
-    def behavior(self):
-        return lambda names, rngs, env: RandomPolicy(2)
+    def behaviors(self):
+        return Behaviors(("random", "leftward"), Walks)
 
     def contexts(self, run):
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.config))
 
     def references(self, run):
         return {"random": Reference(lambda rows, env: RandomPolicy(2))}
+
+
+class Walks(DiscretePolicy):
+    def __init__(self, names, rngs, env):
+        left = np.array([0.5 if name == "random" else 0.8 for name in names])
+        self.left_right = np.stack([left, 1 - left], axis=1)
+
+    def probabilities(self, observation):
+        return self.left_right
+
+    def observe(self, *transition):
+        pass
 
 
 def label(variation: Variation, cells: int) -> LabelledQueries:

@@ -69,6 +69,17 @@ class ContinuousProblem(Problem):
     def references(self, run: Run) -> dict[str, Reference]:
         return {"random": Reference(_random)}
 
+    @classmethod
+    def translated(cls, tables: dict[str, Any]) -> dict[str, Any]:
+        """Version 0.1.0 wrote ``bite:SHARE`` for ``drop:SHARE``, and the seed of every split into Dark Room's section."""
+        section, room = tables.get(cls.section, {}), tables.get("darkroom", {})
+        if not isinstance(section, dict) or not isinstance(room, dict):
+            return tables
+        shared = {"split_seed": room["split_seed"]} if "split_seed" in room else {}
+        texts = {name: section[name] for name in ("strength", "solved") if isinstance(section.get(name), str)}
+        renamed = {name: text.replace("bite:", "drop:") for name, text in texts.items()}
+        return {**tables, cls.section: {**shared, **section, **renamed}}
+
     def resolved(self) -> ControlConfig:
         return calibrated_strength.resolved(self.config, self.name)
 
@@ -85,12 +96,12 @@ class ContinuousProblem(Problem):
                     "return that the undisturbed expert loses",
                 )
         yield from self._own_objections(run)
-        alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
-        if run.pretrain.windows and run.pretrain.decoy_fraction and alone:
-            remedy = (
-                f"use 0, or a stream.job_tasks with at least two of the {count} tasks in every job: decoys need a second expert"
-            )
-            yield "pretrain.decoy_fraction", run.pretrain.decoy_fraction, remedy
+        single_task_job = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
+        if run.pretrain.windows and run.pretrain.decoy_fraction and single_task_job:
+            tasks = next((tasks for tasks in range(2, count + 1) if count % tasks != 1), 0)
+            other = f"stream.job_tasks = {tasks}" if tasks else "control.train_tasks = 2"
+            reason = "decoys need the expert of a second task in the same job"
+            yield "pretrain.decoy_fraction", run.pretrain.decoy_fraction, f"use 0, or {other}: {reason}"
 
     @abc.abstractmethod
     def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:

@@ -203,7 +203,7 @@ def curves(found: Sequence[Divergence], bins: int = 10) -> dict[str, Any]:
     }
 
 
-class PosteriorSuite:
+class RoomPosteriorSuite:
     """The comparison with the exact posterior, as ``Problem.posterior``."""
 
     kinds, priors = KINDS, PRIORS

@@ -14,10 +14,10 @@ from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.interfaces import (
     Batch,
+    Behaviors,
     BeliefReader,
     Contexts,
     Labeller,
-    MakeBehavior,
     MakeDrawing,
     MakePolicy,
     Policy,
@@ -37,6 +37,7 @@ from icrl_dist.types import Adversary, Job, Spec, Split, Task, Variation
 if TYPE_CHECKING:
     from icrl_dist.config.run import Run
     from icrl_dist.problems.benchmarks import Benchmarks
+    from icrl_dist.problems.parts import MakeGame, PosteriorSuite
 
 ORACLE = "oracle"
 
@@ -163,9 +164,6 @@ class DarkRoomProblem(Problem):
         of = self.config
         if not 0 < self.train_count < of.size**2:
             yield "darkroom.train_fraction", of.train_fraction, "leave at least one goal to train on and one to test on"
-        for name in run.pretrain.behaviors:
-            if name not in KINDS:
-                yield "pretrain.behaviors", run.pretrain.behaviors, f"choose from {', '.join(KINDS)}"
 
     def title(self, tasks: int) -> str:
         return f"{tasks} held-out goals of a {self.config.size}x{self.config.size} Dark Room"
@@ -183,13 +181,13 @@ class DarkRoomProblem(Problem):
         return RoomLabeller
 
     @property
-    def behavior(self) -> MakeBehavior:
+    def behaviors(self) -> Behaviors:
         """Walks through the room: one behavior policy per row."""
 
         def walks(names: Sequence[str], rngs: Sequence[np.random.Generator], env: Batch) -> Policy:
             return Walks(round(env.spec.high[0]) + 1, env.spec.horizon, names, rngs)
 
-        return walks
+        return Behaviors(KINDS, walks)
 
     @property
     def belief(self) -> Callable[[Variation], BeliefReader]:
@@ -206,14 +204,14 @@ class DarkRoomProblem(Problem):
         return picture.message_optimum
 
     @property
-    def posterior(self) -> Any:
+    def posterior(self) -> PosteriorSuite:
         """The comparison with the exact posterior."""
-        from icrl_dist.problems.darkroom.divergence import PosteriorSuite
+        from icrl_dist.problems.darkroom.divergence import RoomPosteriorSuite
 
-        return PosteriorSuite(self.config)
+        return RoomPosteriorSuite(self.config)
 
     @property
-    def game(self) -> Any:
+    def game(self) -> MakeGame:
         """The interactive room of ``icrl-dist play``."""
         from icrl_dist.problems.darkroom.game import PlayGame
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl_dist.config.random_keys import RandomKey, generator
+from icrl_dist.config.ranges import remedy
 from icrl_dist.interfaces import Batch, MakeDrawing, Reference
 from icrl_dist.problems.continuous.problem import EXPERT, ContinuousProblem, experts_of, missing_experts
 from icrl_dist.problems.dmc import domains
@@ -75,11 +76,8 @@ class DMCProblem(ContinuousProblem):
         if count not in (4, 16, 36):
             yield "control.train_tasks", count, "use 4, 16 or 36: the tasks are the center of the grid"
         elif of.test_tasks > _TASKS - count:
-            yield (
-                "control.test_tasks",
-                of.test_tasks,
-                f"use at most {_TASKS - count}: the grid has no more tasks besides the training tasks",
-            )
+            reason = "the grid has no more tasks besides the training tasks"
+            yield "control.test_tasks", of.test_tasks, remedy(1, _TASKS - count, reason)
 
     def title(self, tasks: int) -> str:
         return f"{tasks} training tasks of {self.name}"

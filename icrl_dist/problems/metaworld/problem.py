@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Float, Float32
 
+from icrl_dist.config.ranges import remedy
 from icrl_dist.experts.payloads import ScriptedContexts
 from icrl_dist.interfaces import Batch, Contexts, JobKind, MakeDrawing, Policy, Problem, Progress, Reference
 from icrl_dist.problems.continuous.problem import SCRIPTED, ContinuousProblem
@@ -91,11 +92,11 @@ class MetaWorldProblem(ContinuousProblem):
         return expert
 
     def _own_objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
-        of, most = self.config, _TASKS - self.config.test_tasks
-        if of.train_tasks > most:
-            yield "control.train_tasks", of.train_tasks, f"ML1 has {_TASKS} tasks: use 1 to {most}, or fewer test tasks"
+        of = self.config
+        if of.train_tasks + of.test_tasks > _TASKS:
+            yield self._too_many_tasks()
         if of.horizon > pick_place.HORIZON:
-            yield "control.horizon", of.horizon, f"Meta-World allows at most {pick_place.HORIZON} steps"
+            yield "control.horizon", of.horizon, remedy(0, pick_place.HORIZON, "Meta-World allows no more steps")
         if isinstance(of.strength, str) and of.disturbance == 0:
             yield (
                 "control.disturbance",
@@ -104,6 +105,15 @@ class MetaWorldProblem(ContinuousProblem):
             )
         if run.method == "experts" and of.histories == "scripted":
             yield "control.histories", of.histories, "use sac: the method experts trains SAC experts"
+
+    def _too_many_tasks(self) -> tuple[str, object, str]:
+        """The objection to the larger of the numbers of training and test tasks, whose sum is above ML1's number of tasks."""
+        counts = {f"control.{name}": getattr(self.config, name) for name in ("train_tasks", "test_tasks")}
+        more, fewer = sorted(counts, key=lambda name: -counts[name])
+        reason = f"ML1 has {_TASKS} tasks, for training and test together, and {fewer} = {counts[fewer]}"
+        if counts[fewer] < _TASKS:
+            return more, counts[more], remedy(1, _TASKS - counts[fewer], reason)
+        return more, counts[more], remedy(1, 1, f"{reason}, which must also be at most {_TASKS - 1}")
 
     @property
     def drawing(self) -> MakeDrawing:
