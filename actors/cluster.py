@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,13 +61,17 @@ class Cluster:
         self._before_run = False
         self._refreshed = -REFRESH_S
         self._certificates = ""
+        self._needed: Mapping[str, str] = {}
         self._ports: list[tuple[str, int]] = []
         self._own_facts = node_facts.facts()
         self._loopback = ""
 
-    def require(self, endpoint: str, connect: str, certificates: str) -> None:
-        """Set what a node must reach and have: the learner at ``connect`` or else ``endpoint``, and the certificates."""
-        self._certificates = certificates
+    def require(self, endpoint: str, connect: str, certificates: str, needed: Mapping[str, str]) -> None:
+        """Set what a node must reach and have: the learner at ``connect`` or else ``endpoint``, and the certificates.
+
+        ``needed``: the run's problem and method, from ``plugins.of_run``; a node must have them from the same package.
+        """
+        self._certificates, self._needed = certificates, needed
         where = endpoints.parse(connect or endpoint)
         self._loopback = connect or endpoint if where.loopback else ""
         self._ports = [(where.host, where.port)]
@@ -163,7 +167,7 @@ class Cluster:
                 refused += self._refuse(candidate, text, retry=not final, certain=final or self._tried_enough(candidate))
                 continue
             node.hostname = facts["host"]
-            if differing := node_facts.differences(self._own_facts, facts):
+            if differing := node_facts.differences(self._own_facts, facts, self._needed):
                 remedy = "run `ray up` again, so that all nodes have the same"
                 refused += self._refuse(candidate, f"{node}: {', '.join(differing)}: {remedy}", retry=False)
             elif problem := connection_problems(facts):

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from icrl_dist.config.run import ConfigError
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # else the end of Ray resets SIGTERM: a second one kills the command at once
     "RAY_worker_niceness": "0",  # with Ray's default of 15, any other process starves the workers
 }
 JOIN_S = 600.0
@@ -118,17 +119,23 @@ class Fleet:
         self._without_nodes_since: float | None = None
 
     def gather(
-        self, endpoint: str, connect: str, certificates: str, note: Callable[[str], None], stopped: Callable[[], bool]
+        self,
+        endpoint: str,
+        connect: str,
+        certificates: str,
+        note: Callable[[str], None],
+        stopped: Callable[[], bool],
+        needed: Mapping[str, str],
     ) -> None:
         """Wait until the cluster's nodes have joined and can reach the learner's endpoint; without a cluster do nothing.
 
-        ``endpoint`` and ``connect`` as in ``config.StreamConfig``.  Returns early once ``stopped()``.  After
-        ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others are enough.
+        ``endpoint`` and ``connect`` as in ``config.StreamConfig``, ``needed`` as in ``Cluster.require``.  Returns
+        early once ``stopped()``.  After ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others suffice.
         Raises ConfigError for a node that fails the check, or if there are too few after ``JOIN_S``.
         """
         if self._cluster is None:
             return
-        self._cluster.require(endpoint, connect, certificates)
+        self._cluster.require(endpoint, connect, certificates, needed)
         began, noted, reported = time.monotonic(), False, False
         enough_since: float | None = None
         with self._cluster.listening(endpoint, connect):

@@ -19,15 +19,18 @@ def start_ray(ray: Any, note: Callable[[str], None], stopped: Callable[[], bool]
     Ray's node process ends for good when one of the processes that it starts takes more than 30 s, which
     happens on a busy computer; only a new Ray helps.  ``note`` is called with a line before each new
     attempt.  Raises RuntimeError after ``TRIES`` attempts, or after a failed one if ``stopped()`` is true.
+    Raises SystemExit at SIGTERM, by the handler that Ray sets when it starts.
     """
     for number in range(1, TRIES + 1):
         before = psutil.Process().children()
         try:
             ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR, **options)
             return
-        except Exception as error:  # Ray raises no specific type
+        except (Exception, SystemExit) as error:  # Ray raises no specific type
             ray.shutdown()
             _end(set(psutil.Process().children()) - set(before))  # Ray leaves what it had already started
+            if isinstance(error, SystemExit):
+                raise
             cause = str(error).splitlines()[0] if str(error) else type(error).__name__
             text = f"Ray did not start on this machine ({cause})"
             if stopped() or number == TRIES:

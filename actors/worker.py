@@ -21,6 +21,7 @@ from actors.watchdog import Watchdog
 from actors.weight_cache import WeightCache
 from icrl_dist import version as code
 from icrl_dist.collect import kinds
+from icrl_dist.config import plugins
 from icrl_dist.config.run import parse
 from icrl_dist.interfaces import Problem
 from icrl_dist.methods import registry as methods
@@ -66,7 +67,9 @@ class Worker:
         longer than ``patience_s``.
         """
         self._link.announce(self._keys.alive(self.name))
-        _, hello = self._request("hello", version=icrl_dist.__version__, code=code.digest(), pid=os.getpid())
+        sources = {name: list(source) for name, source in plugins.sources().items()}
+        identity = {"version": icrl_dist.__version__, "code": code.digest(), "plugins": sources, "pid": os.getpid()}
+        _, hello = self._request("hello", **identity)
         run = parse(read(messages.Welcome, hello, "hello").run, "the learner's run")
         problem, method = problems.of(run), methods.of(run)
         weights = WeightCache(self._link, self._keys, method.build(problem.spec, run), run.stream.max_message_bytes)
@@ -82,10 +85,22 @@ class Worker:
                     self._stop.wait(read(messages.Wait, fields, kind).seconds)
                 else:
                     lease = read(messages.LeasedJob, fields, kind)
-                    job = wire.decode_job(lease.job, functools.partial(_read_payload, problem))
+                    job = self._decode(lease, problem)
+                    if job is None:
+                        continue
                     paused = _PausedWatchdog(weights, watchdog)
                     work = functools.partial(kinds.do, job, problem, method, paused, self.name, self._report, beliefs)
                     self._do(job, work, lease.deadline_s, sender, watchdog, run.stream.lease_s)
+
+    def _decode(self, lease: messages.LeasedJob, problem: Problem) -> Job | None:
+        """The leased job; None if it cannot be decoded, which is reported to the learner as a failure of the job."""
+        try:
+            return wire.decode_job(lease.job, functools.partial(_read_payload, problem))
+        except Exception as error:  # a problem's own payload may raise anything
+            label = "/".join(map(str, lease.name))
+            _log.exception("job %s cannot be decoded", label)
+            self._fail(lease.name, crash_reports.raised(self.name, label, error))
+            return None
 
     def _do(
         self,
@@ -115,11 +130,14 @@ class Worker:
             _log.exception("job %s failed", job.label)
             refused = isinstance(error, Refused)  # then the reason names the trajectory
             current = None if refused else next((identity for identity in job.identities() if identity not in made), None)
-            record = crash_reports.raised(self.name, job, current, error)
+            record = crash_reports.raised(self.name, job.label, error, job, current)
             _drain(sender, drain_s)
-            self._request("failed", job=list(job.name), record=record, file=self._write(record))
+            self._fail(job.name, record)
         finally:
             self._job, self._doing, self._reached = "", "", 0
+
+    def _fail(self, name: tuple[str, int, int, int], record: dict[str, Any]) -> None:
+        self._request("failed", job=list(name), record=record, file=self._write(record))
 
     def _report(self, text: str, note: bool = False, reached: int = 0) -> None:
         """Send a note to the learner at once; other texts are part of the next heartbeat."""

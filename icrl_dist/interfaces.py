@@ -110,13 +110,13 @@ Arguments: the model's final hidden state (B, D), observation, action, reward, n
 
 
 class LabelledQueries(NamedTuple):
-    """Query states of one trajectory with their labels, and action windows (zeta of eq. 6)."""
+    """Query states of one trajectory with their labels, and action windows (zeta_h of eq. 6)."""
 
     queries: Float32[np.ndarray, "Q S"]
     labels: Float32[np.ndarray, "Q A"]
-    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
+    prev_actions: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
     """Actions at the last R query states, which form action windows."""
-    gained: Float32[np.ndarray, " R"]
+    prev_rewards: Float32[np.ndarray, " R"]
     """Reward after each of these actions."""
     origin: str
     """Source of the labels: see ``Trajectory.origin``."""
@@ -214,6 +214,9 @@ class Problem(abc.ABC):
     """Packaged run file that problems of this class share, if any: ``dmc`` for ``dmc.toml`` and ``dmc-laptop.toml``."""
     free_in_forks: ClassVar[tuple[str, ...]] = ()
     """Fields of the section that a fork may change, because neither the tasks nor their split depend on them."""
+    libraries: ClassVar[tuple[str, ...]] = ()
+    """Distributions, beside numpy, whose versions decide the bytes of the environments' episodes, as in ``("mujoco",)``.
+    A cached expert is used with the same versions only."""
     job_kinds: ClassVar[Mapping[str, JobKind]] = {}
     """Kinds of jobs that only this problem has."""
     agent_names: ClassVar[Mapping[str, str]] = {}
@@ -231,11 +234,15 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def make_split(self) -> Split:
-        """Compute the training and test tasks, from the section alone; use ``split``, which keeps the result."""
+        """Compute the training and test tasks, only from the section; use ``split``, which keeps the result."""
 
     @abc.abstractmethod
     def batch(self, variations: Sequence[Variation]) -> Batch:
-        """These variation environments as one batch."""
+        """These variation environments as one batch.
+
+        What decides an environment belongs in the parameters of its task and adversary: ``icrl_dist.make``, live
+        views and the cache of experts know only these.
+        """
 
     @abc.abstractmethod
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
@@ -440,8 +447,8 @@ Draw = Callable[[np.random.Generator], Any]
 """Draws one training batch; the same generator state gives the same batch."""
 
 
-class Weighted(Protocol):
-    """Source of models by policy version."""
+class WeightSource(Protocol):
+    """Gives the model of a policy version, for example from a worker's weight cache."""
 
     def at(self, version: int) -> tuple[torch.nn.Module, str]:
         """The model of exactly this policy version, and its weights digest.  Blocks until it is available."""

@@ -207,10 +207,10 @@ class Trajectory:
     """Query states s_query; none (Q = 0) if there are no labels."""
     labels: Float32[np.ndarray, "Q A"]
     """A distribution over discrete actions at each query state; for vector actions the right action."""
-    taken: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
-    """Actions at the last R query states, which form action windows (zeta of eq. 6), one window after
-    another; the first Q - R query states belong to no window."""
-    gained: Float32[np.ndarray, " R"]
+    prev_actions: Int16[np.ndarray, " R"] | Float32[np.ndarray, "R A"]
+    """Actions at the last R query states, which form action windows (zeta_h of eq. 6), one window after another.
+    At a state of a window the model reads those before it.  The first Q - R query states belong to no window."""
+    prev_rewards: Float32[np.ndarray, " R"]
     """Reward after each of these actions."""
     origin: str
     """Source of the labels: ``optimal``, ``heuristic``, ``expert`` or ``none``."""
@@ -231,11 +231,11 @@ ARRAYS: dict[str, tuple[str, int]] = {
     "adversary": ("<i2", 1),
     "queries": ("<f4", 2),
     "labels": ("<f4", 2),
-    "taken": ("<i2", 1),
-    "gained": ("<f4", 1),
+    "prev_actions": ("<i2", 1),
+    "prev_rewards": ("<f4", 1),
 }
 """A trajectory's arrays with discrete actions: dtype and number of dimensions."""
-VECTORS: dict[str, tuple[str, int]] = ARRAYS | dict.fromkeys(("actions", "adversary", "taken"), ("<f4", 2))
+VECTORS: dict[str, tuple[str, int]] = ARRAYS | dict.fromkeys(("actions", "adversary", "prev_actions"), ("<f4", 2))
 """The same with vector actions."""
 
 

@@ -1,9 +1,10 @@
-"""SHA-256 of the package's code, installed or in a wheel: it identifies the code that a process runs."""
+"""SHA-256 of code, installed or in a wheel: it identifies the code that a process runs."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,11 +22,30 @@ def digest() -> str:
 
 
 @functools.cache
-def digest_of(parts: tuple[str, ...]) -> str:
-    """SHA-256 of some modules in ``icrl_dist``, hex.  ``parts``: files, or folders (ending in ``/``) with all their files."""
-    root = Path(__file__).parent
-    files = [found for part in parts for found in ((root / part).rglob("*.py") if part.endswith("/") else [root / part])]
-    return _digest((found.relative_to(root).as_posix(), found.read_bytes()) for found in files)
+def digest_of(module: str) -> str:
+    """SHA-256 of the source files of the top-level package that holds a module, hex; of the file alone for a loose module.
+
+    Of packages without ``__init__.py``, which several distributions may share, the next package below counts.
+    Empty if there is no such module.  Nothing of the package is executed.
+    """
+    names = module.split(".")
+    try:
+        specs = (importlib.util.find_spec(".".join(names[: count + 1])) for count in range(len(names)))
+        spec = next((one for one in specs if one is None or one.origin is not None), None)
+    except (ImportError, ValueError):
+        return ""
+    if spec is None or spec.origin is None:
+        return ""
+    if spec.submodule_search_locations is None:
+        file = Path(spec.origin)
+        return _digest([(file.name, file.read_bytes())])
+    files = [
+        (file.relative_to(folder).as_posix(), file.read_bytes())
+        for folder in spec.submodule_search_locations
+        for suffix in _SUFFIXES
+        for file in Path(folder).rglob(f"*{suffix}")
+    ]
+    return _digest(files)
 
 
 def digest_of_wheel(wheel: Path) -> str:

@@ -46,7 +46,7 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, weights_digest: str) -> 
         kind = "discrete" if spec.discrete else "continuous"
         raise Rejected("spec", f"{identity}: actions have shape {trajectory.actions.shape}, this run has {kind} actions")
     low, high = (0, spec.actions - 1) if spec.discrete else (-1, 1)
-    for chosen in (trajectory.actions, trajectory.taken, *(() if spec.discrete else (trajectory.labels,))):
+    for chosen in (trajectory.actions, trajectory.prev_actions, *(() if spec.discrete else (trajectory.labels,))):
         if len(chosen) and (chosen.min() < low or chosen.max() > high):
             raise Rejected("spec", f"{identity}: an action lies outside {low}..{high}")
     if not all(map(_finite, trajectory.arrays().values())):

@@ -229,13 +229,12 @@ class LeaseScheduler:
         return [state.job] if state.missing and not state.worker else []
 
     def worker_back(self, worker: str) -> None:
-        """Record that a lost worker has answered again: it was disconnected, not dead, and still holds its job.
+        """Record that a lost worker has answered again: it was disconnected, not dead.
 
-        Its death is no longer counted, unless the job was split or quarantined because of it.
+        Its death is taken back, as ``lost_with_node`` does.  It still holds its job, unless the job was split.
         """
-        state = self._deaths.pop(worker, None)
+        state = self._take_back_death(worker)
         if state is not None and self._is_current(state):
-            state.failures -= 1
             state.worker = state.worker or worker
             self._held[worker] = state
 
@@ -246,9 +245,7 @@ class LeaseScheduler:
         was split and from a variation that was quarantined because of it.
         """
         self._lost_with_node.add(worker)
-        state = self._deaths.pop(worker, None)
-        for one in (state.parts or [state]) if state else ():
-            self._take_back_failure(one)
+        self._take_back_death(worker)
 
     def job_failed(self, worker: str, name: tuple[str, int, int, int], cause: str) -> None:
         """Record that the worker's job raised; a report about a job that it does not hold is ignored."""
@@ -288,6 +285,13 @@ class LeaseScheduler:
         state.quarantined, state.missing = state.missing, set()
         del phase.unfinished[state.job.name]
         self.quarantined[state.job.name] = cause
+
+    def _take_back_death(self, worker: str) -> _JobState | None:
+        """Count the worker's death no longer; returns the job that it counted for, None if it counted for none."""
+        state = self._deaths.pop(worker, None)
+        for one in (state.parts or [state]) if state else ():
+            self._take_back_failure(one)
+        return state
 
     def _take_back_failure(self, state: _JobState) -> None:
         state.failures = max(0, state.failures - 1)

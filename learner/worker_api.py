@@ -10,6 +10,7 @@ from typing import Any
 
 import icrl_dist
 from icrl_dist import version
+from icrl_dist.config import plugins
 from icrl_dist.config.run import Run, dumps
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.dispatch import Dispatcher
@@ -164,7 +165,7 @@ class WorkerAPI:
             "time": time.time(),
             "job": job.label if job else "",
             "seed": self._run.seed,
-            "last_said": self.counters.get(worker, {}),
+            "last_heartbeat": self.counters.get(worker, {}),
             "stacks": stacks,
         }
         cause = stacks[0] if stacks else "no stacks were written: it was killed or disconnected"
@@ -238,14 +239,7 @@ class WorkerAPI:
         worker = request.worker
         match request:
             case messages.Hello():
-                if request.version != icrl_dist.__version__:
-                    theirs, ours = request.version, icrl_dist.__version__
-                    raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
-                if request.code != version.digest():
-                    theirs, ours = request.code[:8], version.digest()[:8]
-                    raise ValueError(
-                        f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code"
-                    )
+                self._require_same_code(request)
                 return wire.encode_message("hello", run=dumps(self._run))
             case messages.Progress():
                 self._update_counters(fields)
@@ -256,6 +250,26 @@ class WorkerAPI:
                 self._report({"event": "note", "text": f"worker {worker}: {request.text[:200]}"})
         return wire.encode_message("noted")
 
+    def _require_same_code(self, hello: messages.Hello) -> None:
+        """Raises ValueError, with the remedy, for a worker with other code than the learner's.
+
+        Of other packages only those with the run's problem and method count.
+        """
+        worker = hello.worker
+        if hello.version != icrl_dist.__version__:
+            theirs, ours = hello.version, icrl_dist.__version__
+            raise ValueError(f"worker {worker} runs icrl-dist {theirs}, the learner {ours}: install the same version")
+        if hello.code != version.digest():
+            theirs, ours = hello.code[:8], version.digest()[:8]
+            raise ValueError(f"worker {worker} runs icrl-dist's code {theirs}, the learner {ours}: install the same code")
+        for name, what in plugins.of_run(self._run.problem, self._run.method).items():
+            here, there = plugins.sources().get(name), hello.plugins.get(name)
+            if here != there:
+                theirs, ours = plugins.text(there), plugins.text(here)
+                raise ValueError(
+                    f"{what}: worker {worker} has {theirs}, the learner has {ours}: install the same version on every node"
+                )
+
     def _lease(self, worker: str) -> bytes:
         if self._finished.is_set():
             return wire.encode_message("stop")
@@ -265,7 +279,8 @@ class WorkerAPI:
                 self._jobs.pop(worker, None)
                 return wire.encode_message("wait", seconds=0.1)
             self._jobs[worker] = lease.job
-        return wire.encode_message("job", job=wire.encode_job(lease.job), deadline_s=lease.deadline_s)
+        job = lease.job
+        return wire.encode_message("job", name=list(job.name), job=wire.encode_job(job), deadline_s=lease.deadline_s)
 
     def _failed(self, worker: str, name: tuple[str, int, int, int], record: dict[str, Any], file: str) -> None:
         with self._lock:

@@ -9,7 +9,7 @@ import torch
 
 from icrl_dist.collect import kinds
 from icrl_dist.config.run import Run, make_run
-from icrl_dist.interfaces import Method, Phase, Progress, VariationKey, Weighted, no_progress
+from icrl_dist.interfaces import Method, Phase, Progress, VariationKey, WeightSource, no_progress
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import registry as problems
@@ -63,13 +63,13 @@ def decoded(run: Run, data: bytes) -> Job:
 
 
 def do(
-    run: Run, job: Job, weights: Weighted | None = None, worker: str = "w", progress: Progress = no_progress
+    run: Run, job: Job, weights: WeightSource | None = None, worker: str = "w", progress: Progress = no_progress
 ) -> list[Trajectory]:
     """All trajectories of a job."""
     return list(kinds.do(job, problems.of(run), methods.of(run), weights or NoWeights(), worker, progress))
 
 
-def collect(run: Run, phase: Phase, weights: Weighted | None = None, method: Method | None = None) -> list[Trajectory]:
+def collect(run: Run, phase: Phase, weights: WeightSource | None = None, method: Method | None = None) -> list[Trajectory]:
     """All trajectories of a phase."""
     jobs = (method or methods.of(run)).ask(run, phase)
     return [trajectory for job in jobs for trajectory in do(run, job, weights)]

@@ -28,8 +28,8 @@ def trajectory(horizon: int = 3, **changes: Any) -> Trajectory:
         "adversary": np.full(horizon, -1, np.int16),
         "queries": np.zeros((0, 2), np.float32),
         "labels": np.zeros((0, 5), np.float32),
-        "taken": np.zeros(0, np.int16),
-        "gained": np.zeros(0, np.float32),
+        "prev_actions": np.zeros(0, np.int16),
+        "prev_rewards": np.zeros(0, np.float32),
         "origin": "none",
     }
     return Trajectory(**{**values, **changes})

@@ -1,4 +1,4 @@
-"""beartype and jaxtyping at every call, lenient where an annotation speaks to mypy alone.
+"""beartype and jaxtyping at every call, lenient where an annotation is only for mypy.
 
 jaxtyping's own decorator checks the arguments of every function twice and binds them to names
 first, whether or not there are arrays among them: most of the time of a whole run in a test.
@@ -51,7 +51,7 @@ def _check(function: FunctionType) -> Callable[..., Any]:
 
 
 def _resolved(hint: Any, names: dict[str, Any]) -> Any:
-    """What the annotation stands for; Any if it is imported, or made, for mypy alone."""
+    """What the annotation stands for; Any if it is imported, or made, only for mypy."""
     try:
         found = typing.get_type_hints(SimpleNamespace(__annotations__={"it": hint}), names, include_extras=True)["it"]
         is_bearable(None, found, conf=CONF)

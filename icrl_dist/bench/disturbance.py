@@ -26,7 +26,7 @@ from icrl_dist.types import Adversary, Task, Variation
 
 WEAK = 0.02
 """Default adversaries are weak if the mean relative loss of return under them is below this."""
-EARNS = 0.01
+MIN_REWARD = 0.01
 """Mean reward per step that an expert needs without disturbance: below it, a relative loss means nothing."""
 _EPISODES, _ADVERSARIES = 1, 2  # spawn keys of the generators
 
@@ -199,27 +199,27 @@ def _row(kind: str, setting: Setting, make: Make, sizes: DisturbanceSizes, confi
 
 
 def verdict(found: dict[str, float | None], horizon: int) -> dict[str, Any]:
-    """``weak``, ``untaught`` (the return is too small for a relative loss to mean anything) and a sentence, ``said``."""
+    """``weak``, ``low_return`` (too low a return for a relative loss to mean anything) and a sentence, ``note``."""
     base, share = found["undisturbed"], found["lost_mean"]
-    if share is None or base is None or base < EARNS * horizon:
-        said = f"the expert's return is {base or 0.0:.2f} in {horizon} steps, too small to measure a loss: train it longer"
-        return {"weak": False, "untaught": True, "said": said}
+    if share is None or base is None or base < MIN_REWARD * horizon:
+        note = f"the expert's return is {base or 0.0:.2f} in {horizon} steps, too small to measure a loss: train it longer"
+        return {"weak": False, "low_return": True, "note": note}
     if share < WEAK:
-        said = f"weak: the default adversaries reduce the return by {share:.1%} on average, less than {WEAK:.0%}"
+        note = f"weak: the default adversaries reduce the return by {share:.1%} on average, less than {WEAK:.0%}"
         error = found["lost_error"]
         if error is None or share + 2 * error >= WEAK:
-            said += "; with so few episodes the loss may be larger"
-        return {"weak": True, "untaught": False, "said": said}
-    return {"weak": False, "untaught": False, "said": ""}
+            note += "; with so few episodes the loss may be larger"
+        return {"weak": True, "low_return": False, "note": note}
+    return {"weak": False, "low_return": False, "note": ""}
 
 
 def describe_row(row: dict[str, Any]) -> str:
     """A row of the table."""
-    disturbance = f"{row['metres'] * 100:g} cm" if "metres" in row else row["forces"]
+    disturbance = f"{row['meters'] * 100:g} cm" if "meters" in row else row["forces"]
     error = "" if row["lost_error"] is None else f" +-{row['lost_error']:.1%}"
     shares = ("-", "-") if row["lost_mean"] is None else (f"{row['lost_mean']:.1%}{error}", f"{row['lost_worst']:.1%}")
     cells = f"{row['undisturbed']:>12.1f}{row['mean']:>9.1f}{row['worst']:>9.1f}{shares[0]:>16}{shares[1]:>12}"
-    return f"{row['problem']:<22}{disturbance:<7}{cells}  {row['said']}".rstrip()
+    return f"{row['problem']:<22}{disturbance:<7}{cells}  {row['note']}".rstrip()
 
 
 def describe(result: dict[str, Any]) -> str:

@@ -177,7 +177,7 @@ def _expert(kind: str, config: SACConfig, report: Report) -> Make:
 
 def _store(row: dict[str, Any]) -> None:
     """Store the row in the user's table; it replaces an earlier row for the same disturbance and drop."""
-    key = ("problem", "forces", "metres", "drop")
+    key = ("problem", "forces", "meters", "drop")
     others = [old for old in calibrated_strength.own() if any(old[name] != row[name] for name in key)]
     file = calibrated_strength.own_file()
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -186,7 +186,7 @@ def _store(row: dict[str, Any]) -> None:
 
 def describe_row(row: dict[str, Any]) -> str:
     """A row of the table."""
-    disturbance = f"{row['metres'] * 100:g} cm" if row["metres"] else "/".join(row["forces"])
+    disturbance = f"{row['meters'] * 100:g} cm" if row["meters"] else "/".join(row["forces"])
     error = "" if row["lost_error"] is None else f" +-{row['lost_error']:.1%}"
     note = "" if row["reached"] else f"  less than {row['drop']:.0%} even at the largest strength tried: not stored"
     return (

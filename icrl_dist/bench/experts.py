@@ -77,7 +77,7 @@ def run(quick: bool = False, paper: ExpertSizes = PAPER, small: ExpertSizes = SM
 
 def compare(sizes: ExpertSizes, matmul_dtype: MatmulDtype, turns: int) -> tuple[float, float]:
     """Updates per CPU-second per expert, ours and those of stable-baselines3: medians over ``turns`` after a warm-up turn."""
-    ours, theirs = lockstep(sizes, matmul_dtype), alone(sizes.config)
+    ours, theirs = lockstep(sizes, matmul_dtype), single(sizes.config)
     found = []
     for _ in range(turns + 1):
         found.append((sizes.experts * sizes.ours / _seconds(ours, sizes.ours), sizes.theirs / _seconds(theirs, sizes.theirs)))
@@ -107,7 +107,7 @@ def lockstep(sizes: ExpertSizes, matmul_dtype: MatmulDtype, device: str = "cpu",
     return update
 
 
-def alone(config: SACConfig) -> Callable[[int], None]:
+def single(config: SACConfig) -> Callable[[int], None]:
     """A function that makes ``count`` updates of an expert of stable-baselines3, in one call of its ``train``."""
     model = blank(SPEC, config)
     model.set_logger(configure(None, []))

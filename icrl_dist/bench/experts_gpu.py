@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from icrl_dist.bench.experts import REPLAY, ExpertSizes, alone, lockstep
+from icrl_dist.bench.experts import REPLAY, ExpertSizes, lockstep, single
 from icrl_dist.config.run import ConfigError, load
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.batched import MatmulDtype, SACBatch, pick, train
@@ -73,7 +73,7 @@ def run(quick: bool = False, steps: int | None = None, device: str = "cuda", siz
 
 def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[str, Any], list[str]]:
     """Updates/s of all experts, of each kind, and of stable-baselines3 (medians over ``turns``); and reasons for a failure."""
-    theirs, their_rates, rates, reasons = alone(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
+    theirs, their_rates, rates, reasons = single(sizes.config), [], dict.fromkeys(_KINDS, 0.0), []
     theirs(sizes.theirs)  # warms the caches
     for kind, (matmul_dtype, graph) in _KINDS.items():
         try:

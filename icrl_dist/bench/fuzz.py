@@ -75,8 +75,8 @@ def targets() -> dict[str, Target]:
         return kinds.read_payload(kind, problem, data)
 
     message = wire.encode_message("hello", a=[1, {"b": None}], c=b"x", d=1.5, e="worker", f=-(2**40))
-    steps, queries, taken = (len(array) for array in (trajectory.actions, trajectory.queries, trajectory.taken))
-    shapes = {"actions": (steps, 4), "adversary": (steps, 2), "labels": (queries, 4), "taken": (taken, 4)}
+    steps, queries, window_steps = (len(array) for array in (trajectory.actions, trajectory.queries, trajectory.prev_actions))
+    shapes = {"actions": (steps, 4), "adversary": (steps, 2), "labels": (queries, 4), "prev_actions": (window_steps, 4)}
     arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     vectors = dataclasses.replace(trajectory, **arrays)
     encoded = wire.encode_trajectory(trajectory)

@@ -53,8 +53,8 @@ def random_trajectories(job: Job, problem: Problem) -> list[Trajectory]:
                     adversary=ran.adversary[row],
                     queries=ran.observations[row][rng.integers(0, len(ran.actions[row]), count)],
                     labels=rng.uniform(-1, 1, (count, actions)).astype(np.float32),
-                    taken=np.zeros((labelled, actions), np.float32),
-                    gained=np.zeros(labelled, np.float32),
+                    prev_actions=np.zeros((labelled, actions), np.float32),
+                    prev_rewards=np.zeros(labelled, np.float32),
                     origin="expert",
                 )
             )

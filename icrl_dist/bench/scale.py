@@ -101,7 +101,7 @@ def work(endpoint: str, first: int, count: int, seconds: float) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-    print(json.dumps({"taken": latencies, "resent": sum(resent)}), flush=True)
+    print(json.dumps({"latencies": latencies, "resent": sum(resent)}), flush=True)
 
 
 def run(folder: Path = Path("runs"), seconds: float = 40.0, workers: Sequence[int] = WORKERS) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def _measure(folder: Path, count: int, seconds: float) -> dict[str, Any]:
         ingest.close()
         if not failures.empty():
             raise failures.get()
-    latencies = sorted(itertools.chain.from_iterable(report["taken"] for report in reports))
+    latencies = sorted(itertools.chain.from_iterable(report["latencies"] for report in reports))
     return {
         "workers": count,
         "ingest_per_s": round(len(stored) / (stored[-1] - began), 1),

@@ -49,8 +49,8 @@ def example(trial: int = 0) -> Trajectory:
         adversary=np.full(steps, -1, np.int16),
         queries=rng.normal(size=(queries, observation)).astype(np.float32),
         labels=rng.random((queries, actions), np.float32),
-        taken=np.zeros(0, np.int16),
-        gained=np.zeros(0, np.float32),
+        prev_actions=np.zeros(0, np.int16),
+        prev_rewards=np.zeros(0, np.float32),
         origin="heuristic",
     )
 
@@ -93,7 +93,7 @@ def work(endpoint: str) -> None:
 def run(seconds: float = 15.0, pairs: int = 5) -> dict[str, Any]:
     """Measure for ``seconds`` in total, alternating; rates and ratios are medians over turns.
 
-    Ray is measured twice: with results taken in the order of the calls, its fastest way with one actor
+    Ray is measured twice: with results fetched in the order of the calls, its fastest way with one actor
     (``ray_per_s``), and as they arrive by ``ray.wait`` (``ray_wait_per_s``), which a learner with many
     actors needs and our stream always does.
     """

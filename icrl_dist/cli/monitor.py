@@ -145,7 +145,7 @@ def _is_active(folder: Path, console: Console) -> bool:
 def _learner_of(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, str]:
     """The endpoint of the learner, the folder of certificates for it, and the name of its run.
 
-    The name is empty with ``--connect``, because the endpoint alone identifies the run.  Raises
+    The name is empty with ``--connect``, because the endpoint identifies the run.  Raises
     ConfigError if no run is active, or if a TLS endpoint has no certificates.
     """
     from icrl_dist.storage.files import held

@@ -11,7 +11,7 @@ import numpy as np
 from icrl_dist.collect.trajectories import trajectory, unlabelled
 from icrl_dist.config.ranges import Positive
 from icrl_dist.config.sections import ContextConfig, Deployment
-from icrl_dist.interfaces import Method, Policy, Problem, Weighted
+from icrl_dist.interfaces import Method, Policy, Problem, WeightSource
 from icrl_dist.rollout.episode import deploy_online
 from icrl_dist.types import Identity, Job, Payload, Trajectory, Variation
 
@@ -41,7 +41,7 @@ class LabelledRollouts(Rollouts):
 
 
 def rollouts(
-    job: Job, problem: Problem, method: Method, weights: Weighted, worker: str, look: Look | None = None
+    job: Job, problem: Problem, method: Method, weights: WeightSource, worker: str, look: Look | None = None
 ) -> Iterator[Trajectory]:
     """N + 1 trials in each variation, all by T^j of the version that the job names.
 

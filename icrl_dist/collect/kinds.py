@@ -11,7 +11,7 @@ from icrl_dist.collect.adapt import LabelledRollouts, Look, Rollouts, rollouts
 from icrl_dist.collect.behavior import BehaviorContexts, behavior_contexts
 from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.experts.train import train_expert
-from icrl_dist.interfaces import JobKind, Method, Problem, Progress, Weighted, no_progress
+from icrl_dist.interfaces import JobKind, Method, Problem, Progress, WeightSource, no_progress
 from icrl_dist.stream import schema
 from icrl_dist.stream.excerpts import nearest
 from icrl_dist.types import Job, Payload, Trajectory
@@ -42,7 +42,7 @@ def do(
     job: Job,
     problem: Problem,
     method: Method,
-    weights: Weighted,
+    weights: WeightSource,
     worker: str,
     progress: Progress = no_progress,
     look: Look | None = None,

@@ -29,6 +29,6 @@ def trajectory(
 
 def unlabelled(spec: Spec) -> LabelledQueries:
     """No query states and no labels."""
-    taken = np.zeros(0, np.int16) if spec.discrete else np.zeros((0, spec.actions), np.float32)
+    prev_actions = np.zeros(0, np.int16) if spec.discrete else np.zeros((0, spec.actions), np.float32)
     zeros = np.zeros((0, spec.observation), np.float32), np.zeros((0, spec.actions), np.float32)
-    return LabelledQueries(*zeros, taken, np.zeros(0, np.float32), "none")
+    return LabelledQueries(*zeros, prev_actions, np.zeros(0, np.float32), "none")

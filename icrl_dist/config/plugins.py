@@ -12,10 +12,11 @@ import contextlib
 import dataclasses
 import functools
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import metadata
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, get_args
 
+from icrl_dist import version
 from icrl_dist.config.toml import ConfigError, nearest
 from icrl_dist.stream import schema
 
@@ -85,6 +86,40 @@ def importable(group: Group) -> dict[str, Any]:
         with contextlib.suppress(ConfigError):
             found[name] = find(group, name)
     return found
+
+
+class Source(NamedTuple):
+    """The distribution that has a problem or a method of another package, and the digest of its code."""
+
+    distribution: str
+    version: str
+    code: str
+    """``version.digest_of`` its module."""
+
+
+@functools.cache
+def sources() -> dict[str, Source]:
+    """The source of every installed problem and method of another package, by ``problems/NAME`` or ``methods/NAME``.
+
+    Problems and methods of this package are left out.  No package is imported, so one that is broken is here too.
+    """
+    found = {}
+    for group in get_args(Group):
+        for name, entry in _entries(group).items():
+            if entry.module.partition(".")[0] not in version.PACKAGES:
+                distribution = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
+                found[f"{group}/{name}"] = Source(*distribution, version.digest_of(entry.module))
+    return found
+
+
+def of_run(problem: str, method: str) -> dict[str, str]:
+    """The names in ``sources`` that a run of this problem and method may have, with their text for messages."""
+    return {f"problems/{problem}": f"problem {problem!r}", f"methods/{method}": f"method {method!r}"}
+
+
+def text(source: Sequence[str] | None) -> str:
+    """A source, or its fields, for messages; None: the problem or method is not one of another package."""
+    return f"{source[0]} {source[1]} with code {source[2][:8]}" if source else "no other package with it"
 
 
 @functools.cache

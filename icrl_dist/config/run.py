@@ -157,8 +157,8 @@ def _packaged() -> dict[str, tuple[str, str]]:
         for size in ("", "-laptop")
         if template and f"{template}{size}" in files
     }
-    alone = files - {file for file, _ in shared.values()} - {"__init__.py", "__pycache__"}
-    return dict(sorted({**shared, **{name: (name, "") for name in alone}}.items()))
+    unshared = files - {file for file, _ in shared.values()} - {"__init__.py", "__pycache__"}
+    return dict(sorted({**shared, **{name: (name, "") for name in unshared}}.items()))
 
 
 def parse(text: str, source: str) -> Run:

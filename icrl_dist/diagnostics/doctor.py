@@ -248,9 +248,9 @@ def _listening(
         try:
             port = stack.enter_context(node_facts.listening(parsed.host, parsed.port))
         except OSError as error:
-            taken = error.errno == errno.EADDRINUSE  # then nodes can try to connect to the present owner
-            remedy = "wait for the active run, or choose a free port" if taken else "choose an address of the head"
-            check = Check(name, None if taken else False, f"{endpoint}: {error.strerror or error}", remedy)
-            yield (parsed.host, parsed.port) if taken else None, (check,)
+            in_use = error.errno == errno.EADDRINUSE  # then nodes can try to connect to the present owner
+            remedy = "wait for the active run, or choose a free port" if in_use else "choose an address of the head"
+            check = Check(name, None if in_use else False, f"{endpoint}: {error.strerror or error}", remedy)
+            yield (parsed.host, parsed.port) if in_use else None, (check,)
         else:
             yield (parsed.host, port), ()

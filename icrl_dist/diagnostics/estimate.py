@@ -1,7 +1,7 @@
 """Estimate of a run's time, network and disk on N nodes, computed from measured rates.
 
 In each phase workers collect whole jobs, their trajectories pass the learner's network and ingest,
-and then the learner fits alone.
+and then only the learner works: it fits.
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ PARTS = {
     "jobs": "fewer jobs than workers: use smaller jobs (stream.job_tasks)",
     "ingest": "storing trajectories on the learner: a faster disk and core help, more nodes do not",
     "network": "the learner's network: more bandwidth helps, more nodes do not",
-    "fit": "the learner alone: a GPU or a faster head helps, more nodes do not",
-    "evaluation": "the learner alone, at the end: reduce evaluate.episodes or evaluate.seeds",
+    "fit": "only the learner works: a GPU or a faster head helps, more nodes do not",
+    "evaluation": "only the learner works, at the end: reduce evaluate.episodes or evaluate.seeds",
     "start": "starting processes and imports: the run is too short for a cluster",
 }
 """The parts of a run's time, and what reduces each."""

@@ -10,13 +10,14 @@ import shutil
 import socket
 import ssl
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import icrl_dist
+from icrl_dist.config import plugins
 from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.version import digest as code_digest
@@ -36,6 +37,8 @@ class Facts:
     code: str
     """``version.digest()`` of its code."""
     versions: dict[str, str]
+    plugins: dict[str, list[str]]
+    """Distribution, version and code digest of problems and methods of other packages: ``plugins.sources``."""
     time: float
     """Its clock, in seconds since 1970."""
     cores: int
@@ -65,6 +68,7 @@ def facts(certificates: str = "", ports: Sequence[tuple[str, int]] = ()) -> dict
         version=icrl_dist.__version__,
         code=code_digest(),
         versions={name: _version(name) for name in VERSIONS},
+        plugins={name: list(source) for name, source in plugins.sources().items()},
         time=time.time(),
         cores=len(os.sched_getaffinity(0)),
         shared_memory=shutil.disk_usage(shm).free if shm.is_dir() else 0,
@@ -109,8 +113,11 @@ def listening(host: str, port: int) -> Iterator[int]:
         yield int(server.getsockname()[1])
 
 
-def differences(here: dict[str, Any], there: dict[str, Any]) -> list[str]:
-    """Differences of another node from this machine that a run does not allow, such as ``torch 2.8 there, 2.9 here``."""
+def differences(here: dict[str, Any], there: dict[str, Any], needed: Mapping[str, str] | None = None) -> list[str]:
+    """Differences of another node from this machine that a run does not allow, such as ``torch 2.8 there, 2.9 here``.
+
+    ``needed``: the problem and the method of the run, from ``plugins.of_run``; other packages may differ in others.
+    """
     found = []
     minor = [str(facts["python"]).rsplit(".", 1)[0] for facts in (here, there)]
     if minor[0] != minor[1]:
@@ -123,4 +130,8 @@ def differences(here: dict[str, Any], there: dict[str, Any]) -> list[str]:
         theirs = there["versions"].get(name, "none")
         if theirs != mine:
             found.append(f"{name} {theirs} there, {mine} here")
+    for name, what in (needed or {}).items():
+        ours, other = here["plugins"].get(name), there.get("plugins", {}).get(name)
+        if ours != other:
+            found.append(f"{what}: {plugins.text(other)} there, {plugins.text(ours)} here")
     return found

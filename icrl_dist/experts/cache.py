@@ -1,9 +1,13 @@
-"""Histories of SAC experts, and their cache: a key holds everything that determines a history, so none is trained twice."""
+"""Histories of SAC experts, and their cache: a key holds everything that determines a history, so none is trained twice.
+
+The code of this package counts by ``EXPERTS_VERSION`` alone (docs/decisions/084-expert-cache-key.md).
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import logging
 from importlib import metadata
 from pathlib import Path
@@ -13,14 +17,20 @@ import msgpack
 import numpy as np
 from jaxtyping import Float32
 
-from icrl_dist import version
+from icrl_dist.config import plugins
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import wire
+from icrl_dist.stream.schema import as_data
 from icrl_dist.types import Variation
 
 _log = logging.getLogger(__name__)
+
+EXPERTS_VERSION = 1
+"""Version of the code that decides the bytes of a history.  Raise it by 1 with every change after which the same settings
+give other bytes: of the training, the draws, the recorded episodes, or the environments of a problem of this package.
+Histories of another version are not found in a cache and are trained again."""
 
 RECORDED_EPISODES = 200
 """Training episodes in a history, evenly spaced; all of them if there are fewer, or if a job needs more than this."""
@@ -30,8 +40,14 @@ WINDOW_EPISODES = 8
 Trainer = Literal["lockstep", "stable-baselines3", "lockstep, cuda"]
 """The implementation that trains an expert, and its device: their roundoff differs, so their experts are not the same."""
 
-_VERSIONS = ("dm-control", "metaworld", "mujoco", "stable-baselines3", "torch")
-_CODE = ("experts/", "problems/", "rollout/recorder.py", "config/sac.py", "training/optimizers.py")
+_LIBRARIES: dict[Trainer, tuple[str, ...]] = {
+    "lockstep": ("numpy", "torch"),
+    "lockstep, cuda": ("numpy", "torch"),
+    "stable-baselines3": ("numpy", "torch", "stable-baselines3"),
+}
+"""The distributions that decide the bytes of a training; those of the environments are ``Problem.libraries``."""
+_NOT_IN_TRAINING = frozenset({"cache"})
+"""Settings of the section ``[sac]`` that do not change a history."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,11 +63,11 @@ class History:
     adversary: Float32[np.ndarray, "E H F"]
     labels: Float32[np.ndarray, "E H A"]
     """The right action at each of the first H states: the expert's mean action, or that of the scripted policy."""
-    led_actions: Float32[np.ndarray, "G H A"]
+    window_actions: Float32[np.ndarray, "G H A"]
     """G episodes after training from which action windows (zeta of eq. 6) are cut: the expert acts by its mean actions."""
-    led_observations: Float32[np.ndarray, "G H+1 S"]
-    led_rewards: Float32[np.ndarray, "G H"]
-    led_labels: Float32[np.ndarray, "G H A"]
+    window_observations: Float32[np.ndarray, "G H+1 S"]
+    window_rewards: Float32[np.ndarray, "G H"]
+    window_labels: Float32[np.ndarray, "G H A"]
     """The right action at each of their first H states."""
     actor: Float32[np.ndarray, " P"]
     """The expert's parameters, in the layout of ``experts.sac.stacked.Shape``."""
@@ -78,12 +94,27 @@ def recorded_episodes(horizon: int, config: SACConfig, trials: int = 1) -> int:
 
 
 def key(variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1) -> str:
-    """Cache key of a history: the SHA-256 of all that determines it, with library versions and the code's digest."""
-    versions = [[name, metadata.version(name)] for name in _VERSIONS]
-    numbers = [[f"sac.{item.name}", getattr(config, item.name)] for item in dataclasses.fields(config) if item.name != "cache"]
-    fields = [wire.from_variation(variation), numbers, seed, trainer, versions, version.digest_of(_CODE)]
-    fields += [recorded_episodes(horizon, config, trials), WINDOW_EPISODES]
-    return hashlib.sha256(msgpack.packb(fields)).hexdigest()
+    """Cache key of a history: the SHA-256 of all that determines it, as JSON with sorted keys.
+
+    Floats have their shortest exact form.  No name of a file, module or class is part of it.
+    """
+    task, adversary = variation.task, variation.adversary
+    libraries = {*_LIBRARIES[trainer], *plugins.find("problems", task.kind).libraries}
+    source = plugins.sources().get(f"problems/{task.kind}")
+    parts = {
+        "experts_version": EXPERTS_VERSION,
+        "task": [task.kind, dict(task.params)],
+        "adversary": [adversary.kind, dict(adversary.params)],
+        "sac": {name: value for name, value in as_data(config).items() if name not in _NOT_IN_TRAINING},
+        "seed": seed,
+        "trainer": trainer,
+        "horizon": horizon,
+        "recorded_episodes": recorded_episodes(horizon, config, trials),
+        "window_episodes": WINDOW_EPISODES,
+        "libraries": {name: metadata.version(name) for name in libraries},
+        "plugin": [source.distribution, source.version] if source else None,
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def load(variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1) -> History | None:

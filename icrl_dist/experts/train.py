@@ -127,7 +127,7 @@ def make_histories(
     ``columns``: training episodes; ``windows``: episodes of ``window_episodes``; ``actors``: parameters per
     variation.  Raises RuntimeError for a variation without any other episode.
     """
-    parts, histories = {"": columns, "led_": windows}, []
+    parts, histories = {"": columns, "window_": windows}, []
     for row, variation in enumerate(variations):
         whole = {prefix: part["whole"][row] for prefix, part in parts.items()}
         diverged = sum(int((~one).sum()) for one in whole.values())

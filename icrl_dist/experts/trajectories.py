@@ -69,7 +69,7 @@ class _WindowEpisodes:
     @classmethod
     def of(cls, history: History, decoys: dict[str, np.ndarray]) -> _WindowEpisodes:
         """The episodes of the variation's own expert, and the decoys whose simulation did not diverge."""
-        own = {name: getattr(history, f"led_{name}") for name in ("actions", "observations", "rewards", "labels")}
+        own = {name: getattr(history, f"window_{name}") for name in ("actions", "observations", "rewards", "labels")}
         others = {name: decoys[name][decoys["whole"]] if decoys else column[:0] for name, column in own.items()}
         both = {name: np.concatenate([column, others[name]]) for name, column in own.items()}
         return cls(**both, decoy=np.arange(len(both["actions"])) >= len(own["actions"]))
@@ -92,8 +92,8 @@ def _labelled_queries(
     return {
         "queries": np.concatenate([history.observations[:, :-1][query], windows.observations[:, :-1][cut]]),
         "labels": np.concatenate([history.labels[query], windows.labels[cut]]),
-        "taken": windows.actions[cut],
-        "gained": windows.rewards[cut],
+        "prev_actions": windows.actions[cut],
+        "prev_rewards": windows.rewards[cut],
     }
 
 
@@ -118,7 +118,7 @@ def window_episodes(
     """
     recorder, order = Recorder(env, WINDOW_EPISODES, WINDOW_EPISODES), np.array(experts)
     for episode in range(WINDOW_EPISODES):
-        observation = recorder.reset([np.random.default_rng(draws.key(seed, draws.LED, episode)) for seed in seeds])
+        observation = recorder.reset([np.random.default_rng(draws.key(seed, draws.WINDOWS, episode)) for seed in seeds])
         for _ in range(env.spec.horizon):
             actions = _expert_actions(order, observation, getattr(env, "truth", None), problem, act)
             observation = recorder.step(actions).observation

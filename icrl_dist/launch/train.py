@@ -18,6 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
@@ -180,7 +181,7 @@ def train_ray(
     certificates = security.folder(run.stream.certificates)  # an absolute path: workers have another working directory
     interrupted = threading.Event()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_on_signals(interrupted.set))
+        handle_again = stack.enter_context(_on_signals(interrupted.set))
         if address is None:  # without a cluster both start at once; on a cluster the nodes are checked first
             learner = stack.enter_context(learner_process.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
@@ -189,9 +190,12 @@ def train_ray(
                 fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
             except FleetFailed as error:
                 raise (TrainInterrupted if interrupted.is_set() else _failed(error)) from None
+            except SystemExit:  # raised by Ray's handler of SIGTERM
+                raise TrainInterrupted from None
             stack.callback(fleet.close)
-            stack.enter_context(_on_signals(interrupted.set))  # again, because Ray replaces the handlers
-            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set)
+            handle_again()  # Ray replaces the handlers
+            needed = plugins.of_run(run.problem, run.method)
+            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed)
             if address is not None and interrupted.is_set():
                 raise TrainInterrupted
         if address is not None:
@@ -245,7 +249,7 @@ def _remove_if_refused(folder: Path) -> Iterator[None]:
         raise
 
 
-def interruptible() -> contextlib.AbstractContextManager[None]:
+def interruptible() -> contextlib.AbstractContextManager[object]:
     """A context in which SIGINT and SIGTERM raise TrainInterrupted, for work that can be repeated."""
 
     def interrupt() -> None:
@@ -255,14 +259,18 @@ def interruptible() -> contextlib.AbstractContextManager[None]:
 
 
 @contextlib.contextmanager
-def _on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` on SIGINT and SIGTERM."""
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop()) for number in signals] if _in_main_thread() else []
+def _on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
+    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them."""
+    signals = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+
+    def handle() -> list[Any]:
+        return [signal.signal(number, lambda *_: stop()) for number in signals]
+
+    before = handle()
     try:
-        yield
+        yield handle
     finally:
-        for number, handler in zip(signals, before, strict=False):
+        for number, handler in zip(signals, before, strict=True):
             signal.signal(number, handler)
 
 

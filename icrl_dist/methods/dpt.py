@@ -36,7 +36,7 @@ class DPT(Method):
     shows_states = True
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """The task under the null adversary alone."""
+        """Only the task under the null adversary."""
         return (Variation(task),)
 
     def phases(self, run: Run) -> tuple[Phase, ...]:

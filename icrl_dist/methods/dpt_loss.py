@@ -21,8 +21,8 @@ def batch_loss(model: PretrainedTransformer, batch: TrainingBatch) -> Float[Tens
     cache = model.encode(context)
     total = model.action_head.loss(model.decide(put(batch.queries), cache, put(batch.prefix)), put(batch.labels))
     if batch.windows is not None:
-        states, actions, rewards, labels = batch.windows
-        windows = Windows(put(states), put(actions), put(rewards))
+        states, prev_actions, prev_rewards, labels = batch.windows
+        windows = Windows(put(states), put(prev_actions), put(prev_rewards))
         outputs = model.decide_windows(windows, cache, put(batch.window_prefix))
         count = states.shape[1] * states.shape[2]
         share = count / (count + batch.prefix.shape[1])

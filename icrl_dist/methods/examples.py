@@ -15,10 +15,10 @@ from icrl_dist.types import Trajectory
 
 def labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
     """A variation's episodes as examples, with the queries and action windows that the worker labelled."""
-    single = np.concatenate([np.arange(len(t.queries)) < len(t.queries) - len(t.taken) for t in trials])
-    names = ("queries", "labels", "taken", "gained")
-    queries, labels, actions, rewards = (np.concatenate([getattr(t, name) for t in trials]) for name in names)
-    windows = LabelledWindows.cut(run.model.window, queries[~single], actions, rewards, labels[~single])
+    single = np.concatenate([np.arange(len(t.queries)) < len(t.queries) - len(t.prev_actions) for t in trials])
+    names = ("queries", "labels", "prev_actions", "prev_rewards")
+    queries, labels, prev_actions, prev_rewards = (np.concatenate([getattr(t, name) for t in trials]) for name in names)
+    windows = LabelledWindows.cut(run.model.window, queries[~single], prev_actions, prev_rewards, labels[~single])
     return Examples.of(trials, queries[single], labels[single], trials[0].identity.stage == "adapt", windows)
 
 

@@ -156,7 +156,7 @@ class Decoder:
         return _layer_norm(x[:, -1], self._norm)
 
     def _reserve_recent(self) -> None:
-        """Make room for one more token that arrives alone.
+        """Make room for one more token that arrives by itself.
 
         Such tokens are stored apart, in a buffer with spare room, until ``_merge_recent``: appending
         them one by one to the tight buffer would copy every context each time.

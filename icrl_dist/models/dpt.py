@@ -30,11 +30,11 @@ class Transitions(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """R action windows of each of B contexts (zeta of eq. 6): L consecutive states, and the action and reward at each."""
+    """R action windows of each of B contexts (zeta_h of eq. 6): L consecutive states, and the action and reward at each."""
 
     states: Float[Tensor, "B R L S"]
-    actions: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
-    rewards: Float[Tensor, "B R L"]
+    prev_actions: Int[Tensor, "B R L"] | Float[Tensor, "B R L A"]
+    prev_rewards: Float[Tensor, "B R L"]
 
 
 class PretrainedTransformer(nn.Module):
@@ -54,7 +54,7 @@ class PretrainedTransformer(nn.Module):
         self.embed_transition = nn.Linear(2 * features + spec.actions + 1, config.width)
         self.embed_query = nn.Linear(features, config.width)
         if config.window > 1:
-            self.embed_taken = nn.Linear(features + spec.actions + 1, config.width)
+            self.embed_taken = nn.Linear(features + spec.actions + 1, config.width)  # the name is part of every weights digest
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
         self.head = nn.Linear(config.width, self.action_head.outputs)
         for name, module in self.named_modules():
@@ -90,9 +90,9 @@ class PretrainedTransformer(nn.Module):
     def window_tokens(self, windows: Windows) -> Float[Tensor, "B R L D"]:
         """The embedded tokens of windows: each state, plus the previous state of the window with its action and reward."""
         states = self.features(windows.states)
-        actions = self.action_head.features(windows.actions)
+        actions = self.action_head.features(windows.prev_actions)
         # Without the last step: its action is the one to predict.
-        previous = torch.cat([states, actions, windows.rewards.unsqueeze(-1)], dim=-1)[..., :-1, :]
+        previous = torch.cat([states, actions, windows.prev_rewards.unsqueeze(-1)], dim=-1)[..., :-1, :]
         # Shift by one position: the first state of a window has no previous one, and gets zeros.
         tokens: Tensor = self.embed_query(states) + F.pad(self.embed_taken(previous), (0, 0, 1, 0))
         return tokens

@@ -101,7 +101,7 @@ class MonitorApp(App[None]):
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             try:
                 asyncio.get_running_loop().add_signal_handler(number, self.action_interrupt)
-            except (ValueError, RuntimeError):  # not in the main thread, which alone handles signals
+            except (ValueError, RuntimeError):  # only the main thread handles signals
                 break
         self._laid_out = True
         self._arrange()

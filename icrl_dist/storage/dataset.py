@@ -77,6 +77,8 @@ class Dataset:
             if unnamed and not self._readonly:
                 self.repaired.append(f"{path.name}: removed {len(unnamed)} trajectories whose names were damaged")
                 found = self._remove_damage(path, found.without(unnamed), sealed=not last)
+        except segment.OtherFormat as error:
+            raise StoreError(f"{path}: {error}") from None
         except (ValueError, OSError) as error:
             raise StoreError(
                 f"{path}: not a dataset of this version of icrl-dist, format {VERSION} ({error}): restore the file, or start a "

@@ -6,7 +6,8 @@ A frame is a header ``magic, length, checksum of the payload, checksum of the he
 - a *trajectory*: small integers (identity, numbers of names, shapes), then its arrays' bytes;
 - a *seal*: SHA-256 of everything before it, at the end of a finished segment.
 
-The header's own checksum lets a reader find the next intact frame after a damaged one.
+The third byte of ``magic`` is the number of the format.  The header's own checksum lets a reader find the next
+intact frame after a damaged one.
 """
 
 from __future__ import annotations
@@ -30,8 +31,12 @@ from icrl_dist.types import ARRAYS, STAGES, VECTORS, Identity, Trajectory, Varia
 
 _HEADER = struct.Struct("<4sIII")
 _HEAD, _CHECKSUM = struct.Struct("<4sII"), struct.Struct("<I")
-_PREFIX = b"icr"
-NAME, TRAJECTORY, SEAL = b"icrN", b"icrT", b"icrS"
+FORMAT = 2
+"""Number of the format, 1 to 9.  Segments of another number are refused: their trajectories have other digests."""
+_FIRST = b"r"
+"""The third byte of format 1, which had no digit there."""
+_PREFIX = b"ic"
+NAME, TRAJECTORY, SEAL = (b"%b%d%b" % (_PREFIX, FORMAT, kind) for kind in (b"N", b"T", b"S"))
 HEADER_BYTES = _HEADER.size
 SEAL_BYTES = HEADER_BYTES + 32
 _NUMBERS = 15
@@ -46,6 +51,10 @@ def frame(magic: bytes, payload: bytes) -> bytes:
 
 class MissingName(ValueError):  # noqa: N818
     """A frame refers to a name whose frame was damaged."""
+
+
+class OtherFormat(ValueError):  # noqa: N818
+    """A segment was written in another format; the message names both numbers and the remedy."""
 
 
 @dataclass
@@ -102,7 +111,7 @@ def encode(trajectory: Trajectory, names: Names) -> tuple[bytes, bytes]:
         number, new = names.number(value)
         numbers.append(number)
         new_names.append(new)
-    shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.taken))
+    shape = (len(t.actions), t.observations.shape[1], len(t.queries), t.labels.shape[1], len(t.prev_actions))
     adversary_width = () if t.adversary.ndim == 1 else (t.adversary.shape[1],)
     head = msgpack.packb([*t.identity.key(), t.policy_version, *numbers, *shape, *adversary_width])
     return b"".join(new_names), frame(TRAJECTORY, b"".join((head, *(array.tobytes() for array in t.arrays().values()))))
@@ -120,7 +129,7 @@ def decode(payload: bytes, names: Names) -> Trajectory:
         raise ValueError(f"a trajectory frame has {len(numbers)} numbers, expected {_NUMBERS} or {_NUMBERS + 1}")
     adversary_width = numbers.pop() if vectors else 0
     stage, round_, task, variation, trial, version, phi, digest, worker, origin, *sizes = numbers
-    steps, components, queries, actions, taken = sizes
+    steps, components, queries, actions, window_steps = sizes
     if (
         min(numbers[:5] + numbers[6:] + [adversary_width]) < 0
         or max(*numbers, adversary_width) >= 1 << 31
@@ -135,8 +144,8 @@ def decode(payload: bytes, names: Names) -> Trajectory:
         "adversary": (steps, adversary_width) if vectors else (steps,),
         "queries": (queries, components),
         "labels": (queries, actions),
-        "taken": (taken, *width),
-        "gained": (taken,),
+        "prev_actions": (window_steps, *width),
+        "prev_rewards": (window_steps,),
     }
     arrays, at, dtypes = {}, reader.tell(), _VECTOR_DTYPES if vectors else _DTYPES
     if len(payload) - at != sum(prod(shape) * dtypes[name].itemsize for name, shape in shapes.items()):
@@ -218,7 +227,10 @@ class Scan:
 
 
 def scan(path: Path) -> Scan:
-    """Read and check a whole segment.  Raises ValueError for intact frames with invalid content."""
+    """Read and check a whole segment.
+
+    Raises OtherFormat for a segment of another format, and ValueError for intact frames with invalid content.
+    """
     found = Scan(size=path.stat().st_size)
     if not found.size:
         return found
@@ -266,10 +278,23 @@ def _end(data: mmap.mmap, offset: int) -> tuple[int, int | None]:
 
 
 def _is_header(data: mmap.mmap | bytes, offset: int) -> bool:
+    """Whether an intact header is there.  Raises OtherFormat if it is one of another format."""
     head = data[offset : offset + HEADER_BYTES]
-    return (
-        len(head) == HEADER_BYTES and head[:4] in (NAME, TRAJECTORY, SEAL) and zlib.crc32(head[:12]) == _HEADER.unpack(head)[3]
-    )
+    number, kind = head[2:3], head[3:4]
+    if (
+        len(head) < HEADER_BYTES
+        or head[:2] != _PREFIX
+        or not (number.isdigit() or number == _FIRST)
+        or kind not in (b"N", b"T", b"S")
+        or zlib.crc32(head[:12]) != _HEADER.unpack(head)[3]
+    ):
+        return False
+    found = 1 if number == _FIRST else int(number)
+    if found != FORMAT:
+        raise OtherFormat(
+            f"dataset format {found}, this release reads {FORMAT}: use the release that wrote it, or start a new run"
+        )
+    return True
 
 
 def copy(source: Path, spans: Sequence[tuple[int, int]], target: BinaryIO, sealed: bool) -> None:

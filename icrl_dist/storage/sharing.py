@@ -18,7 +18,8 @@ def adopt(theirs: Path, folder: Path, keep: Callable[[Identity], bool]) -> int:
     """Share the trajectories of another dataset that ``keep`` accepts; returns the bytes of linked segments.
 
     A sealed segment of which all trajectories are kept is linked, if the file system can; of
-    others the kept trajectories are copied.  Raises StoreError for a damaged segment.
+    others the kept trajectories are copied.  Raises StoreError for a segment that is damaged or of
+    another format.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shared = 0
@@ -40,6 +41,8 @@ def _checked(path: Path) -> segment.Scan:
     try:
         found = segment.scan(path)
         content = path.read_bytes()[: max(0, found.size - segment.SEAL_BYTES)]
+    except segment.OtherFormat as error:
+        raise StoreError(f"{path}: {error}") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: cannot be shared ({error}); {remedy}") from None
     if found.damaged or (found.sealed and hashlib.sha256(content).hexdigest() != found.sealed):

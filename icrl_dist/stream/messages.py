@@ -25,6 +25,9 @@ class Hello:
     """Version of the package that the worker runs."""
     code: str
     """Digest of the code that the worker runs."""
+    plugins: dict[str, tuple[str, str, str]]
+    """Distribution, version and digest of the code of every installed problem and method of another package, by
+    ``problems/NAME`` or ``methods/NAME``; the worker does not know yet which of them the run has."""
     pid: Count
 
 
@@ -101,6 +104,8 @@ class Wait:
 class LeasedJob:
     """Reply to a request for a job."""
 
+    name: tuple[Stage, Count, Count, Count]
+    """``Job.name``, by which a worker that cannot decode the job reports its failure."""
     job: bytes
     """For ``wire.decode_job``."""
     deadline_s: Annotated[float, Ge(0)]

@@ -20,7 +20,7 @@ from icrl_dist.types import ARRAYS
 
 _T = TypeVar("_T")
 
-VERSION = 1
+VERSION = 2
 """Version of the wire format and of the dataset, in every message and checkpoint.
 
 Messages of other versions are refused; runs of other versions can be evaluated, but not continued."""

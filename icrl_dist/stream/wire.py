@@ -294,19 +294,20 @@ def _check_kind(name: str, dtype: str, ndim: int, expected: str, rank: int) -> N
 
 
 def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
-    steps = len(arrays["actions"])
-    wanted = {"observations": steps + 1, "rewards": steps, "adversary": steps, "labels": len(arrays["queries"])}
-    wanted["gained"] = len(arrays["taken"])
+    steps, queries, window_steps = (len(arrays[name]) for name in ("actions", "queries", "prev_actions"))
+    wanted = {"observations": steps + 1, "rewards": steps, "adversary": steps, "labels": queries, "prev_rewards": window_steps}
     for name, rows in wanted.items():
         if len(arrays[name]) != rows:
             raise WireError("shape", f"{name} has {len(arrays[name])} rows, expected {rows}")
-    if len(arrays["taken"]) > len(arrays["queries"]):
-        raise WireError("shape", f"taken has {len(arrays['taken'])} rows, expected at most {len(arrays['queries'])}")
+    if window_steps > queries:
+        raise WireError("shape", f"prev_actions has {window_steps} rows, expected at most {queries}")
     if arrays["queries"].shape[1] != arrays["observations"].shape[1]:
         shapes = arrays["queries"].shape, arrays["observations"].shape
         raise WireError("shape", f"queries and observations have shapes {shapes}, expected equal numbers of components")
-    if arrays["actions"].ndim == 2 and len({arrays[name].shape[1] for name in ("actions", "taken", "labels")}) != 1:
-        widths = {name: arrays[name].shape[1] for name in ("actions", "taken", "labels")}
+    if arrays["actions"].ndim == 1:
+        return
+    widths = {name: arrays[name].shape[1] for name in ("actions", "prev_actions", "labels")}
+    if len(set(widths.values())) != 1:
         raise WireError("shape", f"action vectors have {widths} components, expected equal numbers")
 
 

@@ -47,20 +47,24 @@ def memory() -> dict[str, float]:
     return {"memory_mb": round(now, 1), "peak_mb": round(max(now, peak), 1)}
 
 
-def raised(worker: str, job: Job, identity: Identity | None, error: BaseException) -> dict[str, Any]:
-    """The record of a job that raised ``error`` while it made the trajectory ``identity``."""
+def raised(
+    worker: str, label: str, error: BaseException, job: Job | None = None, identity: Identity | None = None
+) -> dict[str, Any]:
+    """The record of a job that raised ``error`` while it made the trajectory ``identity``.
+
+    ``label``: the job's name as text; ``job``: None if it could not be decoded.
+    """
     place = traceback.extract_tb(error.__traceback__)[-1]
+    of_job = {"seed": job.seed, "policy_version": job.policy_version, "variations": len(job.variations)} if job else {}
     return {
         "what": "raised",
         "worker": worker,
         "time": time.time(),
-        "job": job.label,
+        "job": label,
         "identity": str(identity) if identity else "",
         "exception": _text(f"{type(error).__name__}: {error}"[:_LINE] + f" ({Path(place.filename).name}:{place.lineno})"),
-        "seed": job.seed,
         "spawn_key": list(identity.key()) if identity else [],
-        "policy_version": job.policy_version,
-        "variations": len(job.variations),
+        **of_job,
         **memory(),
         "traceback": _text("".join(traceback.format_exception(error))[-_TEXT:]),
     }

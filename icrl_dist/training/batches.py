@@ -16,11 +16,14 @@ K = TypeVar("K", bound=Hashable)
 
 
 class LabelledWindows(NamedTuple):
-    """R action windows of L states with actions and rewards (zeta of eq. 6), and labels; in a batch, R of each context."""
+    """R action windows of L states (zeta_h of eq. 6) with labels; in a batch, R of each context.
+
+    ``prev_actions`` and ``prev_rewards``: the action and reward at every state, which the later states of the window see.
+    """
 
     states: Float32[np.ndarray, "*B R L S"]
-    actions: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
-    rewards: Float32[np.ndarray, "*B R L"]
+    prev_actions: Int64[np.ndarray, "*B R L"] | Float32[np.ndarray, "*B R L A"]
+    prev_rewards: Float32[np.ndarray, "*B R L"]
     labels: Float32[np.ndarray, "*B R L A"]
 
     @classmethod
@@ -28,13 +31,13 @@ class LabelledWindows(NamedTuple):
         cls,
         length: int,
         states: Float32[np.ndarray, "N S"],
-        actions: Integer[np.ndarray, " N"] | Float32[np.ndarray, "N A"],
-        rewards: Float32[np.ndarray, " N"],
+        prev_actions: Integer[np.ndarray, " N"] | Float32[np.ndarray, "N A"],
+        prev_rewards: Float32[np.ndarray, " N"],
         labels: Float32[np.ndarray, "N A"],
     ) -> LabelledWindows:
         """Consecutive steps as windows of ``length`` steps; the remainder at the end is not used."""
-        used = len(actions) // length * length
-        columns = states, _actions(actions), rewards, labels
+        used = len(prev_actions) // length * length
+        columns = states, _actions(prev_actions), prev_rewards, labels
         return cls(*(c[:used].reshape(-1, length, *c.shape[1:]) for c in columns))
 
 
@@ -47,7 +50,7 @@ def _actions(actions: np.ndarray) -> np.ndarray:
 class Examples:
     """Training data of one variation: episodes for contexts, labelled queries and action windows.
 
-    Any query can be paired with any context, because a label depends on (tau, phi) alone.
+    Any query can be paired with any context, because a label depends only on (tau, phi).
     ``history``: a context holds the first episodes in order, as in deployment; otherwise it
     holds any episodes in any order.
     """

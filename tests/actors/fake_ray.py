@@ -10,6 +10,7 @@ from actors import cluster, fleet, missing
 from icrl_dist.diagnostics import node_facts
 
 REACH = node_facts.reach
+NEEDED = {"problems/toy": "problem 'toy'"}
 LOOPBACK = "tcp/127.0.0.1:0"
 OWN_FACTS = node_facts.facts()
 
@@ -131,7 +132,7 @@ def gather(fleet, notes, endpoint="tls/localtest:0", turns=None):
             return left[0] < 0
         return False
 
-    fleet.gather(endpoint, "", "", notes.append, stopped)
+    fleet.gather(endpoint, "", "", notes.append, stopped, NEEDED)
     fleet.start(endpoint, "run")
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from actors import fleet as fleet_module
 from icrl_dist.config.run import ConfigError
-from tests.actors.fake_ray import LOOPBACK, OWN_FACTS, FakeRay, gather, local_name, new_fleet, placements
+from tests.actors.fake_ray import LOOPBACK, NEEDED, OWN_FACTS, FakeRay, gather, local_name, new_fleet, placements
 
 __all__ = ["local_name", "new_fleet"]
 
@@ -27,6 +27,10 @@ def test_a_cluster_that_stays_too_small_is_refused(new_fleet, local_name, monkey
         ({"code": "f" * 64}, r"icrl-dist's code ffffffff there"),
         ({"versions": {**OWN_FACTS["versions"], "torch": "1.0"}}, r"torch 1.0 there, .* here"),
         ({"python": "3.9.1"}, r"Python 3.9.1 there"),
+        (
+            {"plugins": {"problems/toy": ["toys", "1.1", "a" * 64]}},
+            r"n1 \(10.0.0.1\): problem 'toy': toys 1.1 with code aaaaaaaa there, no other package with it here: run `ray up`",
+        ),
         ({"certificates": "/c/worker.key: cannot be read"}, r"n1 \(10.0.0.1\): /c/worker.key"),
         ({"unreached": ["10.0.0.9:7447: timed out"]}, r"cannot reach the learner's port, 10.0.0.9:7447: timed out"),
         (
@@ -44,6 +48,14 @@ def test_a_node_that_fails_the_check_is_refused_before_the_run_starts(new_fleet,
     assert not ray.placed and "\n" not in str(error.value)
 
 
+def test_a_node_may_have_another_version_of_a_package_that_the_run_does_not_use(new_fleet, local_name):
+    ray = FakeRay(0, 1)
+    ray.answers["n1"] = {"plugins": {"problems/other": ["toys", "1.1", "a" * 64]}}
+    fleet = new_fleet(ray, 1)
+    gather(fleet, [])
+    assert fleet.watch(print, 0) == 1
+
+
 def test_a_later_node_that_fails_the_check_gets_no_workers(new_fleet, local_name):
     ray, notes = FakeRay(0, 1), []
     fleet = new_fleet(ray, None)
@@ -59,7 +71,7 @@ def test_the_run_waits_for_running_checks_and_then_starts_without_them(new_fleet
     ray.slow.add(2)
     fleet = new_fleet(ray, 2)
     turns = iter(range(20))
-    fleet.gather("tls/localtest:0", "", "", notes.append, lambda: next(turns, None) is None)
+    fleet.gather("tls/localtest:0", "", "", notes.append, lambda: next(turns, None) is None, NEEDED)
     assert next(turns, None) is None, "the run started"
     monkeypatch.setattr(fleet_module, "CHECKS_S", 0.01)
     gather(fleet, notes)
@@ -120,10 +132,10 @@ def test_a_loopback_endpoint_is_refused_on_a_cluster_of_several_nodes(new_fleet)
     with pytest.raises(ConfigError, match=r"stream.endpoint = 'tcp/127.0.0.1:0': other nodes cannot reach it.*tls/HEAD_IP"):
         gather(new_fleet(ray, 2), [], LOOPBACK)
     assert not ray.placed
-    alone = FakeRay(2)
-    fleet = new_fleet(alone, 2)
+    one_node = FakeRay(2)
+    fleet = new_fleet(one_node, 2)
     gather(fleet, [], LOOPBACK)
-    assert fleet.watch(print, 0) == 2 and len(alone.placed) == 2
+    assert fleet.watch(print, 0) == 2 and len(one_node.placed) == 2
 
 
 def test_an_occupied_port_is_refused(new_fleet):

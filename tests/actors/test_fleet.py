@@ -61,9 +61,9 @@ def test_a_worker_that_dies_by_itself_is_counted_and_restarted_on_its_node(new_f
     fleet = new_fleet(ray, 1)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
-    for life in ("w0", "w0-1"):
-        ray.errors["work", "n1", life] = RuntimeError("an error\nwith two lines")
-        if life == "w0":
+    for name in ("w0", "w0-1"):
+        ray.errors["work", "n1", name] = RuntimeError("an error\nwith two lines")
+        if name == "w0":
             assert fleet.watch(notes.append, 0) == 1 and notes[-1] == "worker w0 died (with two lines); starting it again"
     with pytest.raises(FleetFailed, match="w0 died 2 times without progress; last: with two lines"):
         fleet.watch(notes.append, 0)

@@ -168,9 +168,9 @@ def test_a_stuck_worker_writes_its_stacks_and_ends_and_another_does_its_job(
     wait_for(lambda: learner.events_of("crash"), "the record")
     (record,) = learner.records()
     assert (record["what"], record["job"]) == ("vanished", "pretrain/0/0")
-    assert record["last_said"]["episodes"] == 0
+    assert record["last_heartbeat"]["episodes"] == 0
     if failure == "sleep":  # heartbeats continue, but not while another thread holds the interpreter lock
-        assert record["last_said"]["job"] == "pretrain/0/0" and record["last_said"]["memory_mb"] > 10
+        assert record["last_heartbeat"]["job"] == "pretrain/0/0" and record["last_heartbeat"]["memory_mb"] > 10
     assert any(function in line for line in record["stacks"])
     monkeypatch.delenv("HOSTILE")
     process = worker(learner, "w0-1")

@@ -16,6 +16,8 @@ from actors.watchdog import Watchdog
 from actors.weight_cache import WeightCache
 from actors.worker import Worker
 from icrl_dist.collect import kinds
+from icrl_dist.collect.behavior import BehaviorContexts
+from icrl_dist.config import plugins
 from icrl_dist.config.run import dumps
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
@@ -27,6 +29,7 @@ from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
 from tests.contracts.link_battery import eventually
 from tests.jobs import jobs_of
+from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 KEYS = StreamKeys("test")
 
@@ -70,8 +73,8 @@ class ScriptedLearner:
                 one.reply(b"stored")
 
 
-def job_message(job):
-    return wire.encode_message("job", job=wire.encode_job(job), deadline_s=60.0)
+def job_message(job, data=None):
+    return wire.encode_message("job", name=list(job.name), job=data or wire.encode_job(job), deadline_s=60.0)
 
 
 STOP = wire.encode_message("stop")
@@ -109,6 +112,38 @@ def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
     assert 10 < record["memory_mb"] <= record["peak_mb"]
     assert "Traceback" in record["traceback"] and "behavior.py" in record["traceback"]
     assert len(learner.stored) == len(list(good.identities()))
+
+
+@dataclasses.dataclass(frozen=True)
+class FromANewerRelease(BehaviorContexts):
+    speed: float = 1.0
+
+
+def raises_type_error(kind, problem, data):
+    raise TypeError("the payload of another package")
+
+
+@pytest.mark.parametrize("case", ["unknown field", "not msgpack", "error of another package"])
+def test_a_job_that_cannot_be_decoded_is_reported_and_the_worker_continues(hub, small_run, monkeypatch, tmp_path, case):
+    bad, good = jobs_of(small_run, "icag")[:2]
+    monkeypatch.setattr(worker_module, "Watchdog", lambda run, name: Watchdog(None, name))  # pytest's process has one
+    data, cause, answers = None, "unknown key payload.speed", [job_message(good)]
+    if case == "unknown field":
+        payload = FromANewerRelease(bad.payload.behaviors, bad.payload.labelling)
+        data = wire.encode_job(dataclasses.replace(bad, payload=payload))
+    elif case == "not msgpack":
+        data, cause = b"\xc1", "WireError: not-msgpack"
+    else:
+        monkeypatch.setattr(kinds, "read_payload", raises_type_error)
+        cause, answers = "TypeError: the payload of another package", []
+    learner = ScriptedLearner(hub(), small_run, [job_message(bad, data), *answers, STOP])
+    Worker(hub(), "test", "w0", folder=tmp_path).run()
+    (report,) = [fields for kind, fields in learner.requests if kind == "failed"]
+    assert (report["job"], report["file"]) == (list(bad.name), "w0-1.json")
+    record = report["record"]
+    assert cause in record["exception"] and record["job"] == "/".join(map(str, bad.name)) and record["worker"] == "w0"
+    assert json.loads((tmp_path / "crashes" / "w0-1.json").read_text()) == record
+    assert len(learner.stored) == (len(list(good.identities())) if answers else 0)
 
 
 def test_the_record_contains_the_identity_of_the_unfinished_trajectory(hub, small_run, monkeypatch, tmp_path):
@@ -173,6 +208,18 @@ def test_every_request_has_counters_and_heartbeats_continue_during_a_job(hub, sm
     assert counters[1] == {"episodes": count, "steps": count * small_run.darkroom.horizon, "trajectories": count, "resent": 0}
     assert {kind for kind, _ in heartbeats} == {"worker"}
     assert all(fields["worker"] == "w0" and fields["memory_mb"] > 10 and fields["waited_s"] >= 0 for _, fields in heartbeats)
+
+
+def test_hello_names_the_code_of_problems_and_methods_of_other_packages(small_run, tmp_path):
+    said = []
+    for name, text in (("one", CORRIDOR), ("other", SLIPPERY)):
+        network = MemoryHub().link
+        learner = ScriptedLearner(network(), small_run, [STOP])
+        with installed(tmp_path / name, {"toy_problem.py": text}):
+            Worker(network(), "test", "w0").run()
+            assert learner.requests[0][1]["plugins"] == {"problems/toy": list(plugins.sources()["problems/toy"])}
+        said.append(learner.requests[0][1]["plugins"]["problems/toy"])
+    assert said[0][:2] == said[1][:2] == ["toys", "1.0"] and said[0][2] != said[1][2]
 
 
 def test_a_refused_hello_ends_the_worker_with_the_reason(hub):

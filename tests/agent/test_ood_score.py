@@ -36,8 +36,8 @@ def decisions(spec, steps, seed, noise=0.1):
         action = (
             rng.integers(spec.actions, size=B) if spec.discrete else rng.uniform(-1, 1, (B, spec.actions)).astype(np.float32)
         )
-        taken = np.eye(spec.actions)[action] if spec.discrete else action
-        comes = np.einsum("bd,ba,dao->bo", state, taken, weights) + noise * rng.normal(size=(B, spec.observation + 1))
+        encoded = np.eye(spec.actions)[action] if spec.discrete else action
+        comes = np.einsum("bd,ba,dao->bo", state, encoded, weights) + noise * rng.normal(size=(B, spec.observation + 1))
         before = rng.uniform(0, 1, (B, spec.observation)).astype(np.float32)
         after = before + comes[:, :-1].astype(np.float32) * np.array([4.5, 1.0], np.float32)
         made.append((state, before, action, comes[:, -1].astype(np.float32), after))
@@ -53,8 +53,8 @@ def outcome_of(spec, one, row):
 
 def features_of(spec, one, row):
     state, action = [*one[0][row], 1.0], one[2][row]
-    taken = [*(float(a == action) for a in range(spec.actions)), 1.0] if spec.discrete else [*action, 1.0]
-    return np.array([s * t for s in state for t in taken], np.float64)
+    inputs = [*(float(a == action) for a in range(spec.actions)), 1.0] if spec.discrete else [*action, 1.0]
+    return np.array([s * t for s in state for t in inputs], np.float64)
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=("discrete", "vectors"))
@@ -133,16 +133,16 @@ def test_calibration_deploys_in_training_tasks_under_new_adversaries_and_repeats
     assert {index for index, _ in rows} == set(range(len(train)))
     goals = {task["goal"] for task in train}
     assert {variation.task["goal"] for _, variation in rows} == goals
-    met = {v.adversary for i, task in enumerate(train) for v in registry.training_variations(small_run, i, task)}
-    assert {variation.adversary for _, variation in rows} & met <= {NULL}
+    trained_on = {v.adversary for i, task in enumerate(train) for v in registry.training_variations(small_run, i, task)}
+    assert {variation.adversary for _, variation in rows} & trained_on <= {NULL}
 
 
 def test_each_method_is_calibrated_under_the_disturbances_that_it_trains_on(small_run):
     task = registry.of(small_run).split.train[0]
     for name in methods.names():
         method = methods.of(dataclasses.replace(small_run, method=name))
-        met = {v.adversary.kind for v in method.training_variations(small_run, 0, task, 5)}
-        assert met == ({"null"} if name == "dpt" else {"null", "dirichlet"})
+        trained_on = {v.adversary.kind for v in method.training_variations(small_run, 0, task, 5)}
+        assert trained_on == ({"null"} if name == "dpt" else {"null", "dirichlet"})
 
 
 class Mirrored:

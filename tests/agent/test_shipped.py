@@ -43,9 +43,9 @@ def test_an_exported_agent_is_the_newest_version_without_what_only_training_need
     kept = {name for name in source.arrays if name.startswith("model/")}
     assert set(made.arrays) == kept | {f"outcomes/{name}" for name in ("readout", "deviation", "typical", "rare")}
     assert made.manifest == {name: value for name, value in source.manifest.items() if name != "dataset"}
-    whole, alone = load_agent(folder, seed=0), load_agent(folder / "agent.npz", seed=0)
+    whole, exported = load_agent(folder, seed=0), load_agent(folder / "agent.npz", seed=0)
     for name, value in weights_of(whole.model).items():
-        np.testing.assert_array_equal(weights_of(alone.model)[name], value)
+        np.testing.assert_array_equal(weights_of(exported.model)[name], value)
     other = tmp_path / "elsewhere" / "old.npz"
     assert main.main(["export", str(version_file(folder, 0)), "--out", str(other)]) == 0
     assert load_agent(other).manifest["version"] == 0

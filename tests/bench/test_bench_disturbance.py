@@ -96,14 +96,14 @@ def test_a_default_disturbance_without_loss_is_weak_and_a_strong_one_is_not(monk
     paper, qarl = result["problems"]
     assert (paper["forces"], paper["newtons"], qarl["forces"], qarl["newtons"]) == ("paper", 0.005, "qarl", 2.0)
     assert paper["undisturbed"] == qarl["undisturbed"] > 190, "the presets must share the expert and the episodes"
-    assert paper["weak"] and abs(paper["lost_mean"]) < 0.02 and "less than 2%" in paper["said"]
-    assert not qarl["weak"] and qarl["lost_mean"] > 0.02 and qarl["said"] == ""
+    assert paper["weak"] and abs(paper["lost_mean"]) < 0.02 and "less than 2%" in paper["note"]
+    assert not qarl["weak"] and qarl["lost_mean"] > 0.02 and qarl["note"] == ""
     assert (result["weak"], result["adversaries"]) == (1, 3)
     assert "weak: the default adversaries reduce the return by" in err.split("returns of experts")[1]
 
 
 @pytest.mark.parametrize(
-    ("undisturbed", "lost_mean", "weak", "untaught"),
+    ("undisturbed", "lost_mean", "weak", "low_return"),
     [
         (100.0, 0.0199, True, False),
         (100.0, -0.3, True, False),
@@ -112,14 +112,14 @@ def test_a_default_disturbance_without_loss_is_weak_and_a_strong_one_is_not(monk
         (0.0, None, False, True),
     ],
 )
-def test_no_loss_is_reported_for_an_expert_with_too_small_a_return(undisturbed, lost_mean, weak, untaught):
+def test_no_loss_is_reported_for_an_expert_with_too_small_a_return(undisturbed, lost_mean, weak, low_return):
     found = disturbance.verdict({"undisturbed": undisturbed, "lost_mean": lost_mean, "lost_error": 0.001}, 200)
-    assert (found["weak"], found["untaught"], bool(found["said"])) == (weak, untaught, weak or untaught)
+    assert (found["weak"], found["low_return"], bool(found["note"])) == (weak, low_return, weak or low_return)
 
 
 def test_a_weak_verdict_within_the_standard_error_says_so():
     sentences = [
-        disturbance.verdict({"undisturbed": 100.0, "lost_mean": 0.01, "lost_error": error}, 200)["said"]
+        disturbance.verdict({"undisturbed": 100.0, "lost_mean": 0.01, "lost_error": error}, 200)["note"]
         for error in (0.004, 0.005, None)
     ]
     assert all(text.startswith("weak") for text in sentences)

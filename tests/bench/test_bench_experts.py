@@ -37,7 +37,7 @@ def test_each_side_makes_the_timed_updates_from_the_same_replay(monkeypatch):
     monkeypatch.setattr(experts, "SACBatch", lambda *arguments: made.append(engine(*arguments)) or made[-1])
     monkeypatch.setattr(experts, "blank", lambda *arguments: made.append(model(*arguments)) or made[-1])
     experts.lockstep(TINY, "float32")(3)
-    experts.alone(TINY.config)(2)
+    experts.single(TINY.config)(2)
     ours, theirs = made
     assert (ours.updates, ours.experts, theirs._n_updates) == (3, 2, 2)
     rows = ours.replay.state()["rows"]

@@ -9,6 +9,7 @@ import pytest
 
 from icrl_dist.config import plugins, run
 from icrl_dist.config.run import ConfigError, load, override
+from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 
 @pytest.fixture(params=["raise ImportError('no simulator')", "1 / 0"])
@@ -33,3 +34,46 @@ def test_another_problem_replaces_the_section_of_the_former_one() -> None:
     assert changed.problem == "dmc-cartpole-balance" and changed.section("control").horizon == 400
     with pytest.raises(ConfigError, match=r"section \[darkroom\]: problem = 'dmc-cartpole-balance' has no such section"):
         override(load("smoke"), ["problem=dmc-cartpole-balance", "darkroom.size=5"], "--set")
+
+
+def source(site: Path, files: dict[str, str], module: str = "toy_problem", number: str = "1.0") -> plugins.Source:
+    with installed(site, files, module, number):
+        found = plugins.sources()
+        assert list(found) == ["problems/toy"], "problems and methods of this package are left out"
+        return found["problems/toy"]
+
+
+def test_the_source_of_a_loose_module_is_its_file(tmp_path: Path) -> None:
+    one = source(tmp_path / "a", {"toy_problem.py": CORRIDOR, "other.py": "x = 1"})
+    assert (one.distribution, one.version, len(one.code)) == ("toys", "1.0", 64)
+    assert source(tmp_path / "b", {"toy_problem.py": CORRIDOR, "other.py": "x = 2"}) == one
+    changed = source(tmp_path / "c", {"toy_problem.py": SLIPPERY})
+    assert changed.code != one.code and changed[:2] == one[:2]
+    assert source(tmp_path / "d", {"toy_problem.py": CORRIDOR}, number="1.1") == one._replace(version="1.1")
+
+
+@pytest.mark.parametrize("above", ["", "company/"])
+def test_the_source_of_a_package_is_all_its_files_also_within_a_namespace(tmp_path: Path, above: str) -> None:
+    module = f"{above}toy_package.sub.problem".replace("/", ".")
+    files = {
+        f"{above}toy_package/__init__.py": "1 / 0  # nothing is imported",
+        f"{above}toy_package/sub/__init__.py": "",
+        f"{above}toy_package/sub/problem.py": CORRIDOR,
+        f"{above}toy_package/numbers.toml": "a = 1",
+        "company/other.py": "x = 1",
+    }
+    one = source(tmp_path / "a", files, module)
+    assert len(one.code) == 64
+    assert source(tmp_path / "b", {**files, "company/other.py": "x = 2"}, module) == one
+    for name in list(files)[:4]:
+        changed = source(tmp_path / "c" / name, {**files, name: f"{files[name]}\n"}, module)
+        assert changed.code != one.code, name
+
+
+def test_a_package_whose_module_is_missing_has_no_code(tmp_path: Path) -> None:
+    for module in ("toy_problem", "missing.toy_problem"):
+        assert source(tmp_path / module, {}, module).code == ""
+
+
+def test_the_problems_of_the_tests_have_a_source(tmp_path: Path) -> None:
+    assert len(source(tmp_path, {}, "tests.toys.corridor").code) == 64

@@ -35,12 +35,12 @@ def test_checks_that_pass_on_every_machine_with_these_tests(tmp_path: Path) -> N
 
 def test_a_port_in_use_fails() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        taken = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        check = check_named("stream endpoint", taken)
+        in_use = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        check = check_named("stream endpoint", in_use)
         assert check.ok is False
-        assert taken in check.value
+        assert in_use in check.value
         assert "port 0" in check.remedy
-    assert check_named("stream endpoint", taken).ok is True
+    assert check_named("stream endpoint", in_use).ok is True
 
 
 @pytest.mark.parametrize(

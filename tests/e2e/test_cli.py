@@ -78,8 +78,8 @@ def test_more_workers_than_cores(capsys, tmp_path):
 
 
 def test_a_port_in_use(capsys, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        port = occupied.getsockname()[1]
         line = refused(capsys, "train", "smoke", "--out", tmp_path / "out", "--stream.endpoint", f"tcp/127.0.0.1:{port}")
     assert f"tcp/127.0.0.1:{port}" in line and "free that port" in line
 

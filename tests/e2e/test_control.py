@@ -59,11 +59,13 @@ def test_returns_stand_beside_the_experts_and_random_ones(inline):
 
 
 def test_ray_ends_with_the_same_bytes_though_a_worker_is_killed_while_its_experts_train(inline, tmp_path):
-    folder, said = tmp_path / "ray", []
+    folder, heartbeats = tmp_path / "ray", []
     process = train("dmc-reacher-easy-laptop", folder, tmp_path / "cache", "--method", "icaa", "--json")
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
-        link.subscribe(f"icrl/{folder.name}/mon/worker/**", lambda _, data: said.append(wire.decode_message(data)[1]))
-        pid = wait_for(lambda: next((s["pid"] for s in list(said) if "experts at" in s["doing"]), None), "experts training")
+        link.subscribe(f"icrl/{folder.name}/mon/worker/**", lambda _, data: heartbeats.append(wire.decode_message(data)[1]))
+        pid = wait_for(
+            lambda: next((h["pid"] for h in list(heartbeats) if "experts at" in h["doing"]), None), "experts training"
+        )
     psutil.Process(pid).send_signal(signal.SIGKILL)
     output = finish(process)
     assert process.returncode == 0, output

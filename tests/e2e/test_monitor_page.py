@@ -114,8 +114,15 @@ def until(page, expression):
     return wait_for(lambda: page.evaluate(expression), expression, page.timeout_s)
 
 
-def cells(page, column):
-    return page.locator(f"#variation-table tbody tr > :nth-child({column})").all_text_contents()
+def expect(page, what):
+    """Assertions about an element that wait for it to become true; ``what``: a CSS selector or a locator."""
+    playwright.expect.set_options(timeout=1000 * page.timeout_s)
+    return playwright.expect(page.locator(what) if isinstance(what, str) else what)
+
+
+def expect_cells(page, column, texts):
+    """Wait until the column of the table of variations has these texts, from top to bottom."""
+    expect(page, f"#variation-table tbody tr > :nth-child({column})").to_have_text(texts)
 
 
 def test_sorting_filters_and_the_dialog_of_a_variation(page):
@@ -133,42 +140,42 @@ def test_sorting_filters_and_the_dialog_of_a_variation(page):
         run.send("belief", identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=[1 / 9] * 9, exact=probs)
         run.progress()
         page.goto(url)
-        until(page, "document.querySelectorAll('#variation-table tbody tr').length === 6")
-        assert cells(page, 1) == ["0/0", "0/1", "1/0", "1/1", "2/0", "2/1 quarantined"]
+        expect_cells(page, 1, ["0/0", "0/1", "1/0", "1/1", "2/0", "2/1 quarantined"])
         last = page.get_by_role("button", name="Last", exact=True)
         last.focus()
         page.keyboard.press("Enter")
-        assert [float(text) for text in cells(page, 4)] == [6, 5, 5, 4, 4, 3]
-        assert page.locator("th[aria-sort=descending]").inner_text().startswith("Last")
+        expect_cells(page, 4, ["6", "5", "5", "4", "4", "3"])
+        expect(page, "th[aria-sort=descending]").to_have_text("Last")
         last.click()
-        assert [float(text) for text in cells(page, 4)] == [3, 4, 4, 5, 5, 6]
+        expect_cells(page, 4, ["3", "4", "4", "5", "5", "6"])
         page.get_by_label("Adversary").select_option("uniform")
-        assert cells(page, 2) == ["uniform p 0.25"] * 3
+        expect_cells(page, 2, ["uniform p 0.25"] * 3)
         page.get_by_label("Task").fill("1")
-        assert cells(page, 1) == ["1/1"] and page.locator("#variation-count").inner_text() == "1 selected of 6"
+        expect_cells(page, 1, ["1/1"])
+        expect(page, "#variation-count").to_have_text("1 selected of 6")
         page.get_by_role("button", name="Quarantined").click()
-        assert cells(page, 1) == [] and "no variation matches" in page.locator("#variation-more").inner_text()
+        expect_cells(page, 1, [])
+        expect(page, "#variation-more").to_contain_text("no variation matches")
         page.get_by_role("button", name="Quarantined").click()
 
+        expect_cells(page, 1, ["1/1"])
         page.locator("#variation-table tbody tr").focus()
         page.keyboard.press("Enter")
         dialog = page.get_by_role("dialog", name="Variation 1/1")
         dialog.get_by_text("uniform: p 0.25").wait_for()
-        copy = dialog.get_by_role("button", name="Copy: icrl-dist explain runs/a-run adapt/0/1/1/1")
-        assert copy.is_visible() and dialog.get_by_role("cell", name="abababababab").count() == 2
+        dialog.get_by_role("button", name="Copy: icrl-dist explain runs/a-run adapt/0/1/1/1").wait_for()
+        expect(page, dialog.get_by_role("cell", name="abababababab")).to_have_count(2)
         expected = "1/1: Dark Room, 3 by 3: goal reached after 2 steps, 1 of 2 actions overridden; return 5"
         dialog.get_by_role("img", name=expected).wait_for()
         page.keyboard.press("Escape")
         dialog.wait_for(state="hidden")
-        assert page.evaluate("document.activeElement.textContent").startswith("1/1")
+        until(page, "document.activeElement.textContent.startsWith('1/1')")
 
         page.get_by_role("img", name="Exact posterior: most likely cell 1, 1 with 1; goal at 1, 1").wait_for()
         page.get_by_text("total variation 0.89").wait_for()
-        tile = page.locator("#episodes canvas")
-        assert tile.get_attribute("aria-label") == expected
-        theme = page.get_by_role("button", name="Theme: system")
-        theme.click()
-        assert page.evaluate("document.documentElement.dataset.theme") == "light"
+        expect(page, "#episodes canvas").to_have_attribute("aria-label", expected)
+        page.get_by_role("button", name="Theme: system").click()
+        expect(page, "html").to_have_attribute("data-theme", "light")
 
 
 def test_hostile_messages_are_shown_as_text_or_ignored(page):
@@ -185,15 +192,15 @@ def test_hostile_messages_are_shown_as_text_or_ignored(page):
         run.send("run", **ABOUT | {"method": MARKUP, "problem": MARKUP})
         run.send("run", **ABOUT | {"began": 1e308})
         run.put(b"\xff" * 100)
-        run.put(msgpack.packb({"v": 1, "kind": "event", "text": "x" * (2 << 20)}))
-        run.put(msgpack.packb({"v": 1, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
+        run.put(msgpack.packb({"v": wire.VERSION, "kind": "event", "text": "x" * (2 << 20)}))
+        run.put(msgpack.packb({"v": wire.VERSION, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
         run.put(wire.encode_message("event", time=1.0, what="x", text="x"), run="another")
         page.goto(url)
         page.locator("#worker-table").get_by_text(MARKUP).first.wait_for()
-        assert page.locator("#name").inner_text() == name
-        assert page.locator("img").count() == 0
+        expect(page, "#name").to_have_text(name)
         for where in ("#events", "#alerts", "#drops", "#variation-table", "#adversary-filter"):
-            assert MARKUP[:32] in page.locator(where).text_content(), where
+            expect(page, where).to_contain_text(MARKUP[:32])
+        expect(page, "img").to_have_count(0)
         page.locator("#variation-table tbody tr").click()
         page.locator("#detail-lineage").get_by_text(MARKUP).first.wait_for()
         page.keyboard.press("Escape")
@@ -212,19 +219,18 @@ def test_variations_beyond_the_limit_and_a_restarted_server(page, monkeypatch):
             run.feed.state.receive("icrl/a-run/mon/trajectories/w0", payload, time.time())
         with serving_run(run.feed, "127.0.0.1", 0) as url:
             page.goto(url)
-            until(page, "document.querySelectorAll('#variation-table tbody tr').length === 100")
-            note = page.locator("#variation-more").inner_text()
-            assert note == "600 more rows not shown; 300 beyond the limit"
-            assert page.locator("#variation-count").inner_text() == "1,000"
+            expect(page, "#variation-table tbody tr").to_have_count(100)
+            expect(page, "#variation-more").to_have_text("600 more rows not shown; 300 beyond the limit")
+            expect(page, "#variation-count").to_have_text("1,000")
             page.get_by_role("button", name="Last", exact=True).click()
-            assert cells(page, 4) == [str(value) for value in range(96, 81, -1) for _ in range(7)][:100]
+            expect_cells(page, 4, [str(value) for value in range(96, 81, -1) for _ in range(7)][:100])
             page.get_by_role("button", name="Show more").click()
-            assert page.locator("#variation-table tbody tr").count() == 200
+            expect(page, "#variation-table tbody tr").to_have_count(200)
         until(page, f"!({CLEAR})")
         run.send_return("0/0", 1, 1000.0, problem="unknown")
         with serving_run(run.feed, "127.0.0.1", int(url.rstrip("/").rpartition(":")[2])):
             until(page, CLEAR)
-            until(page, "document.querySelector('#variation-table tbody th').textContent === '0/0'")
+            expect(page, page.locator("#variation-table tbody th").first).to_have_text("0/0")
 
 
 def test_every_round_is_divided_by_its_own_optimum_and_many_alerts_leave_room(page):
@@ -245,21 +251,21 @@ def test_every_round_is_divided_by_its_own_optimum_and_many_alerts_leave_room(pa
         optima = re.findall(r"optimal ([\d.]+)", page.locator("#detail-summary").inner_text())
         assert [float(text) for text in optima] == pytest.approx([*best.values()], 0.02)
         page.keyboard.press("Escape")
-        assert page.locator("#beliefs canvas").count() == 4
+        expect(page, "#beliefs canvas").to_have_count(4)
         run.send("event", what="worker", text="w1 is gone", worker="w1", alive=False)
-        until(page, "document.querySelectorAll('#beliefs canvas').length === 2")
+        expect(page, "#beliefs canvas").to_have_count(2)
 
         for number in range(100):
             run.send("event", what="alert", alert=f"silent w{number}", active=True, text=f"worker w{number} is silent")
-        until(page, "document.querySelectorAll('#alerts p').length === 100")
+        expect(page, "#alerts p").to_have_count(100)
         alerts, table = page.locator("#alerts"), page.locator("#variation-table")
         assert alerts.bounding_box()["height"] <= 900 / 4 and table.bounding_box()["height"] > 80
         alerts.focus()
-        assert page.evaluate("document.activeElement.id") == "alerts"
+        expect(page, alerts).to_be_focused()
         page.keyboard.press("End")
         until(page, "document.querySelector('#alerts').scrollTop > 1000")
         run.send("run", **ABOUT, alerts=[])  # the list in a run message replaces the alerts
-        until(page, "document.querySelectorAll('#alerts p').length === 0")
+        expect(page, "#alerts p").to_have_count(0)
 
 
 def test_a_recording_is_controlled_by_keyboard(page):
@@ -269,33 +275,34 @@ def test_a_recording_is_controlled_by_keyboard(page):
     with shown(page, run) as url:
         page.goto(url)
         button = page.locator("#pause")
+        button.wait_for()  # hidden until the first snapshot is in; a hidden button cannot have the focus
         button.focus()
         page.keyboard.press("Enter")
-        until(page, "document.querySelector('#pause').textContent === 'Play'")
+        expect(page, button).to_have_text("Play")
         page.get_by_label("Speed").select_option("50")
         wait_for(lambda: len(run.controls) == 2, "the speed", page.timeout_s)
         page.get_by_label("Position in the recording").press("End")
-        until(page, "document.querySelector('#pause').textContent === 'Play again'")
+        expect(page, button).to_have_text("Play again")
         button.press("Enter")
-        until(page, "document.querySelector('#pause').textContent === 'Pause'")
+        expect(page, button).to_have_text("Pause")
         assert run.controls == [{"paused": True}, {"speed": 50}, {"at": 1100}, {"at": 1000, "paused": False}]
 
 
 def test_a_real_run_and_a_killed_worker(page, tmp_path):
     folder = tmp_path / "watched"
-    many = ("--pretrain.steps", "5", "--icaa.rounds", "40", "--icaa.steps", "5")
+    many = ("--pretrain.steps", "5", "--icaa.rounds", "100", "--icaa.steps", "5")
     training = start("train", *SMOKE, *many, "--out", folder, start_new_session=True)
     view = None
     try:
         endpoint_of(folder)
         view = start("monitor", folder, "--web", "0")
-        url = re.search(r"http://\S+", view.stdout.readline())[0]
+        url = next(found[0] for line in view.stdout if (found := re.search(r"http://\S+", line)))
         page.set_default_timeout(120_000)
         page.timeout_s = 120
         page.goto(url)
-        until(page, "document.querySelectorAll('#worker-table tbody tr[data-state=working]').length === 2")
-        until(page, "document.querySelector('#variation-count').textContent === '14'")
-        until(page, "document.querySelectorAll('#variation-table tbody tr').length === 14")  # 7 tasks, 2 variations
+        expect(page, "#worker-table tbody tr[data-state=working]").to_have_count(2)
+        expect(page, "#variation-count").to_have_text("14")
+        expect(page, "#variation-table tbody tr").to_have_count(14)  # 7 tasks, 2 variations
 
         grown = "Number(document.querySelector('#variation-table tbody tr:nth-child(2) > :last-child').textContent)"
         until(page, f"{grown} > 0")
@@ -304,14 +311,14 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
         # Only variations that have started the newest round and whose optimum in it is computed.
         summary = "document.querySelector('#adaptation-summary').textContent"
         until(page, f"/mean of (8|9|1[0-4]) variations/.test({summary})")
-        assert page.locator("#adaptation canvas").count() == 1
+        expect(page, "#adaptation canvas").to_have_count(1)
 
         victim = workers_of(training)[0]
         training.send_signal(signal.SIGSTOP)  # delays the restart of the worker; the learner continues
         os.kill(victim.pid, signal.SIGKILL)
         killed = time.monotonic()
         troubled = "#worker-table tbody tr.troubled"
-        row = page.wait_for_selector(f"{troubled}[data-state=gone]", timeout=3000)
+        row = page.wait_for_selector(f"{troubled}[data-state=gone]")
         print(f"red after {time.monotonic() - killed:.2f} s")
         name, state = row.query_selector("th").inner_text(), row.query_selector(".badge").inner_text()
         assert state == "gone" and name in ("w0", "w1")

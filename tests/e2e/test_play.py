@@ -7,11 +7,17 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 from pathlib import Path
 
 import pytest
+
+from icrl_dist.monitor.event_stream import EventStream
+from icrl_dist.monitor.serve import application, serving
+from tests.e2e.training import wait_for
+from tests.problems.darkroom.fixed_agent import game
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 
@@ -32,7 +38,7 @@ def served():
     yield process, url
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 130 and not errors
 
 
@@ -45,17 +51,29 @@ def browser():
 
 
 @contextlib.contextmanager
-def viewer(browser, url):
+def opened(browser, url):
     """A page of the game that must log no errors."""
     page, errors = browser.new_page(viewport={"width": 1000, "height": 700}), []
     page.set_default_timeout(TIMEOUT_MS)
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(url)
-    expect(page, "#status").to_have_text("live")
     yield page
     assert not errors
     page.close()
+
+
+@contextlib.contextmanager
+def viewer(browser, url):
+    """The same, once it shows the whole state of the game."""
+    with opened(browser, url) as page:
+        expect(page, "#status").to_have_text("live")
+        yield page
+
+
+def labelled(page, what, text):
+    """Wait until the label of an element contains this text."""
+    expect(page, what).to_have_attribute("aria-label", contains(text))
 
 
 def expect(page, what):
@@ -92,22 +110,23 @@ def painted(page, color):
 def test_the_agent_adapts_to_a_moved_goal_and_overrides(served, browser):
     _, url = served
     with viewer(browser, url) as page:
-        assert page.get_attribute("#room", "aria-label").startswith("A room of 10 by 10 cells. Agent at (0, 0), goal at (5, 7)")
+        labelled(page, "#room", "A room of 10 by 10 cells. Agent at (0, 0), goal at (5, 7)")
         undisturbed = [finish(page, episode) for episode in (1, 2)]
         assert [optimum for _, optimum, _ in undisturbed] == [89.0, 89.0] and undisturbed[1][0] > 80
         assert painted(page, "--series-2") == 0
 
-        box = page.locator("#room").bounding_box()
-        page.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 0.75 * box["height"])
-        expect(page, "#room").to_have_attribute("aria-label", contains("goal at (2, 2)"))
+        room = page.locator("#room")
+        box = room.bounding_box()
+        room.click(position={"x": 0.25 * box["width"], "y": 0.75 * box["height"]})
+        labelled(page, "#room", "goal at (2, 2)")
         page.locator("#p").fill("0.5")
         disturbed = [finish(page, episode) for episode in range(3, 9)]
         returns, optima, overridden = zip(*disturbed, strict=True)
         assert set(optima) == {45.7}
         assert all(30 < count < 70 for count in overridden) and painted(page, "--series-2") > 100
         assert sum(returns[2:]) / 4 > 0.8 * optima[0], "at least 80% of the optimum from the third episode on"
-        expect(page, "#implied").to_have_attribute("aria-label", contains("most likely (2, 2)"))
-        expect(page, "#exact").to_have_attribute("aria-label", contains("most likely (2, 2) with 100 %"))
+        labelled(page, "#implied", "most likely (2, 2)")
+        labelled(page, "#exact", "most likely (2, 2) with 100 %")
         expect(page, "#surprise").to_have_attribute("aria-valuetext", contains("training"))
         with viewer(browser, url) as other:
             expect(other, "#returns tr").to_have_count(8)
@@ -128,21 +147,56 @@ def test_the_page_works_by_keyboard(served, browser):
         page.keyboard.press("Enter")
         expect(page, "#step").to_have_text("1 of 100")
         expect(page, "#overridden").to_have_text("1 (1 you)")
-        assert "Agent at (0, 1)" in page.get_attribute("#room", "aria-label") and painted(page, "--series-4") > 10
+        labelled(page, "#room", "Agent at (0, 1)")
+        assert painted(page, "--series-4") > 10
         page.fill("#goal-x", "9")
         page.fill("#goal-y", "1")
         page.keyboard.press("Enter")
-        expect(page, "#room").to_have_attribute("aria-label", contains("goal at (9, 1)"))
+        labelled(page, "#room", "goal at (9, 1)")
         before = page.evaluate("getComputedStyle(document.body).backgroundColor")
         for _ in range(2):
             page.click("#theme")
-        assert page.text_content("#theme") == "Theme: dark"
-        assert page.evaluate("getComputedStyle(document.body).backgroundColor") != before
+        expect(page, "#theme").to_have_text("Theme: dark")
+        expect(page, "body").not_to_have_css("background-color", before)
         page.click("#pause")
         expect(page, "#step").not_to_have_text("1 of 100")
         page.click("#pause")
+        expect(page, "#pause").to_have_text("Resume")
         unlabelled = "button:not([aria-label]):empty, canvas[id]:not([aria-label]):not([aria-hidden])"
-        assert page.locator(unlabelled).count() == 0
+        expect(page, unlabelled).to_have_count(0)
+
+
+def test_the_page_is_live_once_it_shows_the_whole_state(browser, small_run):
+    played, stream = game(small_run), EventStream()
+    with serving(application("play.html", stream), stream, "127.0.0.1", 0) as url, opened(browser, url) as page:
+        stream.publish("episodes", played.history(), state=True)
+        labelled(page, "#chart", "no episode has ended yet")
+        assert page.text_content("#status") == "connecting"
+        stream.publish("room", played.snapshot(), state=True)
+        labelled(page, "#room", "A room of 3 by 3 cells")
+        assert page.text_content("#status") == "connecting"
+        uniform = [1 / 9] * 9
+        figures = {"apart": 0.0, "divergence": 0.0, "transitions": 0}
+        stream.publish("belief", {"implied": uniform, "exact": uniform, **figures}, state=True)
+        expect(page, "#status").to_have_text("live")
+
+
+def test_a_command_is_sent_after_the_answer_to_the_one_before_it(browser, small_run):
+    arrived, second, overlapped = [], threading.Event(), []
+
+    def command(fields):
+        arrived.append(fields["do"])
+        if len(arrived) == 1:
+            overlapped.append(second.wait(1.0))
+        else:
+            second.set()
+
+    stream = EventStream()
+    with serving(application("play.html", stream, command), stream, "127.0.0.1", 0) as url, opened(browser, url) as page:
+        page.locator("#p").fill("0.5")
+        page.click("#one")
+        wait_for(second.is_set, "the second command")
+    assert arrived == ["p", "step"] and overlapped == [False]
 
 
 def test_hostile_commands_are_refused_and_the_game_continues(served):

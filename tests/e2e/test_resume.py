@@ -13,6 +13,7 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from tests.e2e.training import (
     NO_RESTARTS,
     SMOKE,
+    descendants_of,
     endpoint_of,
     equal,
     finish,
@@ -74,7 +75,7 @@ def test_killing_all_processes_twice_and_then_the_command_changes_nothing(refere
 
     def kill_the_command():
         wait_for(lambda: len(workers_of(process)) == 2, "both workers")
-        family = psutil.Process(process.pid).children(recursive=True)
+        family = descendants_of(process)
         # Ray's two agents end by themselves within a minute.
         ours.extend(p for p in family if re.search("learner|WorkerActor", " ".join(p.cmdline())))
         os.kill(process.pid, signal.SIGKILL)

@@ -20,18 +20,21 @@ from icrl_dist.problems.darkroom.exact_agents import RULES
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream.link import Refused
+from icrl_dist.telemetry.processes import is_learner
 from learner import checkpoints
 from tests.e2e.training import (
     CLI,
     NO_RESTARTS,
     SMALLER,
     SMOKE,
+    descendants_of,
     endpoint_of,
     equal,
     finish,
     on_first_adapt_trajectory,
     result_of,
     start,
+    wait_for,
     workers_of,
 )
 
@@ -144,7 +147,7 @@ def test_killing_the_learner_and_then_a_worker_changes_nothing(reference, tmp_pa
     process = start("train", *SMOKE, "--out", folder)
 
     def kill():
-        (learner,) = [p for p in psutil.Process(process.pid).children() if "learner" in p.cmdline()]
+        (learner,) = [p for p in descendants_of(process) if is_learner(p)]
         (folder / "endpoint").unlink()
         learner.kill()
 
@@ -153,7 +156,7 @@ def test_killing_the_learner_and_then_a_worker_changes_nothing(reference, tmp_pa
     with on_first_adapt_trajectory(folder, lambda: os.kill(workers_of(process)[0].pid, signal.SIGKILL), 1) as killed:
         assert killed.wait(300)
         with pytest.raises(Refused, match="not-msgpack"):
-            killed.link.request(f"icrl/{folder.name}/data", b"\xc1garbage", timeout_s=10)
+            killed.link.request(f"icrl/{folder.name}/data", b"\xc1garbage", timeout_s=60)
     output = finish(process)
     assert process.returncode == 0, output
     assert "the learner died (exit code -9)" in output
@@ -164,12 +167,30 @@ def test_killing_the_learner_and_then_a_worker_changes_nothing(reference, tmp_pa
     assert result["drops"]["not-msgpack"] == 1
 
 
+def raylets_of(process):
+    """Ray's node process, if it has started."""
+    found = []
+    for one in descendants_of(process):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            found += [one] * (one.name() == "raylet")
+    return found
+
+
 def test_sigterm_has_the_effect_of_ctrl_c(tmp_path):
     folder = tmp_path / "terminated"
     process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", folder)
-    with on_first_adapt_trajectory(folder, process.terminate) as terminated:
-        family = psutil.Process(process.pid).children(recursive=True)
+    family, raylets = [], []
+
+    def terminate():
+        family.extend(descendants_of(process))
+        raylets.extend(raylets_of(process))
+        process.terminate()
+
+    with on_first_adapt_trajectory(folder, terminate) as terminated:
         assert terminated.wait(300)
+    (raylet,) = raylets
+    raylet.wait(120)
+    process.terminate()  # again, while the command ends Ray's other processes: without effect
     output = finish(process)
     assert process.returncode == 130, output
     assert "SIGTERM" not in output and "--resume" in output
@@ -177,13 +198,27 @@ def test_sigterm_has_the_effect_of_ctrl_c(tmp_path):
     assert not [p.cmdline() for p in alive]
 
 
+def test_sigterm_while_ray_starts_has_the_effect_of_ctrl_c(tmp_path):
+    process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", tmp_path / "terminated")
+    family = wait_for(lambda: raylets_of(process), "the start of Ray") + descendants_of(process)
+    process.terminate()
+    output = finish(process)
+    assert process.returncode == 130 and output.splitlines()[-1].startswith("interrupted; "), output
+    _, alive = psutil.wait_procs(family, timeout=60)
+    assert not [p.cmdline() for p in alive]
+
+
 def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_continues(reference, tmp_path):
     folder = tmp_path / "interrupted"
     process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", folder, start_new_session=True)
-    with on_first_adapt_trajectory(folder, lambda: os.killpg(process.pid, signal.SIGINT)) as interrupted:
-        family = psutil.Process(process.pid).children(recursive=True)
+    family = []
+
+    def interrupt():
+        family.extend(descendants_of(process))
+        os.killpg(process.pid, signal.SIGINT)
+
+    with on_first_adapt_trajectory(folder, interrupt) as interrupted:
         assert interrupted.wait(300)
-        family += psutil.Process(process.pid).children(recursive=True)
     output = finish(process)
     assert process.returncode == 130, output
     assert "--resume" in output and (folder / "checkpoints" / "version-0000.npz").exists()

@@ -52,15 +52,17 @@ def endpoint_of(folder):
 
 @contextlib.contextmanager
 def on_first_adapt_trajectory(folder, act, round_=0):
-    """Call ``act`` once, when a trajectory of the round appears on the monitor plane."""
+    """Call ``act`` once, when a trajectory of the round appears on the monitor plane; the yielded event is set after it."""
     acted = threading.Event()
 
     def receive(key, payload):
         _, fields = wire.decode_message(payload)
         in_round = any(one["identity"].startswith(f"adapt/{round_}") for one in monitor_messages.rows(fields))
         if in_round and not acted.is_set():
-            acted.set()
-            act()
+            try:
+                act()
+            finally:
+                acted.set()
 
     with ZenohLink.connect(endpoint_of(folder), timeout_s=30) as link:
         link.subscribe(f"icrl/{folder.name}/mon/trajectories/**", receive)
@@ -68,8 +70,12 @@ def on_first_adapt_trajectory(folder, act, round_=0):
         yield acted
 
 
+def descendants_of(process):
+    return psutil.Process(process.pid).children(recursive=True)
+
+
 def workers_of(process):
-    return [p for p in psutil.Process(process.pid).children(recursive=True) if processes.is_worker(p)]
+    return [p for p in descendants_of(process) if processes.is_worker(p)]
 
 
 def equal(result, other):
@@ -78,7 +84,7 @@ def equal(result, other):
 
 def kill_the_tree(process):
     """Send SIGKILL to the command and to all processes that it started, Ray's included."""
-    family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    family = [psutil.Process(process.pid), *descendants_of(process)]
     for member in family:
         with contextlib.suppress(psutil.NoSuchProcess):
             member.kill()

@@ -57,8 +57,8 @@ def test_each_expert_acts_in_its_own_row(run):
     torch.manual_seed(0)
     spec = registry.of(run).spec
     batch = batched.SACBatch(range(3), spec, run.sac, "cpu")
-    shapes = dict.fromkeys(("actions", "adversary", "labels", "led_actions", "led_labels"), (0, 1, 2))
-    shapes |= {"rewards": (0, 1), "led_rewards": (0, 1), "observations": (0, 2, 6), "led_observations": (0, 2, 6)}
+    shapes = dict.fromkeys(("actions", "adversary", "labels", "window_actions", "window_labels"), (0, 1, 2))
+    shapes |= {"rewards": (0, 1), "window_rewards": (0, 1), "observations": (0, 2, 6), "window_observations": (0, 2, 6)}
     empty = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     actors = batch.arrays["actor"].numpy()
     made = [History(**empty, actor=actor) for actor in actors]
@@ -97,34 +97,38 @@ def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_anoth
     sent = do(windowed, job)
     found = [cache.load_any(v, HORIZON, windowed.sac, windowed.seed) for v in job.variations]
     policies = [ExpertPolicy([history] * 4, windowed.sac) for history in found]
-    unused, led = np.zeros((4, 2)), {False: 0, True: 0}
+    unused, counts = np.zeros((4, 2)), {False: 0, True: 0}
     for t in sent:
         row = job.variations.index(t.variation)
         own, other = policies[row], policies[(row + 2) % 4]  # two variations of each of two tasks
         assert t.variation.task != job.variations[(row + 2) % 4].task
-        assert len(t.queries) == 6 + 5 * 4 and len(t.taken) == 20
-        states, taken, labels = t.queries[6:].reshape(5, 4, 6), t.taken.reshape(5, 4, 2), t.labels[6:].reshape(5, 4, 2)
-        whole = found[row].led_observations[:, :-1]
+        assert len(t.queries) == 6 + 5 * 4 and len(t.prev_actions) == 20
+        states, prev_actions, labels = (
+            t.queries[6:].reshape(5, 4, 6),
+            t.prev_actions.reshape(5, 4, 2),
+            t.labels[6:].reshape(5, 4, 2),
+        )
+        whole = found[row].window_observations[:, :-1]
         for n in range(5):
             np.testing.assert_allclose(labels[n], own.act(states[n], unused), atol=1e-5)
-            decoy = np.abs(taken[n] - labels[n]).max() > 1e-4
-            led[bool(decoy)] += 1
-            np.testing.assert_allclose(taken[n], (other if decoy else own).act(states[n], unused), atol=1e-5)
+            decoy = np.abs(prev_actions[n] - labels[n]).max() > 1e-4
+            counts[bool(decoy)] += 1
+            np.testing.assert_allclose(prev_actions[n], (other if decoy else own).act(states[n], unused), atol=1e-5)
             places = [
                 (g, h) for g in range(WINDOW_EPISODES) for h in range(HORIZON - 3) if (whole[g, h : h + 4] == states[n]).all()
             ]
-            assert bool(places) != decoy, "four states in a row of an episode that its own expert led, or of another"
+            assert bool(places) != decoy, "four states in a row of an episode in which its own expert acted, or another"
             if places:
                 g, h = places[0]
-                np.testing.assert_array_equal(t.gained.reshape(5, 4)[n], found[row].led_rewards[g, h : h + 4])
-    assert min(led.values()) > 0.25 * sum(led.values())
+                np.testing.assert_array_equal(t.prev_rewards.reshape(5, 4)[n], found[row].window_rewards[g, h : h + 4])
+    assert min(counts.values()) > 0.25 * sum(counts.values())
 
 
 def test_a_job_of_one_task_has_no_decoys(windowed):
-    alone = dataclasses.replace(windowed, stream=dataclasses.replace(windowed.stream, job_tasks=1))
+    one_task_jobs = dataclasses.replace(windowed, stream=dataclasses.replace(windowed.stream, job_tasks=1))
     with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or a stream\.job_tasks with at least two"):
-        validate(alone, "x")
-    validate(dataclasses.replace(alone, pretrain=dataclasses.replace(alone.pretrain, decoy_fraction=0.0)), "x")
+        validate(one_task_jobs, "x")
+    validate(dataclasses.replace(one_task_jobs, pretrain=dataclasses.replace(one_task_jobs.pretrain, decoy_fraction=0.0)), "x")
 
 
 def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed(windowed):
@@ -134,8 +138,8 @@ def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed
     draw = method.data(run, method.phases(run)[0], data)
     torch.manual_seed(0)
     model = method.build(registry.of(run).spec, run)
-    taken = draw(np.random.default_rng(0)).windows.actions
-    assert taken.shape == (8, 2, 4, 2) and taken.dtype == np.float32
+    prev_actions = draw(np.random.default_rng(0)).windows.prev_actions
+    assert prev_actions.shape == (8, 2, 4, 2) and prev_actions.dtype == np.float32
 
     def loss(step):
         return batch_loss(model, draw(np.random.default_rng(step)))

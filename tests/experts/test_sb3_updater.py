@@ -19,21 +19,21 @@ BACKEND = "stable-baselines3"
 
 
 def test_updates_are_those_of_stable_baselines3_and_those_of_the_engine_up_to_rounding(tmp_path, monkeypatch):
-    alone, engine = SACBatch([0], SPEC, SMALL, "cpu", backend=BACKEND), SACBatch([0], SPEC, SMALL, "cpu")
-    alone.save_sb3(0, tmp_path / "before.zip")
+    single, engine = SACBatch([0], SPEC, SMALL, "cpu", backend=BACKEND), SACBatch([0], SPEC, SMALL, "cpu")
+    single.save_sb3(0, tmp_path / "before.zip")
     for batch, noise in random_updates(SMALL, 10, experts=1):
-        alone.update(batch, noise)
+        single.update(batch, noise)
         engine.update(batch, noise)
     updated_by_sb3(
         Expert.load(tmp_path / "before.zip", device="cpu"), 0, random_updates(SMALL, 10, experts=1), monkeypatch
     ).save(tmp_path / "after.zip")
-    theirs, updates = load(tmp_path / "after.zip", SPEC, SMALL, (alone.actor_shape, alone.critic_shape))
-    assert updates == alone.updates == 10
-    for name, array in alone.arrays.items():
+    theirs, updates = load(tmp_path / "after.zip", SPEC, SMALL, (single.actor_shape, single.critic_shape))
+    assert updates == single.updates == 10
+    for name, array in single.arrays.items():
         torch.testing.assert_close(array[0], theirs[name], atol=1e-6, rtol=1e-4, msg=name)
         torch.testing.assert_close(array, engine.arrays[name], atol=2e-5, rtol=1e-3, msg=name)
     untrained = SACBatch([0], SPEC, SMALL, "cpu")
-    assert all(not torch.equal(alone.arrays[name], array) for name, array in untrained.arrays.items())
+    assert all(not torch.equal(single.arrays[name], array) for name, array in untrained.arrays.items())
 
 
 def test_training_continues_from_a_state_and_does_not_change_the_global_generators():

@@ -117,9 +117,9 @@ def invalid(trajectory):
         ("spec", changed(observations=trajectory.observations[:5], **short)),
         ("spec", changed(actions=far)),
         ("spec", changed(labels=trajectory.labels[:, :4])),
-        ("spec", changed(taken=np.full(2, 5, np.int16), gained=np.zeros(2, np.float32))),
-        ("spec", changed(taken=np.full(2, -1, np.int16), gained=np.zeros(2, np.float32))),
-        ("not-finite", changed(taken=np.zeros(2, np.int16), gained=np.full(2, np.inf, np.float32))),
+        ("spec", changed(prev_actions=np.full(2, 5, np.int16), prev_rewards=np.zeros(2, np.float32))),
+        ("spec", changed(prev_actions=np.full(2, -1, np.int16), prev_rewards=np.zeros(2, np.float32))),
+        ("not-finite", changed(prev_actions=np.zeros(2, np.int16), prev_rewards=np.full(2, np.inf, np.float32))),
         ("unexpected", changed(identity=Identity("adapt", 7, 0, 0, 0))),
         (
             "unexpected",
@@ -146,7 +146,7 @@ def test_invalid_messages_are_refused_and_counted_by_reason(ingest, trajectories
 def test_continuous_actions_are_checked_against_the_spec(trajectories, job):
     spec = Spec((0.0, 0.0), (2.0, 2.0), 3, len(trajectories[0].actions), discrete=False)
     one, rng = trajectories[0], np.random.default_rng(0)
-    shapes = {"actions": (len(one.actions), 3), "labels": (len(one.queries), 3), "taken": (len(one.taken), 3)}
+    shapes = {"actions": (len(one.actions), 3), "labels": (len(one.queries), 3), "prev_actions": (len(one.prev_actions), 3)}
     arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
     good = dataclasses.replace(one, adversary=np.zeros((len(one.actions), 2), np.float32), **arrays)
     check(good, job, spec, "")
@@ -181,7 +181,7 @@ def test_each_trajectory_of_a_request_has_its_own_answer(ingest, trajectories):
         ("not-msgpack", b""),
         ("oversized", b"\0" * ((1 << 20) + 1)),
         ("schema", wire.encode_message("batch")),
-        ("version", msgpack.packb({"v": 2, "kind": "batch", "items": []})),
+        ("version", msgpack.packb({"v": wire.VERSION + 1, "kind": "batch", "items": []})),
     ],
 )
 def test_a_request_that_is_not_a_batch_is_refused(ingest, reason, payload):

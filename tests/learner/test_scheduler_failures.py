@@ -68,29 +68,29 @@ def test_a_part_that_finishes_is_not_quarantined(scheduler, jobs):
 
 
 def test_a_job_of_one_variation_is_quarantined_at_its_third_death(jobs):
-    alone = dataclasses.replace(jobs[0], variations=jobs[0].variations[:1], tasks=1)
+    single = dataclasses.replace(jobs[0], variations=jobs[0].variations[:1], tasks=1)
     scheduler = LeaseScheduler(LEASE)
-    scheduler.open([alone], nothing_stored)
+    scheduler.open([single], nothing_stored)
     for worker in "ab":
-        assert leased(scheduler, worker) == alone
-        assert kill(scheduler, worker) == [alone] and not scheduler.quarantined
-    assert leased(scheduler, "c") == alone
+        assert leased(scheduler, worker) == single
+        assert kill(scheduler, worker) == [single] and not scheduler.quarantined
+    assert leased(scheduler, "c") == single
     assert kill(scheduler, "c") == []
     assert scheduler.quarantine_causes() == [("pretrain/0/0/0", "it died")] and scheduler.done(*PHASE)
     assert scheduler.progress(*PHASE) == (0, 0)
 
 
 def test_an_exception_counts_like_a_death_and_is_the_cause(jobs):
-    alone = dataclasses.replace(jobs[0], variations=jobs[0].variations[:1], tasks=1)
+    single = dataclasses.replace(jobs[0], variations=jobs[0].variations[:1], tasks=1)
     scheduler = LeaseScheduler(LEASE)
-    scheduler.open([alone], nothing_stored)
+    scheduler.open([single], nothing_stored)
     for _ in range(3):
         assert not scheduler.quarantined
         leased(scheduler, "a")
         scheduler.job_failed("a", ("pretrain", 0, 0, 2), "a job that it does not hold")
-        scheduler.job_failed("b", alone.name, "a worker that holds nothing")
-        scheduler.job_failed("a", alone.name, "ValueError: no")
-        scheduler.job_failed("a", alone.name, "reported twice")
+        scheduler.job_failed("b", single.name, "a worker that holds nothing")
+        scheduler.job_failed("a", single.name, "ValueError: no")
+        scheduler.job_failed("a", single.name, "reported twice")
     assert scheduler.quarantine_causes() == [("pretrain/0/0/0", "ValueError: no")]
 
 
@@ -234,11 +234,11 @@ def test_an_expert_from_a_cache_does_not_shorten_the_lease_of_a_training(trainin
 def test_failures_of_a_training_that_gets_further_each_time_are_forgotten(training):
     scheduler = LeaseScheduler(LEASE)
     scheduler.open(training[:1], nothing_stored)
-    for life in range(6):
-        assert leased(scheduler, f"w{life}") == training[0], "whole: parts would start from the beginning"
-        scheduler.reached(f"w{life}", training[0].label, 1000 * (life + 1))
-        scheduler.reached(f"w{life}", "another job", 10**9)
-        kill(scheduler, f"w{life}")
+    for death in range(6):
+        assert leased(scheduler, f"w{death}") == training[0], "whole: parts would start from the beginning"
+        scheduler.reached(f"w{death}", training[0].label, 1000 * (death + 1))
+        scheduler.reached(f"w{death}", "another job", 10**9)
+        kill(scheduler, f"w{death}")
     leased(scheduler, "w6")
     scheduler.reached("w6", training[0].label, 6000)  # no further than before
     kill(scheduler, "w6")

@@ -2,7 +2,7 @@
 
 import collections
 
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from learner.scheduler import LeaseScheduler
@@ -21,8 +21,16 @@ EVENTS = st.lists(
 )
 
 
+SPLIT_AFTER_A_DISCONNECTION = (
+    *(("lease", 0), ("fail", 0), ("lease", 0), ("die", 0)),
+    *(("lease", 1), ("lease", 0), ("die", 1)),
+)
+"""A worker counts as dead, its job is split because of that, and the worker asks for the next job."""
+
+
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(events=EVENTS)
+@example([(what, who, 0) for what, who in SPLIT_AFTER_A_DISCONNECTION])
 def test_no_sequence_of_events_loses_a_trajectory_or_quarantines_before_three_failures(jobs, events):
     scheduler = LeaseScheduler(LEASE, floor_s=1.0, factor=4.0)
     scheduler.open(jobs, nothing_stored)

@@ -9,14 +9,17 @@ import pytest
 
 import icrl_dist
 from icrl_dist import version
-from icrl_dist.config.run import parse
-from icrl_dist.stream import wire
+from icrl_dist.config import plugins
+from icrl_dist.config.run import make_run, parse
+from icrl_dist.stream import messages, wire
 from icrl_dist.stream.link import Refused, StreamKeys
+from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
 from learner import worker_api as worker_api_module
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 from tests.jobs import decoded, jobs_of
+from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 KEYS = StreamKeys("test")
 COUNTS = {"episodes": 0, "steps": 0, "resent": 0, "trajectories": 0, "waited_s": 0.0}
@@ -46,6 +49,10 @@ class Server:
     def request(self, kind, worker, link=None, **fields):
         message = wire.encode_message(kind, worker=worker, **fields)
         return wire.decode_message((link or self.link).request(KEYS.work, message, timeout_s=10.0))
+
+    def hello(self, worker, **changed):
+        fields = {"version": icrl_dist.__version__, "code": version.digest(), "plugins": {}, "pid": 1}
+        return self.request("hello", worker, **{**fields, **changed})
 
     def ask(self, worker, **counts):
         return self.request("ask", worker, **{**COUNTS, **counts})
@@ -87,12 +94,40 @@ def records(server):
 
 
 def test_hello_returns_the_run_and_refuses_another_version(server):
-    _, fields = server.request("hello", "w0", version=icrl_dist.__version__, code=version.digest(), pid=1)
+    _, fields = server.hello("w0")
     assert parse(fields["run"], "test") == server.run
     with pytest.raises(Refused, match=r"w0 runs icrl-dist 0\.0, the learner"):
-        server.request("hello", "w0", version="0.0", code=version.digest(), pid=1)
+        server.hello("w0", version="0.0")
     with pytest.raises(Refused, match="runs icrl-dist's code ffffffff, the learner"):
-        server.request("hello", "w0", version=icrl_dist.__version__, code="f" * 64, pid=1)
+        server.hello("w0", code="f" * 64)
+
+
+def sources(site, text, number="1.0"):
+    """What a worker says about its other packages where this source of the problem ``toy`` is installed."""
+    with installed(site, {"toy_problem.py": text}, number=number):
+        return {name: list(source) for name, source in plugins.sources().items()}
+
+
+def test_a_worker_with_another_source_of_the_runs_problem_is_refused(server, tmp_path, monkeypatch):
+    same = sources(tmp_path / "same", CORRIDOR)
+    other, newer = sources(tmp_path / "other", SLIPPERY), sources(tmp_path / "newer", CORRIDOR, "1.1")
+    with installed(tmp_path / "learner", {"toy_problem.py": CORRIDOR}):
+        for plugins_there in (same, other, {}):
+            server.hello("w0", plugins=plugins_there)  # the run has another problem
+        monkeypatch.setattr(server.worker_api, "_run", make_run("toy"))
+        server.hello("w0", plugins=same)
+        codes = {name: made["problems/toy"][2][:8] for name, made in (("same", same), ("other", other))}
+        ours = rf"the learner has toys 1\.0 with code {codes['same']}: install the same version on every node"
+        for there, theirs in (
+            (other, rf"toys 1\.0 with code {codes['other']}"),
+            (newer, rf"toys 1\.1 with code {codes['same']}"),
+            ({}, "no other package with it"),
+        ):
+            with pytest.raises(Refused, match=f"problem 'toy': worker w0 has {theirs}, {ours}"):
+                server.hello("w0", plugins=there)
+    monkeypatch.setattr(server.worker_api, "_run", server.run)
+    with pytest.raises(Refused, match=r"method 'icaa': worker w0 has toys .*, the learner has no other package with it"):
+        server.hello("w0", plugins={"methods/icaa": same["problems/toy"]})
 
 
 def test_invalid_requests_are_refused_and_the_next_is_answered(server):
@@ -108,6 +143,7 @@ def test_requests_are_answered_with_jobs_then_wait_then_stop(server):
     for i, job in enumerate(server.jobs):
         kind, fields = server.ask(f"w{i}")
         assert (kind, decoded(server.run, fields["job"]), fields["deadline_s"]) == ("job", job, 60.0)
+        assert read(messages.LeasedJob, fields, kind).name == job.name
     assert server.ask("w3") == ("wait", {"seconds": 0.1})
     server.worker_api.finish()
     assert server.ask("w3") == ("stop", {})
@@ -153,7 +189,7 @@ def test_a_worker_that_ends_without_a_report_gets_a_crash_record(server, worker)
     assert event["text"] == f"worker w0 ended without a report ({cause}); {path}"
     (record,) = records(server).values()
     assert (record["what"], record["job"], record["seed"]) == ("vanished", server.jobs[0].label, server.run.seed)
-    assert record["last_said"]["episodes"] == 7 and record["stacks"] == []
+    assert record["last_heartbeat"]["episodes"] == 7 and record["stacks"] == []
     joined, ended = (event["text"] for event in server.wait("worker", 2))
     assert joined == "worker w0 joined" and ended == "worker w0 is gone; its job will be leased again: pretrain/0/0"
     assert decoded(server.run, server.ask("w1")[1]["job"]) == server.jobs[0]
@@ -235,34 +271,34 @@ def test_a_quarantine_is_reported_once_and_the_run_continues(server):
 
 
 def test_the_cause_of_a_quarantine_by_death_names_worker_and_stacks(server, worker):
-    alone = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
-    server.scheduler.open([alone], lambda job: ())
-    for life in range(3):
-        link = worker(f"w{life}")
-        server.ask(f"w{life}")
-        stacks = crash_reports.stacks_of(server.folder, f"w{life}")
+    single = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
+    server.scheduler.open([single], lambda job: ())
+    for death in range(3):
+        link = worker(f"w{death}")
+        server.ask(f"w{death}")
+        stacks = crash_reports.stacks_of(server.folder, f"w{death}")
         stacks.parent.mkdir(exist_ok=True)
         stacks.write_text("Fatal Python error: Segmentation fault\n")
         link.close()
-        server.wait("crash", life + 1)
+        server.wait("crash", death + 1)
     assert server.wait("quarantine")[0]["cause"] == "worker w2 died: Fatal Python error: Segmentation fault"
 
 
 def test_a_quarantine_is_released_when_workers_were_lost_with_their_nodes(server, worker):
-    alone = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
-    server.scheduler.open([alone], lambda job: ())
+    single = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
+    server.scheduler.open([single], lambda job: ())
     keep = server.jobs[1]
     server.scheduler.open([dataclasses.replace(keep, stage="adapt")], lambda job: ())
     server.worker_api.lost_with_node(["w0"])
-    for life in range(4):
-        link = worker(f"w{life}")
-        assert decoded(server.run, server.ask(f"w{life}")[1]["job"]) == alone
+    for death in range(4):
+        link = worker(f"w{death}")
+        assert decoded(server.run, server.ask(f"w{death}")[1]["job"]) == single
         link.close()
-        server.wait("crash", life + 1)
+        server.wait("crash", death + 1)
     server.wait("quarantine")
     server.worker_api.lost_with_node(["w1", "w2", "w3"])
     assert server.wait("released")[0]["text"].startswith("variation pretrain/0/0/0 is leased again")
-    assert decoded(server.run, server.ask("w4")[1]["job"]) == alone and not server.scheduler.quarantined
+    assert decoded(server.run, server.ask("w4")[1]["job"]) == single and not server.scheduler.quarantined
 
 
 def test_a_run_in_which_every_job_fails_ends_with_the_cause(server):
@@ -276,12 +312,12 @@ def test_a_run_in_which_every_job_fails_ends_with_the_cause(server):
 
 
 def test_a_phase_with_only_quarantined_variations_ends_the_run(server):
-    alone = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
-    server.scheduler.open([alone], lambda job: ())
+    single = dataclasses.replace(server.jobs[0], variations=server.jobs[0].variations[:1], tasks=1)
+    server.scheduler.open([single], lambda job: ())
     for _ in range(3):
         assert not server.failures
         server.ask("w0")
-        server.fail("w0", alone)
+        server.fail("w0", single)
     assert server.failures[0].startswith("pretrain/0: no trajectory was stored, and 1 of")
 
 

@@ -19,8 +19,8 @@ def test_a_prefix_equals_a_shorter_context() -> None:
     model, whole, queries = build(), transitions(), states(T + 1)
     together = model(whole, queries, torch.arange(T + 1).repeat(B, 1))
     for n in range(T + 1):
-        alone = model.decide(queries[:, n : n + 1], model.encode(part(whole, 0, n)))
-        torch.testing.assert_close(together[:, n : n + 1], alone, atol=1e-5, rtol=1e-5)
+        single = model.decide(queries[:, n : n + 1], model.encode(part(whole, 0, n)))
+        torch.testing.assert_close(together[:, n : n + 1], single, atol=1e-5, rtol=1e-5)
 
 
 @torch.no_grad()
@@ -49,8 +49,8 @@ def test_queries_do_not_see_one_another() -> None:
     prefix = torch.randint(0, T + 1, (B, Q), generator=torch.Generator().manual_seed(1))
     together = model(context, queries, prefix)
     for n in range(Q):
-        alone = model(context, queries[:, n : n + 1], prefix[:, n : n + 1])
-        torch.testing.assert_close(together[:, n : n + 1], alone, atol=1e-6, rtol=1e-5)
+        single = model(context, queries[:, n : n + 1], prefix[:, n : n + 1])
+        torch.testing.assert_close(together[:, n : n + 1], single, atol=1e-6, rtol=1e-5)
     assert together.std(dim=1).min() > 1e-3, "outputs hardly depend on the query: the comparison would prove nothing"
 
 

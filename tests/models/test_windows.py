@@ -21,8 +21,8 @@ def test_the_first_state_of_a_window_is_a_query_and_windows_do_not_see_each_othe
     together = model.decide_windows(of, cache, prefix)
     torch.testing.assert_close(together[:, :, 0], model.decide(of.states[:, :, 0], cache, prefix), atol=1e-5, rtol=1e-5)
     for r in range(R):
-        alone = model.decide_windows(part(of, slice(None), slice(r, r + 1)), cache, prefix[:, r : r + 1])
-        torch.testing.assert_close(alone, together[:, r : r + 1], atol=1e-5, rtol=1e-5)
+        single = model.decide_windows(part(of, slice(None), slice(r, r + 1)), cache, prefix[:, r : r + 1])
+        torch.testing.assert_close(single, together[:, r : r + 1], atol=1e-5, rtol=1e-5)
     assert together.std(dim=2).min() > 1e-3, "outputs hardly depend on the state, so this would prove nothing"
 
 

@@ -38,8 +38,8 @@ def episode(task=0, variation=0, trial=0, total=3, worker="w0", stage="adapt", a
         adversary=overridden,
         queries=np.zeros((0, 2), np.float32),
         labels=np.zeros((0, 5), np.float32),
-        taken=none,
-        gained=np.zeros(0, np.float32),
+        prev_actions=none,
+        prev_rewards=np.zeros(0, np.float32),
         origin="none",
     )
 

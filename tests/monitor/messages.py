@@ -27,8 +27,8 @@ def trajectory(identity="adapt/0/3/1/7", total=2.0, worker="w0", task=ROOM, adve
         "adversary": np.where(np.arange(horizon) == 2, 1, -1).astype(np.int16),
         "queries": np.zeros((0, 2), np.float32),
         "labels": np.zeros((0, 5), np.float32),
-        "taken": np.zeros(0, np.int16),
-        "gained": np.zeros(0, np.float32),
+        "prev_actions": np.zeros(0, np.int16),
+        "prev_rewards": np.zeros(0, np.float32),
         "origin": "none",
     }
     return Trajectory(**(fields | changes))

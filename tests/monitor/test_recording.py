@@ -190,9 +190,9 @@ def test_without_a_folder_the_newest_run_with_a_live_learner_is_shown(hub, tmp_p
 def test_rollouts_of_new_weights_are_played_after_their_fit(tmp_path):
     recording = Recording(run_folder(tmp_path / "run"))
     try:
-        said = [(then - BEGAN, payload) for then, key, payload in recording.messages() if "/trajectories/" in key]
+        messages = [(at - BEGAN, payload) for at, key, payload in recording.messages() if "/trajectories/" in key]
     finally:
         recording.close()
-    assert len(said) == 72
-    assert max(then for then, payload in said if b"pretrain/" in payload) <= 2
-    assert min(then for then, payload in said if b"adapt/" in payload) > 6
+    assert len(messages) == 72
+    assert max(at for at, payload in messages if b"pretrain/" in payload) <= 2
+    assert min(at for at, payload in messages if b"adapt/" in payload) > 6

@@ -215,8 +215,8 @@ def test_a_foreign_host_name_is_refused(page):
 
 def test_an_address_that_cannot_be_used_gives_one_line_with_the_remedy():
     app, stream = application("play.html", EventStream()), EventStream()
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        port = occupied.getsockname()[1]
         with pytest.raises(ConfigError, match=rf"^cannot listen on 127.0.0.1, port {port}: .*in use; .*--web 0"):
             serving(app, stream, "127.0.0.1", port).__enter__()
     with pytest.raises(ConfigError, match="--web 70000"):

@@ -65,7 +65,7 @@ def test_every_nth_trajectory_up_to_the_count(monkeypatch):
 def test_msgpack_output_has_one_map_a_trajectory(monkeypatch):
     written, _ = tapped(monkeypatch, tasks=(1,), form="msgpack")
     found = list(msgpack.Unpacker(io.BytesIO(written)))
-    assert len(found) == 8 and found[0]["identity"] == "adapt/0/1/0/0" and found[0]["v"] == 1
+    assert len(found) == 8 and found[0]["identity"] == "adapt/0/1/0/0" and found[0]["v"] == wire.VERSION
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])

@@ -82,16 +82,16 @@ def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) ->
     assert problem.exact is not None
     exact = problem.exact.agent(run, "paper")
     for goals in (problem.split.test, problem.split.train[:3]):
-        met: list[tuple[Variation, ...]] = []
+        batches: list[tuple[Variation, ...]] = []
 
-        def act(rows: Sequence[Variation], env: Batch, met: list[tuple[Variation, ...]] = met) -> Policy:
-            met.append(tuple(rows))
+        def act(rows: Sequence[Variation], env: Batch, batches: list[tuple[Variation, ...]] = batches) -> Policy:
+            batches.append(tuple(rows))
             return exact(rows, env)
 
         same = gaps(run, act, goals)
         assert list(same) == ["0", "0.4"]
         assert all(row["gap"] == row["low"] == row["high"] == 0 and row["exact"] > 0 for row in same.values())
-        for p, rows in zip((0.0, 0.4), met, strict=True):
+        for p, rows in zip((0.0, 0.4), batches, strict=True):
             adversary = Adversary.of("uniform", p=p) if p else NULL
             assert rows == tuple(Variation(problem.at_test_start(t), adversary) for t in goals for _ in range(5))
     worse = gaps(run, problem.references(run)["random"].make, problem.split.test)

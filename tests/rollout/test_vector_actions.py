@@ -58,14 +58,14 @@ def examples(goal, rng, episodes):
     walks, states = [], rng.uniform(-1, 1, size=(64, 2)).astype(np.float32)
     for _ in range(episodes):
         env = Valley([goal])
-        seen, acted, gained = [env.reset(None)], [], []
-        while len(acted) < 12:
-            if len(acted) % 4 == 0:
+        observations, actions, rewards = [env.reset(None)], [], []
+        while len(actions) < 12:
+            if len(actions) % 4 == 0:
                 leads = rng.integers(0, 4, size=1)
-            way = np.clip(Valley.optimal(seen[-1], leads) + rng.normal(size=(1, 2)) / 5, -1, 1).astype(np.float32)
+            way = np.clip(Valley.optimal(observations[-1], leads) + rng.normal(size=(1, 2)) / 5, -1, 1).astype(np.float32)
             step = env.step(way)
-            seen.append(step.observation), acted.append(way), gained.append(step.reward)
-        walks.append([np.concatenate(column) for column in (seen, acted, gained)])
+            observations.append(step.observation), actions.append(way), rewards.append(step.reward)
+        walks.append([np.concatenate(column) for column in (observations, actions, rewards)])
     at = rng.uniform(-1, 1, size=(32, 2)).astype(np.float32)
     guess = np.where(rng.random(32) < 0.3, rng.integers(0, 4, size=32), goal)
     path = [at]
@@ -76,8 +76,8 @@ def examples(goal, rng, episodes):
     of = batches.LabelledWindows(
         along[:, :-1], Valley.optimal(along[:, :-1], guess[:, None]), near, Valley.optimal(along[:, :-1], np.array(goal))
     )
-    seen, acted, gained = (np.stack(column) for column in zip(*walks, strict=True))
-    return Examples(acted, seen, gained, states, Valley.optimal(states, np.array(goal)), False, of)
+    observations, actions, rewards = (np.stack(column) for column in zip(*walks, strict=True))
+    return Examples(actions, observations, rewards, states, Valley.optimal(states, np.array(goal)), False, of)
 
 
 def test_the_same_code_learns_and_deploys_vector_actions():
@@ -98,8 +98,8 @@ def test_the_same_code_learns_and_deploys_vector_actions():
     def earned(policy):
         for n in range(4):  # D_off: episodes of other policies
             seen = [examples(goal, np.random.default_rng((n, row)), 1) for row, goal in enumerate(goals)]
-            states, acted, gained = (np.concatenate([getattr(e, name) for e in seen]) for name in names)
-            policy.append(states[:, :-1], acted, states[:, 1:], gained)
+            states, actions, rewards = (np.concatenate([getattr(e, name) for e in seen]) for name in names)
+            policy.append(states[:, :-1], actions, states[:, 1:], rewards)
         ran = [episode(Valley(goals), policy, np.random.default_rng(9 + n).spawn(32)) for n in range(3)]
         assert all(e.actions.dtype == np.float32 and e.actions.shape == (32, 12, 2) for e in ran)
         return np.mean([e.returns for e in ran])

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import os
+import zlib
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_check
 from icrl_dist.storage.dataset import Damaged
 from icrl_dist.storage.dataset import Dataset as RealDataset
 from icrl_dist.storage.files import StoreError
-from icrl_dist.storage.segment import HEADER_BYTES, NAME, SEAL_BYTES, TRAJECTORY, frame
+from icrl_dist.storage.segment import FORMAT, HEADER_BYTES, NAME, SEAL_BYTES, TRAJECTORY, frame
 from icrl_dist.storage.sharing import adopt
 from icrl_dist.stream import wire
 from icrl_dist.types import Identity
 from tests.jobs import collected
+from tests.stream import examples
 
 
 @pytest.fixture
@@ -59,8 +61,8 @@ def test_reopening_gives_the_appended_trajectories_in_canonical_order(Dataset, t
 
 def test_one_segment_may_hold_discrete_and_continuous_actions(Dataset, tmp_path, trajectories):
     t, rng = trajectories[0], np.random.default_rng(0)
-    steps, queries, taken = len(t.actions), len(t.queries), len(t.taken)
-    shapes = {"actions": (steps, 3), "labels": (queries, 3), "taken": (taken, 3), "adversary": (steps, 2)}
+    steps, queries, window_steps = len(t.actions), len(t.queries), len(t.prev_actions)
+    shapes = {"actions": (steps, 3), "labels": (queries, 3), "prev_actions": (window_steps, 3), "adversary": (steps, 2)}
     arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
     vectors = [dataclasses.replace(t, identity=t.identity._replace(trial=100 + n), **arrays) for n in range(3)]
     Dataset(tmp_path).append([vectors[0], *trajectories, *vectors[1:]])
@@ -259,6 +261,57 @@ def test_intact_frames_with_invalid_content_are_refused(Dataset, tmp_path):
     (tmp_path / "segment-x.frames").write_bytes(b"")
     with pytest.raises(StoreError, match=r"segment-x\.frames"):
         Dataset(tmp_path)
+
+
+def in_format(content, number):
+    """The frames of a segment as another format writes them: formats differ in the third byte of each frame."""
+    other, at = bytearray(content), 0
+    while at < len(other):
+        other[at + 2 : at + 3] = number
+        other[at + 12 : at + 16] = zlib.crc32(other[at : at + 12]).to_bytes(4, "little")
+        at += HEADER_BYTES + int.from_bytes(other[at + 4 : at + 8], "little")
+    return bytes(other)
+
+
+FORMER = {
+    "sealed": lambda content: content,
+    "torn": lambda content: content[:-50],
+    "first header damaged": lambda content: b"x" + content[1:],
+    "after a frame of today": lambda content: frame(TRAJECTORY, b"") + content,
+}
+
+
+@pytest.mark.parametrize("change", FORMER)
+@pytest.mark.parametrize(("number", "shown"), [(b"r", 1), (b"9", 9)])
+def test_a_dataset_of_another_format_is_refused_in_one_line_and_not_repaired(
+    Dataset, tmp_path, trajectories, number, shown, change
+):
+    dataset = Dataset(tmp_path / "run")
+    dataset.append(trajectories)
+    dataset.seal()
+    path = segment_of(tmp_path / "run")
+    assert in_format(path.read_bytes(), b"2") == path.read_bytes()
+    path.write_bytes(FORMER[change](in_format(path.read_bytes(), number)))
+    before = path.read_bytes()
+    message = f"{path}: dataset format {shown}, this release reads 2: use the release that wrote it, or start a new run"
+    for read in (
+        lambda: Dataset(tmp_path / "run"),
+        lambda: Dataset(tmp_path / "run", readonly=True),
+        lambda: adopt(tmp_path / "run", tmp_path / "fork", keep=lambda _: True),
+    ):
+        with pytest.raises(StoreError) as refused:
+            read()
+        assert str(refused.value) == message
+    assert path.read_bytes() == before and [f.name for f in path.parent.iterdir()] == [path.name]
+    assert not list((tmp_path / "fork").iterdir())
+
+
+def test_whoever_changes_the_digest_of_a_trajectory_raises_the_numbers_of_segments_and_messages():
+    """A reader of the former numbers would give the same bytes another digest, so these three change together."""
+    t = examples.trajectory()
+    zeros = {name: np.zeros_like(array) for name, array in t.arrays().items()}
+    digest = wire.trajectory_digest(dataclasses.replace(t, **zeros))
+    assert (FORMAT, wire.VERSION, digest[:16]) == (2, 2, "c8a38d1bb2bebbc2")
 
 
 def is_early(identity):

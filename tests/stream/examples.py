@@ -34,8 +34,8 @@ def trajectory(steps: int = 5, queries: int = 3, variation: Variation = VARIATIO
         adversary=np.full(steps, -1, np.int16),
         queries=rng.normal(size=(queries, 2)).astype(np.float32),
         labels=rng.random((queries, 5)).astype(np.float32),
-        taken=rng.integers(0, 5, queries // 2).astype(np.int16),
-        gained=rng.normal(size=queries // 2).astype(np.float32),
+        prev_actions=rng.integers(0, 5, queries // 2).astype(np.int16),
+        prev_rewards=rng.normal(size=queries // 2).astype(np.float32),
         origin="optimal",
     )
 
@@ -43,7 +43,7 @@ def trajectory(steps: int = 5, queries: int = 3, variation: Variation = VARIATIO
 def vectors(steps: int = 5, queries: int = 3) -> Trajectory:
     """A trajectory with actions of four components and an adversary of three."""
     rng = np.random.default_rng(steps)
-    shapes = {"actions": (steps, 4), "adversary": (steps, 3), "taken": (queries // 2, 4), "labels": (queries, 4)}
+    shapes = {"actions": (steps, 4), "adversary": (steps, 3), "prev_actions": (queries // 2, 4), "labels": (queries, 4)}
     arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
     return dataclasses.replace(trajectory(steps, queries), origin="expert", **arrays)
 

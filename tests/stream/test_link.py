@@ -247,8 +247,8 @@ def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
         adversary=np.full(2, -1, np.int16),
         queries=np.zeros((0, 2), np.float32),
         labels=np.zeros((0, 5), np.float32),
-        taken=np.zeros(0, np.int16),
-        gained=np.zeros(0, np.float32),
+        prev_actions=np.zeros(0, np.int16),
+        prev_rewards=np.zeros(0, np.float32),
         origin="none",
     )
     with ZenohLink.listen(ANYWHERE) as learner:

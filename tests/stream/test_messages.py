@@ -16,7 +16,7 @@ from icrl_dist.types import STAGES
 
 COUNTS = {"episodes": 3, "steps": 24, "resent": 0, "trajectories": 3, "waited_s": 1.5}
 VALID: dict[str, dict[str, Any]] = {
-    "hello": {"worker": "w0", "version": "1", "code": "ab", "pid": 7},
+    "hello": {"worker": "w0", "version": "1", "code": "ab", "plugins": {"problems/toy": ["toys", "1.0", "cd"]}, "pid": 7},
     "ask": {"worker": "w0", **COUNTS},
     "failed": {"worker": "w0", "job": ["adapt", 0, 3, 0], "record": {"exception": "x"}, "file": ""},
     "note": {"worker": "w0", "text": "hello"},
@@ -24,6 +24,8 @@ VALID: dict[str, dict[str, Any]] = {
 BAD: list[tuple[str, str, object]] = [
     ("hello", "pid", -1),
     ("hello", "version", None),
+    ("hello", "plugins", {"problems/toy": ["toys", "1.0"]}),
+    ("hello", "plugins", {"problems/toy": ["toys", "1.0", 3]}),
     ("ask", "worker", 3),
     ("ask", "steps", "x"),
     ("ask", "steps", 1.0),

@@ -39,7 +39,7 @@ def array(name: str, shape: list[Any], content: bytes = b"", dtype: str | None =
     return put("arrays", name, [dtype or ARRAYS[name][0], shape, content])
 
 
-FOUR_TAKEN, FOUR_GAINED = ["<i2", [4], bytes(8)], ["<f4", [4], bytes(16)]
+FOUR_PREV_ACTIONS, FOUR_PREV_REWARDS = ["<i2", [4], bytes(8)], ["<f4", [4], bytes(16)]
 MALFORMED: list[tuple[str, str, bytes]] = [
     ("no bytes", "not-msgpack", b""),
     ("never used byte", "not-msgpack", b"\xc1"),
@@ -56,11 +56,12 @@ MALFORMED: list[tuple[str, str, bytes]] = [
     ("extension", "not-msgpack", repack(put("worker", msgpack.ExtType(5, b"x")))),
     ("empty extension", "not-msgpack", b"\x81\xa1v\xc7\x00\x05"),
     ("not a map", "schema", b"\x01"),
-    ("bytes as a key", "schema", repack(put(b"v", 1))),
+    ("bytes as a key", "schema", repack(put(b"v", wire.VERSION))),
     ("no version", "version", repack(lambda m: m.pop("v"))),
-    ("next version", "version", repack(put("v", 2))),
+    ("former version", "version", repack(put("v", wire.VERSION - 1))),
+    ("next version", "version", repack(put("v", wire.VERSION + 1))),
     ("true as version", "version", repack(put("v", True))),
-    ("float as version", "version", repack(put("v", 1.0))),
+    ("float as version", "version", repack(put("v", float(wire.VERSION)))),
     ("another kind", "schema", wire.encode_job(JOB)),
     ("missing field", "schema", repack(lambda m: m.pop("worker"))),
     ("unknown field", "schema", repack(put("extra", 1))),
@@ -96,11 +97,11 @@ MALFORMED: list[tuple[str, str, bytes]] = [
     ("four actions", "shape", repack(array("actions", [4], bytes(8)))),
     ("four rewards", "shape", repack(array("rewards", [4], bytes(16)))),
     ("two labels", "shape", repack(array("labels", [2, 5], bytes(40)))),
-    ("fewer window actions than rewards", "shape", repack(array("taken", [0]))),
+    ("fewer window actions than rewards", "shape", repack(array("prev_actions", [0]))),
     (
         "more window actions than queries",
         "shape",
-        repack(lambda m: m["arrays"].update(taken=FOUR_TAKEN, gained=FOUR_GAINED)),
+        repack(lambda m: m["arrays"].update(prev_actions=FOUR_PREV_ACTIONS, prev_rewards=FOUR_PREV_REWARDS)),
     ),
     ("queries of three", "shape", repack(array("queries", [3, 3], bytes(36)))),
     ("vectors for numbers", "dtype", repack(array("actions", [5, 4], bytes(80), "<f4"))),

@@ -148,7 +148,7 @@ def trajectory(trial: int) -> Trajectory:
     made["rewards"] = np.full(HORIZON, trial, np.float32)
     made["adversary"] = np.full(HORIZON, -1, np.int16)
     made["queries"], made["labels"] = np.zeros((0, 2), np.float32), np.zeros((0, ACTIONS), np.float32)
-    made["taken"], made["gained"] = np.zeros(0, np.int16), np.zeros(0, np.float32)
+    made["prev_actions"], made["prev_rewards"] = np.zeros(0, np.int16), np.zeros(0, np.float32)
     identity = Identity("adapt", 0, 0, 0, trial)
     return Trajectory(identity, Variation(Task.of("darkroom")), -1, "", "test", origin="none", **made)
 

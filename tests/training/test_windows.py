@@ -35,10 +35,15 @@ def pretraining_jobs(run, decoy_fraction):
 
 def followed(run, t):
     """Cells, actions, rewards and labels of a trajectory's windows."""
-    alone = len(t.queries) - len(t.taken)
-    assert (alone, len(t.taken)) == (run.pretrain.queries, 2 * LENGTH)
-    cells = cell_numbers(t.queries[alone:], 3).reshape(2, LENGTH)
-    return cells, t.taken.reshape(2, LENGTH), t.gained.reshape(2, LENGTH), t.labels[alone:].reshape(2, LENGTH, -1)
+    outside = len(t.queries) - len(t.prev_actions)
+    assert (outside, len(t.prev_actions)) == (run.pretrain.queries, 2 * LENGTH)
+    cells = cell_numbers(t.queries[outside:], 3).reshape(2, LENGTH)
+    return (
+        cells,
+        t.prev_actions.reshape(2, LENGTH),
+        t.prev_rewards.reshape(2, LENGTH),
+        t.labels[outside:].reshape(2, LENGTH, -1),
+    )
 
 
 @pytest.mark.parametrize("decoy_fraction", [0.0, 1.0])
@@ -49,14 +54,14 @@ def test_windows_are_played_in_the_variation_and_labelled_for_it(run, decoy_frac
             truth = soft_labels(
                 Hypotheses.of([t.variation]), run.section("darkroom").gamma, run.section("darkroom").label_slack
             )[0]
-            cells, taken, gained, labels = followed(run, t)
+            cells, prev_actions, prev_rewards, labels = followed(run, t)
             starts |= set(cells[:, 0].tolist())
             np.testing.assert_array_equal(labels, truth[cells])
             goal = int(t.variation.task.vector("goal")[0] * 3 + t.variation.task.vector("goal")[1])
-            np.testing.assert_array_equal(gained[:, :-1] == 1, cells[:, 1:] == goal)
+            np.testing.assert_array_equal(prev_rewards[:, :-1] == 1, cells[:, 1:] == goal)
             if t.variation.adversary.kind == "null":
-                np.testing.assert_array_equal(next_cell(3)[cells[:, :-1], taken[:, :-1]], cells[:, 1:])
-            right.append((np.take_along_axis(labels, taken[:, :, None].astype(np.int64), axis=2) > 0).mean())
+                np.testing.assert_array_equal(next_cell(3)[cells[:, :-1], prev_actions[:, :-1]], cells[:, 1:])
+            right.append((np.take_along_axis(labels, prev_actions[:, :, None].astype(np.int64), axis=2) > 0).mean())
     assert starts == set(range(9))
     assert np.mean(right) == 1 if decoy_fraction == 0 else np.mean(right) < 0.9
 
@@ -66,8 +71,8 @@ def test_a_trajectorys_windows_do_not_depend_on_the_other_variations_of_the_job(
     whole = {t.identity: t for t in do(run, job)}
     count = len(job.variations) // job.tasks
     for row, (task, k) in enumerate(job.rows()):
-        alone = dataclasses.replace(job, task=task, first=k, variations=job.variations[row : row + 1], tasks=1)
-        for t in do(run, alone):
+        single = dataclasses.replace(job, task=task, first=k, variations=job.variations[row : row + 1], tasks=1)
+        for t in do(run, single):
             for name, array in t.arrays().items():
                 np.testing.assert_array_equal(array, getattr(whole[t.identity], name), err_msg=name)
     assert count > 1
@@ -99,9 +104,9 @@ def test_training_draws_windows_of_the_contexts_variation():
         assert batch.windows.states.shape == (8, 3, LENGTH, 2)
         for row in range(8):
             mark = batch.actions[row, 0]
-            assert (batch.windows.actions[row] == mark).all() and (batch.windows.labels[row] == mark).all()
+            assert (batch.windows.prev_actions[row] == mark).all() and (batch.windows.labels[row] == mark).all()
             assert ((batch.windows.states[row] // 1) == mark).all()
-            np.testing.assert_array_equal(batch.windows.rewards[row], batch.windows.states[row, :, :, 0])
+            np.testing.assert_array_equal(batch.windows.prev_rewards[row], batch.windows.states[row, :, :, 0])
         chosen |= set(np.round(batch.windows.states[:, :, 0, 0] % 1 * 10).astype(int).ravel().tolist())
         prefixes |= set(batch.window_prefix.ravel().tolist())
     assert chosen == {0, 1, 2, 3} and prefixes == set(range(3 * HORIZON + 1))
@@ -121,6 +126,6 @@ def test_own_trials_are_cut_into_windows_that_do_not_cross_episodes(run):
     assert len(of.states) == len(expected)
     for n, (t, h) in enumerate(expected):
         np.testing.assert_array_equal(of.states[n], t.observations[h : h + LENGTH])
-        np.testing.assert_array_equal(of.actions[n], t.actions[h : h + LENGTH])
-        np.testing.assert_array_equal(of.rewards[n], t.rewards[h : h + LENGTH])
+        np.testing.assert_array_equal(of.prev_actions[n], t.actions[h : h + LENGTH])
+        np.testing.assert_array_equal(of.prev_rewards[n], t.rewards[h : h + LENGTH])
         np.testing.assert_array_equal(of.labels[n].argmax(axis=1), t.actions[h : h + LENGTH])

@@ -12,7 +12,7 @@ from torch import Tensor
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.types import Spec
 
-INITIALIZATION, STARTS, ACTIONS, UPDATES, LED = range(5)
+INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS = range(5)
 """The purpose of a generator: initial parameters, initial states, actions, updates, and the episodes after training
 from which action windows are cut."""
 

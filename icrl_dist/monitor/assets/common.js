@@ -79,24 +79,40 @@ export function color(name) {
   return colors.get(name);
 }
 
-/** Connect to the server's events; `handlers` by name of event.  The element `status` shows the state of the connection. */
+/**
+ * Connect to the server's events; `handlers` by name of event.  The element `status` shows the state of the connection:
+ * "live" once every event has arrived at least once, so that the page shows the server's whole state.
+ */
 export function listen(handlers, status) {
   const source = new EventSource("/events");
+  const missing = new Set(Object.keys(handlers)); // events that have not arrived on this connection
   const show = (kind, text) => {
     if (status.textContent === text) return;
     status.className = `badge ${kind}`;
     status.textContent = text;
   };
-  source.onopen = () => show("ok", "live");
-  source.onerror = () => show("bad", source.readyState === EventSource.CLOSED ? "disconnected: reload the page" : "reconnecting");
+  source.onerror = () => {
+    for (const name of Object.keys(handlers)) missing.add(name);
+    show("bad", source.readyState === EventSource.CLOSED ? "disconnected: reload the page" : "reconnecting");
+  };
   for (const [name, handle] of Object.entries(handlers)) {
-    source.addEventListener(name, (event) => handle(JSON.parse(event.data)));
+    source.addEventListener(name, (event) => {
+      if (missing.delete(name) && !missing.size) show("ok", "live");
+      handle(JSON.parse(event.data));
+    });
   }
   return source;
 }
 
-/** Send a command; resolves to "" or to the error, one line. */
-export async function command(fields) {
+let answered = Promise.resolve();
+
+/** Send a command after the answer to the one before it, so that they arrive in order; resolves to "" or to the error, one line. */
+export function command(fields) {
+  answered = answered.then(() => post(fields));
+  return answered;
+}
+
+async function post(fields) {
   try {
     const answer = await fetch("/command", {
       method: "POST",

@@ -41,7 +41,7 @@ export class Detail {
     this.name = name;
     this.shown = null;
     setText(byId("detail-title"), `Variation ${name}`);
-    setText(byId("detail-said"), "");
+    setText(byId("detail-note"), "");
     byId("detail-lineage").replaceChildren();
     byId("detail-episode").replaceChildren();
     this.tile.episode = null;
@@ -56,14 +56,14 @@ export class Detail {
     this.fetching = true;
     try {
       const answer = await fetch(`/variation/${this.name}`);
-      if (!answer.ok) return setText(byId("detail-said"), "The server has no data of this variation any more.");
+      if (!answer.ok) return setText(byId("detail-note"), "The server has no data of this variation any more.");
       const row = await answer.json();
       if (row.name === this.name) {
         this.shown = newest;
         this.#show(row);
       }
     } catch {
-      setText(byId("detail-said"), "No answer from the server.");
+      setText(byId("detail-note"), "No answer from the server.");
     } finally {
       this.fetching = false;
     }
@@ -133,9 +133,9 @@ export class Detail {
   async #copy(command) {
     try {
       await navigator.clipboard.writeText(command);
-      setText(byId("detail-said"), `Copied: ${command}`);
+      setText(byId("detail-note"), `Copied: ${command}`);
     } catch {
-      setText(byId("detail-said"), command);
+      setText(byId("detail-note"), command);
     }
   }
 }

@@ -57,7 +57,7 @@ export function drawRoom(element, room) {
   pen.lineJoin = "round";
   for (let i = 1; i < points.length; i++) {
     pen.globalAlpha = 0.2 + (0.65 * i) / points.length;
-    pen.strokeStyle = color({ agent: "--series-1", law: "--series-2", hand: "--series-4" }[points[i][2]]);
+    pen.strokeStyle = color({ agent: "--series-1", random: "--series-2", person: "--series-4" }[points[i][2]]);
     pen.lineWidth = 2;
     pen.beginPath();
     pen.moveTo(points[i - 1][0], points[i - 1][1]);
@@ -80,10 +80,10 @@ export function drawRoom(element, room) {
 
 /** Mark an overridden step: a triangle for a random override, a square for a manual one; false for the agent's own step. */
 function drawOverride(pen, [x, y, cause], r) {
-  if (cause !== "law" && cause !== "hand") return false;
-  pen.fillStyle = color(cause === "law" ? "--series-2" : "--series-4");
+  if (cause !== "random" && cause !== "person") return false;
+  pen.fillStyle = color(cause === "random" ? "--series-2" : "--series-4");
   pen.beginPath();
-  if (cause === "law") {
+  if (cause === "random") {
     pen.moveTo(x, y - 1.3 * r);
     pen.lineTo(x + 1.3 * r, y + r);
     pen.lineTo(x - 1.3 * r, y + r);

@@ -18,8 +18,8 @@ async function send(fields) {
 function showRoom() {
   drawRoom($("room"), room);
   const causes = room.path.map(([, cause]) => cause);
-  const manual = causes.filter((cause) => cause === "hand").length;
-  const random = causes.filter((cause) => cause === "law").length;
+  const manual = causes.filter((cause) => cause === "person").length;
+  const random = causes.filter((cause) => cause === "random").length;
   $("episode").textContent = room.episode;
   $("step").textContent = `${room.step} of ${room.horizon}`;
   $("total").textContent = number(room.total);
@@ -35,7 +35,7 @@ function showRoom() {
   $("speed-text").textContent = `${number(room.speed, room.speed < 10 ? 1 : 0)} steps a second`;
   setControl($("p"), room.p);
   $("p-text").textContent = number(room.p, 2);
-  setControl($("law"), room.law ?? "");
+  setControl($("distribution"), room.distribution ?? "");
   $("keep").checked = room.keep;
   for (const name of ["goal-x", "goal-y"]) $(name).max = room.size - 1;
   for (const button of document.querySelectorAll("[data-push]")) {
@@ -95,7 +95,7 @@ function showEpisodes() {
   const last = episodes.total.length - 1;
   const summary = last < 0 ? "no episode has ended yet" : `episode ${numbers[last]} has return ${number(episodes.total[last])}`;
   $("chart").setAttribute("aria-label", `Return by episode: ${summary}`);
-  if (last >= 0) $("said").textContent = summary;
+  if (last >= 0) $("announcement").textContent = summary;
 }
 
 // Commands.
@@ -111,7 +111,9 @@ $("through").addEventListener("click", () => send({ do: "episode" }));
 $("new").addEventListener("click", () => send({ do: "new" }));
 $("speed").addEventListener("input", () => send({ do: "speed", value: Math.min(FASTEST, Number(toSpeed($("speed").value).toFixed(2))) }));
 $("p").addEventListener("input", () => send({ do: "p", value: Number($("p").value) }));
-$("law").addEventListener("change", () => send({ do: "law", value: $("law").value === "" ? null : Number($("law").value) }));
+$("distribution").addEventListener("change", ({ target }) =>
+  send({ do: "distribution", value: target.value === "" ? null : Number(target.value) }),
+);
 $("keep").addEventListener("change", () => send({ do: "keep", value: $("keep").checked }));
 $("goal-form").addEventListener("submit", (event) => {
   event.preventDefault();

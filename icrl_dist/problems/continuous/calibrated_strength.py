@@ -19,7 +19,7 @@ from icrl_dist.config.toml import ConfigError
 from icrl_dist.problems.continuous.config import ControlConfig
 
 _FORM = re.compile(r"drop:(0?\.\d+|\d+e-\d+)")
-_FIELDS = {"problem": str, "forces": list, "metres": float, "drop": float, "strength": float}
+_FIELDS = {"problem": str, "forces": list, "meters": float, "drop": float, "strength": float}
 _METAWORLD = "metaworld"
 
 
@@ -63,7 +63,7 @@ def _look_up(control: ControlConfig, problem: str) -> float:
     rows = [row for row in table() if row["problem"] == problem and (control.forces in row["forces"] or not by_force)]
     for row in rows:
         if row["drop"] == wanted:
-            return float(row["strength"]) if by_force else float(row["strength"] * row["metres"] / control.disturbance)
+            return float(row["strength"]) if by_force else float(row["strength"] * row["meters"] / control.disturbance)
     known = ", ".join(f"drop:{row['drop']:g}" for row in rows) or "none"
     setting = f"{problem} with forces of {control.forces!r}" if by_force else problem
     raise ConfigError(
@@ -105,11 +105,14 @@ def own() -> list[dict[str, Any]]:
 def _rows(text: str, source: str) -> list[dict[str, Any]]:
     try:
         rows = json.loads(text)
-        good = all(isinstance(row[name], kind) for row in rows for name, kind in _FIELDS.items())
+        former = any("metres" in row for row in rows)
+        good = former or all(isinstance(row[name], kind) for row in rows for name, kind in _FIELDS.items())
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{source}: not a table of calibrated strengths ({error!r}); delete it and measure them again"
         ) from None
+    if former:
+        raise ConfigError(f"{source}: metres is now called meters: rename it")
     if not isinstance(rows, list) or not good or any(not 0 < row["strength"] < float("inf") for row in rows):
         raise ConfigError(f"{source}: not a table of calibrated strengths; delete it and measure them again")
     return rows

@@ -19,7 +19,7 @@ Make = Callable[[Any], Policy]
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """A disturbance of a problem; strength 1 is the largest force of a preset, or a displacement in metres."""
+    """A disturbance of a problem; strength 1 is the largest force of a preset, or a displacement in meters."""
 
     forces: str
     """The preset, ``paper`` or ``qarl``; empty in Meta-World."""
@@ -72,11 +72,11 @@ class DisturbanceExperts(abc.ABC):
 
     @abc.abstractmethod
     def describe(self, setting: Setting, config: SACConfig) -> dict[str, Any]:
-        """Fields of a result that name the disturbance: ``metres``, or ``forces``, ``newtons`` and ``steps``."""
+        """Fields of a result that name the disturbance: ``meters``, or ``forces``, ``newtons`` and ``steps``."""
 
     @abc.abstractmethod
     def calibration_key(self, setting: Setting) -> dict[str, Any]:
-        """Fields ``forces`` and ``metres`` of a calibrated strength."""
+        """Fields ``forces`` and ``meters`` of a calibrated strength."""
 
     @abc.abstractmethod
     def expert(self, config: SACConfig) -> str:

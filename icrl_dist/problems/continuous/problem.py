@@ -97,8 +97,8 @@ class ContinuousProblem(Problem):
                     "return that the undisturbed expert loses",
                 )
         yield from self._own_objections(run)
-        alone = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
-        if run.pretrain.windows and run.pretrain.decoy_fraction and alone:
+        single_task_job = count == 1 or count % run.stream.job_tasks == 1 or run.stream.job_tasks == 1
+        if run.pretrain.windows and run.pretrain.decoy_fraction and single_task_job:
             tasks = next((tasks for tasks in range(2, count + 1) if count % tasks != 1), 0)
             other = f"stream.job_tasks = {tasks}" if tasks else "control.train_tasks = 2"
             reason = "decoys need the expert of a second task in the same job"

@@ -33,7 +33,7 @@ HELD_S = 1.5
 _SUPPOSED = (NULL, Adversary.of("uniform", p=0.4))
 """Adversaries assumed in the posteriors over the goal; the exact posterior does not depend on them."""
 
-Cause = Literal["agent", "law", "hand"]
+Cause = Literal["agent", "random", "person"]
 """Who selected an executed action: the agent, a random override, or the person."""
 
 
@@ -117,7 +117,7 @@ class PlayGame:
         if done:
             causes = [c for _, c in self.path]
             optimum = None if self._changed else self.optimum
-            self.episodes.append(Played(self.total, optimum, self.horizon - causes.count("agent"), causes.count("hand")))
+            self.episodes.append(Played(self.total, optimum, self.horizon - causes.count("agent"), causes.count("person")))
 
     def _executed(self, action: int) -> tuple[int, Cause]:
         u, drawn = self._rng.random(), int(self._rng.choice(ACTIONS, p=self.override_probs))
@@ -125,8 +125,8 @@ class PlayGame:
         if chosen is None and self._clock() < self._held_until:
             chosen = self._held
         if chosen is not None:
-            return chosen, "hand"
-        return (drawn, "law") if u < self.p else (action, "agent")
+            return chosen, "person"
+        return (drawn, "random") if u < self.p else (action, "agent")
 
     def belief(self) -> Belief:
         """The posterior over goals that the agent's action distributions imply, and the exact posterior.
@@ -214,7 +214,7 @@ class PlayGame:
             "optimum": round(self.optimum, 2),
             "path": [[0, "start"], *([cell, cause] for cell, cause in self.path)],
             "p": self.p,
-            "law": None if self.override_probs == _UNIFORM else self.override_probs.index(1.0),
+            "distribution": None if self.override_probs == _UNIFORM else self.override_probs.index(1.0),
             "held": self._held if self._clock() < self._held_until else None,
             "speed": self.speed,
             "paused": self.paused,
@@ -275,7 +275,7 @@ def _flag(game: PlayGame, value: object) -> bool:
 COMMANDS: dict[str, tuple[Callable[[PlayGame, object], Any] | None, Callable[..., None]]] = {
     "goal": (_cell, PlayGame.move_goal),
     "p": (_number(0.0, 1.0, "p"), PlayGame.override),
-    "law": (_action_or_none, PlayGame.choose_distribution),
+    "distribution": (_action_or_none, PlayGame.choose_distribution),
     "push": (_action, PlayGame.override_once),
     "hold": (_action_or_none, PlayGame.hold),
     "speed": (_number(*SPEEDS, "speed"), PlayGame.change_speed),

@@ -42,7 +42,7 @@ class RoomLabelling:
 
 
 NO_WINDOWS = np.zeros(0, np.int16), np.zeros(0, np.float32)
-"""Actions and rewards of no action window."""
+"""``prev_actions`` and ``prev_rewards`` without action windows."""
 
 
 def labels_of(hypotheses: Hypotheses, labels: str, gamma: float, slack: float) -> Float32[np.ndarray, "M C A"]:
@@ -74,7 +74,7 @@ class RoomLabeller:
         single = [self._queries(row, rng) for row, rng in zip(rows.tolist(), rngs, strict=True)]
         if not self._labelling.windows:
             return single
-        states, taken, gained = self._windows(rows, rngs)
+        states, prev_actions, prev_rewards = self._windows(rows, rngs)
         labels = self._table[rows[:, None], cell_numbers(states, self._size)]
         if self._labelling.labels == "sampled":
             u = np.stack([rng.random(labels.shape[1]) for rng in rngs])
@@ -83,8 +83,8 @@ class RoomLabeller:
             LabelledQueries(
                 np.concatenate([one.queries, states[b]]),
                 np.concatenate([one.labels, labels[b]]),
-                taken[b],
-                gained[b],
+                prev_actions[b],
+                prev_rewards[b],
                 one.origin,
             )
             for b, one in enumerate(single)

@@ -99,7 +99,7 @@ class SACExperts(DisturbanceExperts):
 
     def calibration_key(self, setting: Setting) -> dict[str, Any]:
         presets = ["paper", "qarl"] if len(self.settings()) == 1 else [setting.forces]
-        return {"forces": presets, "metres": 0.0}
+        return {"forces": presets, "meters": 0.0}
 
     def expert(self, config: SACConfig) -> str:
         return f"SAC, {config.steps:,} steps, {'-'.join(map(str, config.hidden))}"

@@ -27,6 +27,7 @@ class DMCProblem(ContinuousProblem):
     """One task of one domain, varied over a grid of two physical parameters."""
 
     template = "dmc"
+    libraries = ("dm-control", "mujoco")
 
     def spec_of(self, task: Task) -> Spec:
         return domains.spec(task)

@@ -64,10 +64,10 @@ class ScriptedExperts(DisturbanceExperts):
         return ScriptedWithGoal
 
     def describe(self, setting: Setting, config: SACConfig) -> dict[str, Any]:
-        return {"metres": pick_place.disturbance(setting.task)}
+        return {"meters": pick_place.disturbance(setting.task)}
 
     def calibration_key(self, setting: Setting) -> dict[str, Any]:
-        return {"forces": [], "metres": pick_place.DISTURBANCE}
+        return {"forces": [], "meters": pick_place.DISTURBANCE}
 
     def expert(self, config: SACConfig) -> str:
         return "scripted"

@@ -35,6 +35,7 @@ class MetaWorldProblem(ContinuousProblem):
     """The agent must carry an object to a hidden goal; an adversary disturbs the observation."""
 
     template: ClassVar[str] = ""
+    libraries: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
     job_kinds: ClassVar[Mapping[str, JobKind]] = {ScriptedContexts.kind: JobKind(ScriptedContexts, _scripted_context)}
 
     def spec_of(self, task: Task) -> Spec:

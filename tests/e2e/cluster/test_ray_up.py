@@ -108,11 +108,11 @@ class TestJobs:
         commands = [jobs.exec(f"RAY_AUTH_MODE=disabled {jobs.train('open')}"), jobs.job("submit", "--", *unfit)]
         try:
             with ThreadPoolExecutor() as pool:
-                (said, _), (wrong, printed) = pool.map(refused, commands)
+                (refusal, _), (wrong, printed) = pool.map(refused, commands)
         finally:
             for key in keys:
                 key.with_suffix(".away").rename(key)
-        assert "without a token anyone who reaches Ray's ports" in said
+        assert "without a token anyone who reaches Ray's ports" in refusal
         where = r"worker-[ab] \(10.0.0.[34]\)"
         assert re.search(where + r": .*worker.key: cannot be read.*cannot reach the learner's port, 10.0.0.77:7447", wrong)
         assert re.search(r"Job '\w+' failed .*failed with exit code 2", printed)

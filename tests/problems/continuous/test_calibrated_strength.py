@@ -20,8 +20,8 @@ KIND = "dmc-cartpole-balance"
 RUN = f'problem = "{KIND}"\n[control]\ntrain_tasks = 4\nstrength = "drop:0.3"\n'
 
 
-def row(strength, problem=KIND, forces=("paper",), share=0.3, metres=0.0):
-    return {"problem": problem, "forces": list(forces), "metres": metres, "drop": share, "strength": strength}
+def row(strength, problem=KIND, forces=("paper",), share=0.3, meters=0.0):
+    return {"problem": problem, "forces": list(forces), "meters": meters, "drop": share, "strength": strength}
 
 
 @pytest.fixture
@@ -79,8 +79,8 @@ def test_a_run_has_the_measured_strength_and_keeps_it_when_the_table_changes(own
     assert parse(RUN, "file").control.solved.endswith("=8.0")
 
 
-def test_a_drop_in_meta_world_is_measured_in_metres(own):
-    own(row(0.6, problem="metaworld-pick-place", forces=(), metres=0.01))
+def test_a_drop_in_meta_world_is_measured_in_meters(own):
+    own(row(0.6, problem="metaworld-pick-place", forces=(), meters=0.01))
     text = 'problem = "metaworld-pick-place"\n[control]\nstrength = "drop:0.3"\ndisturbance = {}\n'
     assert calibrated_strength.strength(parse(text.format("0.01"), "file").control, "metaworld-pick-place") == 0.6
     assert calibrated_strength.strength(parse(text.format("0.02"), "file").control, "metaworld-pick-place") == pytest.approx(
@@ -99,15 +99,18 @@ def test_a_strength_that_is_neither_a_number_nor_a_drop_is_refused_with_the_form
 def test_an_unsolved_drop_is_refused_with_the_command_that_solves_it(own, capsys):
     file = own(row(7.5, share=0.5))
     assert main.main(["train", f"{KIND}-laptop", "--control.strength", "drop:0.25", "--out", str(file.parent / "r")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"`icrl-dist bench disturbance --problem {KIND} --drop 0.25`" in said
-    assert "solved: drop:0.5" in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1 and f"`icrl-dist bench disturbance --problem {KIND} --drop 0.25`" in printed
+    assert "solved: drop:0.5" in printed
     with pytest.raises(ConfigError, match=r"not solved for dmc-hopper-hop .*solved: none"):
         override(load("dmc-hopper-hop"), ["control.strength=drop:0.5"], "--set")
     with pytest.raises(ConfigError, match=r"section \[control\]: problem = 'darkroom' has no such section"):
         parse('[control]\nstrength = "drop:0.25"', "file")
     file.write_text("[{}]")
     with pytest.raises(ConfigError, match=r"not a table of calibrated strengths.*delete it"):
+        parse(RUN, "file")
+    file.write_text(file.read_text().replace("{}", '{"metres": 0.01}'))
+    with pytest.raises(ConfigError, match=r"drops\.json: metres is now called meters: rename it$"):
         parse(RUN, "file")
 
 
@@ -118,7 +121,7 @@ def test_the_packaged_table_contains_the_measurements_of_each_strength():
         below = [share for strength, share in one["tried"] if strength < one["strength"]]
         assert below and max(below) < one["drop"], "no smaller strength that was tried reaches the drop"
         assert f"--problem {one['problem']} --drop" in one["command"] and one["versions"] and one["date"]
-        assert one["undisturbed"] >= drop.COMPETENT * (5000 if one["metres"] else 200)
+        assert one["undisturbed"] >= drop.COMPETENT * (5000 if one["meters"] else 200)
 
 
 def test_a_solved_strength_is_stored_for_later_runs(own, monkeypatch, capsys):

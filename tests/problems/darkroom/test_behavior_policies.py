@@ -67,5 +67,5 @@ def test_rows_are_independent_and_have_their_own_draws():
     ran = episode(registry.batch([task] * 8), Walks(SIZE, HORIZON, kinds, together), together)
     for row, kind in enumerate(kinds):
         own = [np.random.default_rng([7, row])]
-        alone = episode(registry.batch([task]), Walks(SIZE, HORIZON, [kind], own), own)
-        np.testing.assert_array_equal(alone.observations[0], ran.observations[row])
+        single = episode(registry.batch([task]), Walks(SIZE, HORIZON, [kind], own), own)
+        np.testing.assert_array_equal(single.observations[0], ran.observations[row])

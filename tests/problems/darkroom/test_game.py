@@ -31,7 +31,7 @@ def test_the_agent_observes_its_own_action_and_the_outcome_only(run):
     (before, action, reward, after, done), (_, _, second, end, _) = g.agent.observed
     assert (before.tolist(), action, reward, after.tolist(), done) == ([0, 0], UP, 1, [1, 0], False)
     assert (second, end.tolist()) == (0, [1, 1])
-    assert g.path == [(3, "hand"), (4, "agent")] and g.total == 1
+    assert g.path == [(3, "person"), (4, "agent")] and g.total == 1
 
 
 def test_every_step_is_a_move_and_walls_stop_it(run):
@@ -48,13 +48,13 @@ def test_every_step_is_a_move_and_walls_stop_it(run):
 def test_the_adversary_overrides_with_its_probability_and_its_action_distribution(run):
     g = game(run)
     g.command({"do": "p", "value": 0.4})
-    g.command({"do": "law", "value": RIGHT})
+    g.command({"do": "distribution", "value": RIGHT})
     play(g, 8 * 200)
     share = sum(e.overridden for e in g.episodes) / (8 * len(g.episodes))
     assert abs(share - 0.4) < 0.05 and not any(e.by_hand for e in g.episodes)
     g.command({"do": "p", "value": 1})
     play(g, 8)
-    assert [cell for cell, _ in g.path] == [3] + [6] * 7 and {cause for _, cause in g.path} == {"law"}
+    assert [cell for cell, _ in g.path] == [3] + [6] * 7 and {cause for _, cause in g.path} == {"random"}
 
 
 def test_a_held_action_continues_until_it_is_released_or_expires(run):
@@ -71,7 +71,7 @@ def test_a_held_action_continues_until_it_is_released_or_expires(run):
     play(g, 1)
     clock.now += 0.02
     play(g, 1)
-    assert [cause for _, cause in g.path] == ["hand"] * 3 + ["agent", "hand", "agent"]
+    assert [cause for _, cause in g.path] == ["person"] * 3 + ["agent", "person", "agent"]
 
 
 def test_a_short_tap_between_two_steps_is_not_lost(run):
@@ -79,17 +79,17 @@ def test_a_short_tap_between_two_steps_is_not_lost(run):
     g.command({"do": "hold", "value": RIGHT})
     g.command({"do": "hold", "value": None})
     play(g, 2)
-    assert [cause for _, cause in g.path] == ["hand", "agent"]
+    assert [cause for _, cause in g.path] == ["person", "agent"]
 
 
 def test_the_optimum_is_the_expected_return_of_the_oracle_for_this_goal_and_adversary(run):
     g = game(run)
-    for p, law, q in ((0.0, None, [0.2] * 5), (0.5, None, [0.2] * 5), (0.5, LEFT, [0, 1, 0, 0, 0])):
+    for p, action, q in ((0.0, None, [0.2] * 5), (0.5, None, [0.2] * 5), (0.5, LEFT, [0, 1, 0, 0, 0])):
         g.command({"do": "p", "value": p})
-        g.command({"do": "law", "value": law})
+        g.command({"do": "distribution", "value": action})
         h = Hypotheses(3, 8, np.array([7]), np.array([p]), np.array([q], np.float64))
         assert g.optimum == pytest.approx(optimal_returns(h)[0])
-    assert g.snapshot()["law"] == LEFT
+    assert g.snapshot()["distribution"] == LEFT
 
 
 def test_an_episode_in_which_the_task_changed_has_no_optimum(run):
@@ -163,7 +163,7 @@ def test_snapshots_and_histories_are_json_of_bounded_size(run):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({}, "do='None': expected one of goal, p, law"),
+        ({}, "do='None': expected one of goal, p, distribution"),
         ({"do": "reset"}, "do='reset'"),
         ({"do": ["p"]}, "do="),
         ({"do": "p"}, "p: expected the fields do, value"),
@@ -176,7 +176,7 @@ def test_snapshots_and_histories_are_json_of_bounded_size(run):
         ),
         *(({"do": "push", "value": v}, "expected 0 to 4") for v in (-1, 5, 1.0, True, None, "up")),
         *(({"do": "hold", "value": v}, "expected 0 to 4") for v in (-1, 5, False)),
-        *(({"do": "law", "value": v}, "expected 0 to 4") for v in (7, "uniform")),
+        *(({"do": "distribution", "value": v}, "expected 0 to 4") for v in (7, "uniform")),
         *(({"do": "speed", "value": v}, "a number from 0.5 to 100") for v in (0, 1000, None)),
         *(({"do": "pause", "value": v}, "expected true or false") for v in (0, 1, "true", None)),
         ({"do": "x" * 5000}, "do='xxxx"),

@@ -84,9 +84,9 @@ def test_rows_of_a_batch_are_independent():
     targets = np.random.default_rng(1).dirichlet(np.ones(5), (3, 16))
     together = implied(targets, basis)
     for row, target in enumerate(targets):
-        alone = implied(target[None], basis)
-        assert np.abs(together.weight[row] - alone.weight[0]).sum() < 0.05
-        assert together.divergence[row] == pytest.approx(alone.divergence[0], abs=posterior.TOLERANCE)
+        single = implied(target[None], basis)
+        assert np.abs(together.weight[row] - single.weight[0]).sum() < 0.05
+        assert together.divergence[row] == pytest.approx(single.divergence[0], abs=posterior.TOLERANCE)
 
 
 def test_a_hundred_goals_take_milliseconds():

@@ -131,8 +131,8 @@ def test_a_row_does_not_depend_on_the_other_rows(room: Room) -> None:
 
     together = play(DarkRoom(variations), range(50), actions)
     for row in range(50):
-        alone = play(DarkRoom([variations[row]]), [row], actions[:, row : row + 1])
-        assert bytes_of(*alone, 0) == bytes_of(*together, row)
+        single = play(DarkRoom([variations[row]]), [row], actions[:, row : row + 1])
+        assert bytes_of(*single, 0) == bytes_of(*together, row)
 
 
 def test_actions_of_the_agent_do_not_change_those_of_the_adversary() -> None:

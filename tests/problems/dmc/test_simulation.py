@@ -118,14 +118,14 @@ def test_a_row_does_not_depend_on_the_other_rows(kind):
         *(network_adversary.network(seed, registry.spec(tasks[0]).observation, envs_forces(kind)) for seed in range(3)),
     ]
     rows = [Variation(task, adversary) for task, adversary in zip(tasks, adversaries, strict=True)]
-    together, alone = registry.batch(rows), registry.batch(rows[2:3])
+    together, single = registry.batch(rows), registry.batch(rows[2:3])
     actions = np.random.default_rng(0).uniform(-1, 1, (20, 4, together.spec.actions)).astype(np.float32)
     seen = [together.reset([np.random.default_rng(row) for row in range(4)])]
-    lonely = [alone.reset([np.random.default_rng(2)])]
+    of_single = [single.reset([np.random.default_rng(2)])]
     for now in actions:
         seen.append(together.step(now).observation)
-        lonely.append(alone.step(now[2:3]).observation)
-    np.testing.assert_array_equal(np.stack(seen)[:, 2], np.stack(lonely)[:, 0])
+        of_single.append(single.step(now[2:3]).observation)
+    np.testing.assert_array_equal(np.stack(seen)[:, 2], np.stack(of_single)[:, 0])
 
 
 def envs_forces(kind):
@@ -263,7 +263,7 @@ def test_extreme_actions_rarely_leave_the_range_of_an_observation(kind):
 
 
 def test_an_impossible_task_is_refused_with_the_remedy():
-    for kind, settings, said in (
+    for kind, settings, message in (
         ("dmc-cheeta-run", {}, "'dmc-cheeta-run'.*did you mean 'dmc-cheetah-run'"),
         ("dmc-cheetah-run", {"torso_mas": 5.0}, "'torso_mas'.*torso_mass"),
         ("dmc-cheetah-run", {"torso_mass": 20.0}, "torso_mass=20 lies outside its grid: use 3 to 9"),
@@ -273,7 +273,7 @@ def test_an_impossible_task_is_refused_with_the_remedy():
         ("dmc-cheetah-run", {"horizon": 0}, "horizon=0"),
         ("dmc-cheetah-run", {"horizon": 1.5}, "horizon=1.5"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             domains.task(kind, **settings)
     with pytest.raises(ValueError, match=r"did you mean 'dmc-cheetah-run'"):
         registry.spec(Task.of("dmc-cheetah-rum"))

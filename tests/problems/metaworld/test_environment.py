@@ -148,7 +148,7 @@ def test_a_diverged_simulation_stands_still_without_reward_and_the_next_episode_
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         ({"object": (0.5, 0.65, 0.02)}, r"object=\(0\.5, 0\.65, 0\.02\) lies outside its box"),
         ({"goal": (0.0, 0.85)}, r"goal=\(0\.0, 0\.85\) lies outside"),
@@ -158,9 +158,9 @@ def test_a_diverged_simulation_stands_still_without_reward_and_the_next_episode_
         ({"goal_show": 1}, r"no parameter 'goal_show'.*did you mean 'goal_shown'"),
     ],
 )
-def test_an_impossible_task_is_refused(settings, said):
+def test_an_impossible_task_is_refused(settings, message):
     given = {"object": (0.02, 0.65, 0.02), "goal": (0.05, 0.85, 0.2), **settings}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         pick_place.task(given.pop("object"), given.pop("goal"), **given)
 
 

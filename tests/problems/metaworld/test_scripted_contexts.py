@@ -85,7 +85,7 @@ def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_g
         assert all(np.allclose(one.observations[-1], seen[row]) for row, one in enumerate(rows))
     assert any(plan.lapses[:HORIZON].any() for plan in given)
     for t in sent:
-        assert not t.observations[:, 36:].any() and len(t.queries) == HORIZON and not len(t.taken)
+        assert not t.observations[:, 36:].any() and len(t.queries) == HORIZON and not len(t.prev_actions)
         labels = np.stack([states[query.tobytes(), t.variation] for query in t.queries])
         np.testing.assert_allclose(t.labels, labels, atol=1e-3)
     method, data = methods.of(run), InMemoryDataset(sent)
@@ -103,7 +103,7 @@ def test_the_same_job_gives_the_same_bytes_with_action_windows(run, monkeypatch)
     sent, again = (do(run, job) for _ in range(2))
     assert [wire.trajectory_digest(t) for t in sent] == [wire.trajectory_digest(t) for t in again]
     for t in sent:
-        assert t.taken.shape == (12, 4) and len(t.queries) == HORIZON + 12
+        assert t.prev_actions.shape == (12, 4) and len(t.queries) == HORIZON + 12
 
 
 def test_scripted_histories_are_refused_where_there_is_no_scripted_policy():
