@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
 
 def returns_table(frame: pd.DataFrame, title: str) -> Table:
-    """Mean return by online episode, one row per agent and p, with 95% intervals of the last episodes.
+    """Mean return by online episode, one row per agent and p, with the 95% interval of the last column.
 
     ``frame``: result rows of one suite.  The last column is the return of the last episodes as a share of the first
-    reference that is a ceiling (oracle, scripted policy or experts), or of the exact optimum if there is none.
+    reference that is a ceiling (oracle, scripted policy or experts), or of the exact optimum if there is none; without
+    either it is that return itself.
     """
     found = summaries.returns(frame)
     trainings, tasks, evaluations, episodes = found[0].returns.shape
@@ -40,7 +41,7 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
             "" if before is not None and before.p == one.p else f"{one.p:g}",
             one.name,
             *(f"{mean[e - 1]:.1f}" for e in shown),
-            _with_interval(value, known, "{:.1f}"),
+            _with_interval(value, known and share is None, "{:.1f}"),
             *([] if share is None else [_with_interval(share, known, "{:.0%}")]),
         )
     return table
@@ -50,7 +51,7 @@ def _with_interval(of: Interval, known: bool, form: str) -> str:
     if math.isnan(of.value):
         return "-"
     value, low, high = (form.format(number) for number in (of.value, of.low, of.high))
-    return f"{value} \\[{low}, {high}]" if known and not math.isnan(of.low) else value
+    return f"{value} \\[{low.removesuffix('%')}, {high.removesuffix('%')}]" if known and not math.isnan(of.low) else value
 
 
 def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) -> Table:

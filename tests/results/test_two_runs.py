@@ -136,10 +136,19 @@ def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method, 
             values = [row["return"] for row in records(own, episode=episode)]
             assert len(values) == 2 * SEEDS * len(seeds) and cells[2 + episode] == f"{sum(values) / len(values):.1f}"
         scores, oracle = nested(own, LAST), nested(records(rows, p=p, agent="oracle"), LAST)
-        resampled = drawn([scores, oracle], lambda one, two: (slow_mean(one), slow_ratio(one, two)))
+        resampled = drawn([scores, oracle], slow_ratio)
         value, share = slow_mean(means(scores)), slow_mean(means(scores)) / slow_mean(means(oracle))
-        assert cells[5] == "{:.1f} [{:.1f}, {:.1f}]".format(value, *percentiles(resampled[:, 0]))
-        assert cells[6] == "{:.0%} [{:.0%}, {:.0%}]".format(share, *percentiles(resampled[:, 1]))
+        assert cells[5] == f"{value:.1f}"
+        assert cells[6] == "{:.0%} [{:.0f}, {:.0f}]".format(share, *(100 * bound for bound in percentiles(resampled)))
+
+
+def test_without_a_ceiling_the_interval_is_that_of_the_return():
+    returns = [[[1.0, 2.0, 6.0], [3.0, 4.0, 5.0]], [[7.0, 9.0, 8.0], [2.0, 1.0, 0.0]]]
+    header, (cells,) = cells_of(rendered(tables.returns_table(frame(block(returns)), "")))
+    assert header[-1] == "last 3"
+    scores = [[[sum(evaluation) / 3 for evaluation in task] for task in returns]]
+    low, high = percentiles(drawn([scores], slow_mean))
+    assert cells[-1] == f"{slow_mean(means(scores)):.1f} [{low:.1f}, {high:.1f}]"
 
 
 def test_every_number_of_result_json_follows_from_the_rows(runs):
