@@ -68,7 +68,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or methods.of(run).deployment(run)
     answer: dict[str, Any] = {"suite": arguments.suite, "deploy": deploy, "what": str(what)}
     report = folder / "report" / heldout.report_name(run, what, arguments.suite, deploy)
-    results = _results_folder(folder)
+    results = (heldout.run_folder(what) or folder) / "results"  # the rows of a checkpoint in a run folder belong to that run
     if arguments.what is not None and is_unfinished(what):
         console.print(
             f"{what}: this run is not finished; the newest version so far is evaluated", highlight=False, markup=False
@@ -98,9 +98,3 @@ def _source_and_output(arguments: EvaluateArguments) -> tuple[Path, Path]:
     if what is None and name is not None:
         return shipped(name), Path("runs") / f"{name}-pretrained"
     raise ConfigError("evaluate: name a run folder or a checkpoint file, or with --pretrained an agent of the package")
-
-
-def _results_folder(folder: Path) -> Path:
-    """Where the result rows are written: rows of a checkpoint in a run folder belong to that run."""
-    run = folder.parent if folder.name == "checkpoints" and (folder.parent / "run.toml").exists() else folder
-    return run / "results"

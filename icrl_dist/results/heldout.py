@@ -25,7 +25,7 @@ from icrl_dist.results import evaluate, plots, rows, summaries, training_rows
 from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.names import key_of
-from icrl_dist.results.summaries import Returns
+from icrl_dist.results.returns import Returns, returns
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Dataset
@@ -130,9 +130,19 @@ def _recorded(
     deploy: Deployment | None = None,
 ) -> pd.DataFrame:
     """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows as they were read."""
-    name = what.resolve().name if what.is_dir() else what.stem
+    folder = run_folder(what)
+    name = what.stem if folder is None else folder.resolve().name
     blocks = [one.block(run, name, tasks) for tasks, ones in found.items() for one in ones]
     return rows.read([rows.append(results, suite, report_name(run, what, suite, deploy), blocks)])
+
+
+def run_folder(what: Path) -> Path | None:
+    """The run folder that a run folder or a checkpoint file belongs to; None for a file outside of one."""
+    if what.is_dir():
+        return what
+    beside = what.absolute().parent
+    folder = beside.parent if beside.name == "checkpoints" else beside
+    return folder if (folder / "run.toml").exists() else None
 
 
 def check_suite(run: Run, suite: str) -> None:
@@ -157,7 +167,7 @@ def offline(run: Run, what: Path, results: Path, deploy: Deployment | None = Non
 
 def show_online(run: Run, report: Path, frame: pd.DataFrame, console: Console) -> dict[str, Any]:
     """Print the table; write the numbers to ``report``.json and the figure to ``report``.png.  Returns both, and summaries."""
-    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), summaries.returns(frame)
+    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), returns(frame)
     _, tasks, evaluations, _ = found[0].returns.shape
     title = f"{run.method.upper()} on {registry.of(run).title(tasks)}, {evaluations} seeds"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
@@ -227,7 +237,7 @@ def posterior(run: Run, what: Path, results: Path, display: Display) -> dict[str
         evaluated[name] = posterior_suite.online(run, (agent, act), tasks, progress)
     frame = _recorded(run, what, results, "posterior", evaluated, "paper")
     for name, which in (("paper_gap", "test"), ("paper_gap_train", "train")):
-        report[name] = posterior_suite.gaps(frame[frame["tasks"] == which], run.seed)
+        report[name] = posterior_suite.gaps(frame[frame["tasks"] == which])
     return report
 
 
@@ -264,7 +274,7 @@ def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str
 
 def show_offline(run: Run, frame: pd.DataFrame, console: Console) -> dict[str, Any]:
     """Print the table; returns the numbers."""
-    found = summaries.returns(frame)
+    found = returns(frame)
     title = registry.of(run).title(found[0].returns.shape[1])
     console.print(returns_table(frame, f"One episode given data collected before: {title}"))
     _show_diverged(found, console)

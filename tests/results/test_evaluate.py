@@ -106,7 +106,7 @@ def test_numbers_of_result_json_are_means_over_tasks_and_seeds():
 
 def test_adaptation_is_measured_relative_to_the_oracle():
     def result(*tasks):
-        (found,) = summaries.returns(frame(block([[task] for task in tasks], optimum=[9.0] * len(tasks))))
+        (found,) = returns(frame(block([[task] for task in tasks], optimum=[9.0] * len(tasks))))
         return found
 
     oracle, model = result((10, 10, 8, 12)), result((1, 8, 9, 10))

@@ -19,7 +19,7 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.results import statistics, tables
 from icrl_dist.results.comparison import Comparison
 from icrl_dist.results.names import AgentKey, names
-from icrl_dist.results.summaries import Interval
+from icrl_dist.results.statistics import Interval
 from tests.results.row_blocks import block, frame
 from tests.results.test_statistics import slow_bootstrap, slow_improvement, slow_iqm, slow_mean, slow_minimum, slow_ratio
 
