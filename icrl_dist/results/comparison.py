@@ -81,6 +81,8 @@ def compare(first: Returns, second: Returns, last: int = LAST) -> list[Compariso
     (``check_pairs``).  Raises ConfigError if a row has no partner.
     """
     check_pairs(first, second)
+    if first.agent.data != second.agent.data:
+        raise ConfigError(f"a comparison needs one kind of offline data: data are {first.agent.data} and {second.agent.data}")
     scores, crossed = np.stack([first.scores(last), second.scores(last)]), first.crossed
 
     def over_cells(of: Float64[np.ndarray, "R 2 S C"]) -> Float64[np.ndarray, "R 3"]:

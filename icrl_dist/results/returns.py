@@ -129,8 +129,8 @@ def _arrays(agent: AgentKey, name: str, p: float, rows: pd.DataFrame, setting: d
     for column, level in zip(_INDEX[2:], levels[2:], strict=True):
         if level[0] != 0 or level[-1] != len(level) - 1:
             raise ConfigError(
-                f"result rows of {agent.agent}, p = {p:g}: {column} is {level[0]} to {level[-1]}, {len(level)} numbers, where it "
-                f"should be 0 to {len(level) - 1}: choose whole evaluations by the column evaluation"
+                f"result rows of {agent.agent}, p = {p:g}: {column} is {level[0]} to {level[-1]}, {len(level)} numbers, where "
+                f"it should be 0 to {len(level) - 1}: choose whole evaluations by the column evaluation"
             )
     first = rows.iloc[:: shape[2] * shape[3]]
     splits = first["split_seed"].astype(object).where(first["split_seed"].notna(), None)
@@ -174,7 +174,7 @@ def check_pairs(first: Returns, second: Returns) -> None:
             if here != there:
                 raise ConfigError(
                     f"result rows at p = {first.p:g}, training seed {seed}, task {index}: {first.name} has {_cell(here)} and "
-                    f"{second.name} has {_cell(there)}: pairs need equal split seeds, tasks and adversaries, so evaluate both alike"
+                    f"{second.name} has {_cell(there)}: pairs need equal split seed, task and adversary; evaluate both alike"
                 )
 
 

@@ -28,7 +28,7 @@ class Ceiling:
 
 
 def ceilings(found: list[Returns], last: int = LAST) -> dict[tuple[float, AgentKey], Ceiling]:
-    """By p and agent: the first agent that is given the task (such as the oracle or experts), or else the agent's exact optimum."""
+    """By p and agent: the first agent that is given the task (such as the oracle), or else the agent's exact optimum."""
     agents = [one for one in found if one.ceiling]
     if agents:
         best = {one.p: Ceiling(one.name, one.scores(last)) for one in agents if one.agent == agents[0].agent}

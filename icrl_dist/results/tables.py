@@ -27,7 +27,8 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
     found = returns(frame)
     trainings, tasks, evaluations, episodes = _shape(found)
     shown, last = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes], min(LAST, episodes)
-    caption = f"[...]: {statistics.resampled(trainings, tasks, evaluations, last)}"
+    over = statistics.resampled(trainings, tasks, evaluations, last)
+    caption = f"[...]: {over}" if statistics.units((trainings, tasks, evaluations)) > 1 else over
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for name in ("p", "agent", *(f"ep {e}" for e in shown), f"last {last}"):
         table.add_column(name, justify="left" if name == "agent" else "right")
