@@ -51,7 +51,7 @@ COLUMNS: dict[str, Column] = {
     "method": Column("string", "method of the run, such as `icaa`"),
     "problem": Column("string", "problem of the run, such as `darkroom`"),
     "training_seed": Column("int64", "`seed` of the run"),
-    "split_seed": Column("int64", "`split_seed` of the run's problem; null if the problem has none", True),
+    "split_seed": Column("int64", "`split_seed` of the run's problem; null if it has none that is a whole number", True),
     "suite": Column("string", "`online`, `offline`, `posterior`, `label_quality` or `experts`"),
     "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
     "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),
@@ -66,7 +66,7 @@ COLUMNS: dict[str, Column] = {
     "p": Column("double", "strength of the test adversary, from `evaluate.p`; null if it is an adversary of training", True),
     "adversary_family": Column("string", "family of the adversary, such as `dirichlet`; `null` is no disturbance"),
     "adversary_index": Column(
-        "int64", "number of the adversary: of the test task that it was drawn for, or of the variation in training"
+        "int64", "number of the test task for which the adversary was drawn; in training, number of the variation"
     ),
     "adversary": Column("string", "parameters of the adversary, JSON; of a network they include its seed and strength"),
     "evaluation_seed": Column("int64", "number of the evaluation of the task, from 0; the context starts empty in each"),
