@@ -60,7 +60,7 @@ class Command(NamedTuple):
     text: str
 
 
-class Refused(Exception):
+class ShellError(Exception):
     """The shell ended with an error; the message holds the command and what the shell printed."""
 
 
@@ -112,7 +112,7 @@ def comments(text: str) -> str:
 def calls(command: str, folder: Path) -> list[list[str]]:
     """The programs that bash calls for a command, each with its arguments, in an empty home folder.
 
-    Raises Refused if bash or a program that it looks for fails.
+    Raises ShellError if bash or a program that it looks for fails.
     """
     home, programs = folder / "home", folder / "programs"
     shutil.rmtree(home, ignore_errors=True)
@@ -132,7 +132,7 @@ def calls(command: str, folder: Path) -> list[list[str]]:
     script = f"set -e -o pipefail\n{command}\nwait\n"
     ended = subprocess.run([bash, "-c", script], cwd=home, env=environment, capture_output=True, text=True, timeout=20)
     if ended.returncode:
-        raise Refused(f"{command!r}: exit code {ended.returncode}, {ended.stderr.strip()}")
+        raise ShellError(f"{command!r}: exit code {ended.returncode}, {ended.stderr.strip()}")
     words = record.read_bytes().decode().split("\0")[:-1]
     found = []
     while words:

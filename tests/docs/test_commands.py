@@ -1,5 +1,6 @@
 """Every command in the documentation is one that a shell and the command line accept."""
 
+import functools
 import re
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from icrl_dist.cli.plan import PlanArguments
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config.run import ConfigError, load, override, validate
 from icrl_dist.config.toml import dumps
-from tests.docs.shell_commands import Command, Refused, blocks, calls, comments, filled, spans
+from tests.docs.shell_commands import Command, ShellError, blocks, calls, comments, filled, spans
 
 ROOT = Path.cwd()
 PAGES = [
@@ -24,7 +25,8 @@ SOURCES = sorted(Path("icrl_dist/cli").glob("*.py"))
 COMMAND_PAGE = Path("docs/commands.md")
 
 
-def fault(call: list[str]) -> str:
+@functools.cache
+def fault(*call: str) -> str:
     """Why a call of ``icrl-dist`` is refused before it does anything; empty if it is not."""
     if len(call) < 2:
         return ""
@@ -59,10 +61,10 @@ def faults(commands: list[Command], folder: Path) -> list[str]:
         else:
             try:
                 called = calls(filled(command.text), folder)
-            except Refused as error:
+            except ShellError as error:
                 called, wrong = [], [str(error)]
             else:
-                wrong = [f"{' '.join(call)}: {why}" for call in called if call[0] == "icrl-dist" and (why := fault(call))]
+                wrong = [f"{' '.join(call)}: {why}" for call in called if call[0] == "icrl-dist" and (why := fault(*call))]
             targets = [word for call in called if call[0] == "make" for word in call[1:] if "=" not in word]
             wrong += [
                 f"no target: make {target}" for target in targets if f"\n{target}:" not in (ROOT / "Makefile").read_text()
