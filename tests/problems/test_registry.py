@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import pytest
 
@@ -16,7 +17,8 @@ from icrl_dist.types import NULL, Split, Variation
 
 
 def with_room(run: Run, **values: object) -> Run:
-    return dataclasses.replace(run, darkroom=dataclasses.replace(run.section("darkroom"), **values))
+    changed: dict[str, Any] = {"darkroom": dataclasses.replace(run.section("darkroom"), **values)}
+    return dataclasses.replace(run, **changed)
 
 
 def split(run: Run) -> Split:
