@@ -129,9 +129,9 @@ def test_the_first_prior_is_the_one_trained_on(run: Run) -> None:
         divergence.training_variations(run, heldout=False) == groups[:7]
         and divergence.training_variations(run, heldout=True) == groups[7:]
     )
-    for heldout, groups_in_use in ((False, groups[:7]), (True, groups)):
+    for heldout, chosen in ((False, groups[:7]), (True, groups)):
         h, _ = divergence.hypotheses(run, heldout)
-        flat = [v for group in groups_in_use for v in group]
+        flat = [v for group in chosen for v in group]
         assert h.goal.tolist() == [3 * int(v.task.vector("goal")[0]) + int(v.task.vector("goal")[1]) for v in flat]
         assert h.p.tolist() == [0.0 if v.adversary == NULL else v.adversary.number("p") for v in flat]
         q = [[0.2] * 5 if v.adversary == NULL else argmax_distribution(v.adversary.vector("alpha")) for v in flat]
