@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -89,8 +89,8 @@ def measured(run: Run, model: PretrainedTransformer, heldout: bool) -> Iterator[
 
 
 @pytest.mark.parametrize("prior", [own, independent])
-def test_exact_decisions_equal_enumeration(room: Room, prior: object) -> None:
-    variations = prior(room)  # type: ignore[operator]
+def test_exact_decisions_equal_enumeration(room: Room, prior: Callable[[Room], list[Variation]]) -> None:
+    variations = prior(room)
     rows = [variations[m] for m in (3, 8, 17)]
     context = walks(rows)
     query = np.random.default_rng(1).integers(0, SIZE**2, size=(3, 2 * HORIZON + 1))
