@@ -17,13 +17,16 @@ import pytest
 from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.serve import application, serving
 from tests.e2e.training import wait_for
+from tests.optional import known
 from tests.problems.darkroom.fixed_agent import game
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 
 CHROMIUM = Path("/usr/bin/chromium")
-QUIET = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
-QUIET += ("--disable-background-networking", "--disable-component-update")
+QUIET = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+)
 TIMEOUT_MS = 60_000
 
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}")
@@ -34,7 +37,7 @@ def served():
     command = [sys.executable, "-m", "icrl_dist.cli", "play", "--pretrained", "darkroom", "--web", "0", "--paused"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-    url = process.stdout.readline().partition(": ")[0]
+    url = known(process.stdout).readline().partition(": ")[0]
     yield process, url
     if process.poll() is None:
         process.send_signal(signal.SIGINT)

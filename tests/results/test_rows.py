@@ -54,6 +54,7 @@ def test_the_rows_of_an_evaluation_are_its_returns(small_run, tmp_path):
     key = ["agent", "p", "task_index", "evaluation_seed", "episode"]
     by_key = {tuple(row[name] for name in key): row for row in frame.to_dict("records")}
     for one in found:
+        assert one.optimum is not None
         for (task, seed, episode), value in np.ndenumerate(one.returns):
             row, variation = by_key[one.agent.key, one.p, task, seed, episode], one.variations[task]
             assert row["return"] == value and row["optimum"] == one.optimum[task]

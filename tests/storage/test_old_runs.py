@@ -21,11 +21,11 @@ from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_fo
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream.validation import VERSION
+from icrl_dist.telemetry.metrics import Metrics
 from learner import checkpoints, service
 
 OLD = Path(__file__).parents[1] / "config" / "written_by_0_1_0"
 TEXT = (OLD / "icag.toml").read_text()
-METRICS = service.Metrics
 
 
 def rewrite(path: Path, change: Callable[[dict[str, np.ndarray], dict[str, Any]], None]) -> None:
@@ -52,7 +52,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     folder = tmp_path_factory.mktemp("runs") / "old"
     run = parse_written(TEXT, "x")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        patch.setattr(service, "Metrics", lambda folder, **options: Metrics(folder, tensorboard=False, **options))
         train.prepare(run, folder, resume=False, overwrite=False)
         result = train.train_inline(run, folder, lambda event: None)
     (folder / "run.toml").write_text(TEXT)
