@@ -23,17 +23,25 @@ SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
 """Names of the agents in the package; docs/results/engine.md describes the training of each."""
 
 
-def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | None = None) -> InContextAgent:
+def load_agent(
+    what: str | Path, seed: int | None = None, deploy: Deployment | None = None, threads: int | None = 1
+) -> InContextAgent:
     """The agent of a run folder (its newest version), of a checkpoint file, or of the package, by its name.
 
     ``load_agent("darkroom")`` loads the agent of the package; write ``"./darkroom"`` for a run folder of that name.
 
-    Raises ConfigError if there is no such agent or it was not trained for the rule ``deploy``, StoreError
-    if the file was not written by this system.  Loading executes no code from the file.
+    ``seed``: of the draws of its actions; None: other draws each time.  ``deploy``: the deployment rule, ``paper`` or
+    ``committed``; None: the rule that it was trained for.
+    ``threads``: CPU threads of torch while the agent acts and observes; None: the number that torch is set to.  More
+    than one helps large batches on idle cores.  On busy cores threads that wait for each other can take a hundred
+    times as long (docs/decisions/073-openmp-wait-policy.md).  Outside these calls the process's own number holds.
+
+    Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy`` or if ``threads`` is
+    below 1, StoreError if the file was not written by this system.  Loading executes no code from the file.
     """
     checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint))
+    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
 
 
 def shipped(name: str | Path) -> Path:
