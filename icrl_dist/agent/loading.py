@@ -7,6 +7,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
 from icrl_dist.agent.trained_model import TrainedModel
@@ -102,7 +104,8 @@ def trained(checkpoint: Checkpoint) -> TrainedModel:
     try:
         run = parse_written(checkpoint.manifest["run"], "checkpoint")
         spec, method = spec_from(checkpoint.manifest["spec"]), methods.of(run)
-        model = method.build(spec, run)
+        with torch.random.fork_rng(()):  # an untrained model takes random numbers of the process
+            model = method.build(spec, run)
         load_weights(model, checkpoint.part("model"))
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StoreError(f"checkpoint: not an agent of this version of icrl-dist ({' '.join(str(error).split())})") from None

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions
 from rich.jupyter import JupyterMixin
 from rich.table import Table
 from rich.text import Text
@@ -43,7 +43,7 @@ class Evaluation(JupyterMixin):
         """The figure of the report, a PNG file; None for an evaluation without one."""
         return Path(self.summary["figure"]) if "figure" in self.summary else None
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | Text]:
         yield from self.tables
         yield from map(Text, self.notes)
 

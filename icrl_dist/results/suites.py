@@ -50,10 +50,9 @@ def evaluate(
     by this system.  The messages name the options of the command line.
     """
     source, folder = _source_and_output(what)
-    if suite not in get_args(Suite):
-        raise ConfigError(f"--suite {suite}: choose one of {', '.join(get_args(Suite))}")
-    if deploy is not None and deploy not in get_args(Deployment):
-        raise ConfigError(f"--deploy {deploy}: choose one of {', '.join(get_args(Deployment))}")
+    for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
+        if value is not None and value not in get_args(choices):
+            raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
     run = parse_written(str(load_checkpoint(checkpoint_file(source)).manifest.get("run", "")), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
