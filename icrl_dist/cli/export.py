@@ -40,6 +40,6 @@ def export(arguments: ExportArguments, console: Console) -> int:
     if out.exists() and not is_slim(out):
         raise ConfigError(f"--out {out}: exists and is not an exported agent; name another file")
     with Display(console) as display:
-        save_checkpoint(out, slim(heldout.calibrate(source, display)))
+        save_checkpoint(out, slim(heldout.calibrate(source, display.report)))
     console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)
     return OK

@@ -15,17 +15,15 @@ import os
 import re
 import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
 from icrl_dist.config.run import ConfigError
+from icrl_dist.console.display import ReportEvent
 from icrl_dist.storage.checkpoint import newest_version
 from icrl_dist.storage.files import StoreError, held, hold
-
-ReportEvent = Callable[[dict[str, Any]], None]
-"""Shows one event of a run, such as ``{"event": "note", "text": ...}``."""
 
 WAIT_S = 10.0
 """Seconds to wait for the processes of a killed run to end before its folder counts as in use."""

@@ -20,10 +20,11 @@ from typing import Any
 
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
+from icrl_dist.console.display import ReportEvent
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.learner_process import TrainFailed
-from icrl_dist.launch.run_folder import FolderTransaction, ReportEvent
+from icrl_dist.launch.run_folder import FolderTransaction
 from icrl_dist.storage.files import atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
@@ -31,7 +32,12 @@ from icrl_dist.stream.link import StreamKeys
 
 
 class TrainInterrupted(Exception):  # noqa: N818
-    """The run was interrupted; its checkpoint is written."""
+    """The run was interrupted by SIGINT or SIGTERM; the message says what its folder holds now."""
+
+    def __init__(self, text: str = "its checkpoint is written", resumable: bool = True) -> None:
+        super().__init__(text)
+        self.resumable = resumable
+        """Whether the run can be resumed in its folder."""
 
 
 def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> FolderTransaction:
@@ -132,7 +138,7 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
     from learner.service import Interrupted, RunFailed, Service
 
     hub = MemoryHub()
-    with hub.link() as learner_link, hub.link() as worker_link:
+    with _torch_unchanged(), hub.link() as learner_link, hub.link() as worker_link:
         try:
             service = Service(run, folder, learner_link, report)
         except RunFailed as error:
@@ -161,6 +167,20 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
                 worker.stop()
                 thread.join(timeout=30)
                 service.close()
+
+
+@contextlib.contextmanager
+def _torch_unchanged() -> Iterator[None]:
+    """Restore what the learner sets in torch for the whole process: its random numbers and its deterministic mode."""
+    import torch
+
+    mode = torch.get_deterministic_debug_mode()
+    initialized: bool = torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    with torch.random.fork_rng(range(torch.cuda.device_count()) if initialized else ()):
+        try:
+            yield
+        finally:
+            torch.set_deterministic_debug_mode(mode)
 
 
 def train_ray(
@@ -260,8 +280,12 @@ def interruptible() -> contextlib.AbstractContextManager[object]:
 
 @contextlib.contextmanager
 def _on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
-    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them."""
-    signals = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them.
+
+    The former handlers are set at the end.  Outside the main thread Python allows no handlers, and nothing is changed.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    signals = [number for number in numbers if signal.getsignal(number) is not None]  # another could not be set again
 
     def handle() -> list[Any]:
         return [signal.signal(number, lambda *_: stop()) for number in signals]

@@ -33,6 +33,9 @@ class FakeRay:
         self.unreachable, self.slow = set(), set()
         """Numbers of nodes whose Ray process cannot be reached, and of nodes that do not answer a check yet."""
 
+    def is_initialized(self):
+        return False
+
     def init(self, address=None, **options):
         if address == "192.0.2.99:6379":
             raise ConnectionError("no answer")

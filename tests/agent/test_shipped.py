@@ -123,3 +123,37 @@ def test_a_file_of_that_name_does_not_hide_the_shipped_agent(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     save_checkpoint(tmp_path / "darkroom", Checkpoint({}, {}))
     assert load_agent("darkroom").manifest["method"] == "icag"
+
+
+def test_an_agent_uses_its_own_number_of_threads_and_leaves_that_of_the_process(monkeypatch):
+    during = []
+
+    def seen(call):
+        def observed(*arguments):
+            during.append(torch.get_num_threads())
+            return call(*arguments)
+
+        return observed
+
+    def play(agent):
+        for name in ("act", "observe", "distribution"):
+            monkeypatch.setattr(agent._policy, name, seen(getattr(agent._policy, name)))
+        during.clear()
+        (action,) = agent.act(np.zeros((1, 2)))
+        agent.observe(np.zeros((1, 2)), [action], [0.0], np.ones((1, 2)), [False])
+        agent.distribution(np.zeros((1, 2)))
+        return during
+
+    torch.set_num_threads(2)
+    try:
+        assert play(load_agent("darkroom", seed=0)) == [1, 1, 1]
+        assert play(load_agent("darkroom", seed=0, threads=3)) == [3, 3, 3]
+        assert play(load_agent("darkroom", seed=0, threads=None)) == [2, 2, 2]
+        agent = load_agent("darkroom")
+        with pytest.raises(ValueError, match="obs has shape"):
+            agent.act(np.zeros((2, 2)))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+    with pytest.raises(ConfigError, match="threads = 0: use at least 1"):
+        load_agent("darkroom", threads=0)
