@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from icrl_dist.results.rows import read_results
     from icrl_dist.types import NULL, Adversary, Task, Variation
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "NULL",

@@ -1,9 +1,12 @@
-"""The checks of a commit are those of `make check`, and the citation is complete."""
+"""The checks of a commit are those of `make check`, the citation is complete, and one version is stated everywhere."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import yaml
+
+from icrl_dist import __version__
 
 
 def test_pre_commit_runs_what_make_check_runs():
@@ -19,3 +22,18 @@ def test_the_citation_names_the_paper():
     assert {"cff-version", "message", "title", "authors", "references"} <= citation.keys()
     (paper,) = citation["references"]
     assert paper["title"].startswith("Efficiently Robust In-Context") and paper["url"].startswith("https://")
+
+
+def test_the_package_its_metadata_and_the_changelog_state_one_version():
+    assert tomllib.loads(Path("pyproject.toml").read_text())["project"]["version"] == __version__
+    newest = re.findall(r"^## (.+)$", Path("CHANGELOG.md").read_text(), re.MULTILINE)
+    released = [title for title in newest if title != "Unreleased"]
+    assert re.fullmatch(rf"{re.escape(__version__)} - \d{{4}}-\d\d-\d\d", released[0])
+
+
+def test_the_sections_of_the_changelog_are_those_of_keep_a_changelog():
+    text = Path("CHANGELOG.md").read_text()
+    kinds = "Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"
+    assert set(re.findall(r"^### (.+)$", text, re.MULTILINE)) <= set(kinds)
+    for section in text.split("\n## ")[1:]:
+        assert "\n### " in section and not re.search(r"^\w", section.partition("\n### ")[0].partition("\n")[2], re.MULTILINE)
