@@ -36,4 +36,5 @@ def test_the_sections_of_the_changelog_are_those_of_keep_a_changelog():
     kinds = "Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"
     assert set(re.findall(r"^### (.+)$", text, re.MULTILINE)) <= set(kinds)
     for section in text.split("\n## ")[1:]:
-        assert "\n### " in section and not re.search(r"^\w", section.partition("\n### ")[0].partition("\n")[2], re.MULTILINE)
+        before, heading, _ = section.partition("\n### ")
+        assert heading and "\n- " not in before
