@@ -126,7 +126,7 @@ def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_anoth
 
 def test_a_job_of_one_task_has_no_decoys(windowed):
     one_task_jobs = dataclasses.replace(windowed, stream=dataclasses.replace(windowed.stream, job_tasks=1))
-    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or a stream\.job_tasks with at least two"):
+    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or stream\.job_tasks = 2"):
         validate(one_task_jobs, "x")
     validate(dataclasses.replace(one_task_jobs, pretrain=dataclasses.replace(one_task_jobs.pretrain, decoy_fraction=0.0)), "x")
 
