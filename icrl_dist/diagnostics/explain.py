@@ -108,7 +108,7 @@ def describe(answer: dict[str, Any]) -> str:
         "stored": f"segment {answer['segment']}, byte {answer['byte']}, {answer['bytes']} bytes",
         "sha256": answer["sha256"] + (" (intact)" if answer["intact"] else " (CHANGED)"),
     }
-    if sessions := answer["sessions"]:
+    if (sessions := answer["sessions"]) and not answer["from_ancestor"]:
         facts["run by"] = provenance.text(sessions[0])
         changed = dict.fromkeys(provenance.differences(sessions[0], later) for later in sessions[1:])
         facts["run by"] += "".join(f"; continued with other software or hardware: {text}" for text in changed if text)

@@ -78,7 +78,7 @@ def commit(root: Path = Path(__file__).parents[2]) -> str:
     command = ["git", "--no-optional-locks", "-C", str(root), "status", "--porcelain=v2", "--branch", "--", *version.PACKAGES]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # a hook's
     try:
-        ran = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True, env=environment)
+        ran = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True, env=environment)
     except (OSError, subprocess.SubprocessError):
         return ""
     lines = ran.stdout.splitlines()

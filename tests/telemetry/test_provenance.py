@@ -16,9 +16,11 @@ from icrl_dist import __version__, load_agent, read_results, version
 from icrl_dist.cli import main
 from icrl_dist.config import plugins
 from icrl_dist.launch import train
+from icrl_dist.results import rows
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from icrl_dist.telemetry import provenance
 from learner import service
+from tests.results.row_blocks import block
 
 DECIDES_BYTES = {"python", "torch", "numpy", "mujoco", "dm-control", "metaworld", "stable-baselines3", "ray", "eclipse-zenoh"}
 WORDS = ("--episodes", "1", "--seeds", "1", "--p", "0")
@@ -87,11 +89,14 @@ def test_a_processor_without_a_name_has_its_architecture(tmp_path: Path) -> None
     assert found == ["AMD EPYC 9B14", platform.machine(), platform.machine()]
 
 
-def test_the_package_of_the_problem_and_the_method_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_package_of_the_problem_and_the_method_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = plugins.Source("rooms", "3.1", "c" * 64)
     monkeypatch.setattr(plugins, "sources", lambda: {"problems/darkroom": source, "methods/other": source})
     found = provenance.record("darkroom", "dpt", 1)
     assert found["plugins"] == {"problems/darkroom": {"distribution": "rooms", "version": "3.1", "code": "c" * 64}}
+    rows.append(tmp_path / "results", "online", {}, [block([[[1.0]]])])
+    (row,) = read_results(tmp_path).to_dict("records")
+    assert json.loads(row["libraries"]) == {**found["libraries"], **found["plugins"]}
     newer = {**found, "plugins": {"problems/darkroom": source._replace(version="3.2")._asdict()}}
     expected = "problems/darkroom rooms 3.1 with code cccccccc (now rooms 3.2 with code cccccccc)"
     assert provenance.differences(found, newer) == expected
