@@ -176,6 +176,17 @@ def test_a_resume_with_other_software_is_noted_and_recorded_and_changes_no_diges
     assert f"; continued with other software or hardware: {changed}\n" in capsys.readouterr().out
 
 
+def test_a_trajectory_of_the_parent_was_not_made_by_the_fork(
+    finished: tuple[Path, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str], module_run: Any
+) -> None:
+    fork = tmp_path / "fork"
+    train.prepare(module_run, fork, resume=False, overwrite=False, source=(finished[0], 0))
+    provenance.add_session(fork, 0, provenance.record("darkroom", "icaa", 1))
+    for folder, shown in ((finished[0], True), (fork, False)):
+        assert main.main(["explain", str(folder), "pretrain/0/0/0/0"]) == 0
+        assert ("\nrun by " in capsys.readouterr().out) == shown
+
+
 def test_the_file_of_0_1_0_is_the_first_session(tmp_path: Path) -> None:
     old = {
         "python": "3.11.2",
