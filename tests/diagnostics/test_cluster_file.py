@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from icrl_dist import version
+from icrl_dist import __version__, version
 from icrl_dist.cli import main
 from icrl_dist.cli.exit_codes import FAILED, OK, USAGE
 from icrl_dist.diagnostics import cluster_file
@@ -33,7 +33,7 @@ def checkout(tmp_path, monkeypatch):
     (root / "dist").mkdir(parents=True)
     for name in ("pyproject.toml", "constraints.txt", "README.md", *version.PACKAGES):
         (root / name).symlink_to(ROOT / name)
-    with zipfile.ZipFile(root / "dist" / "icrl_dist-0.1.0-py3-none-any.whl", "w") as wheel:
+    with zipfile.ZipFile(root / "dist" / f"icrl_dist-{__version__}-py3-none-any.whl", "w") as wheel:
         for package in version.PACKAGES:
             for file in (ROOT / package).rglob("*"):
                 if file.suffix in (".py", ".toml", ".npz"):

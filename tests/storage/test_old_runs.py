@@ -42,6 +42,9 @@ def as_before(arrays: dict[str, np.ndarray], manifest: dict[str, Any]) -> None:
         arrays[name.replace("optimizer/", "optimiser/")] = arrays.pop(name)
     manifest["run"] = TEXT
     manifest["stretch"] = manifest.pop("window")
+    made_by = manifest.pop("made_by")
+    manifest["threads"] = made_by["threads"]
+    manifest["versions"] = {"icrl-dist": "0.1.0", **{name: made_by["libraries"][name] for name in ("numpy", "torch")}}
     if "next_version" in manifest:
         manifest["produces"] = manifest.pop("next_version")
 
