@@ -163,5 +163,5 @@ def text(made_by: Mapping[str, Any]) -> str:
     parts.append(f"commit {commit[:8]}{'-dirty' * commit.endswith('-dirty')}" if commit else "")
     parts += [f"{name} {made_by.get('libraries', {}).get(name, 'unknown')}" for name in ("python", "torch", "numpy")]
     parts.append(made_by.get("instruction_set", ""))
-    parts.append(f"{made_by['threads']} threads" if "threads" in made_by else "")
+    parts.append(f"threads {made_by['threads']}" if "threads" in made_by else "")
     return ", ".join(part for part in parts if part)
