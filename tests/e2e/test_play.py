@@ -202,6 +202,26 @@ def test_a_command_is_sent_after_the_answer_to_the_one_before_it(browser, small_
     assert arrived == ["p", "step"] and overlapped == [False]
 
 
+def test_values_of_a_slider_replace_each_other_while_they_wait(browser):
+    arrived, moved = [], threading.Event()
+
+    def command(fields):
+        arrived.append((fields["do"], fields.get("value")))
+        moved.wait(TIMEOUT_MS / 1000)
+
+    stream = EventStream()
+    with serving(application("play.html", stream, command), stream, "127.0.0.1", 0) as url, opened(browser, url) as page:
+        page.locator("#p").fill("0.1")
+        wait_for(lambda: arrived, "the first command")
+        for p in ("0.2", "0.3", "0.4"):
+            page.locator("#p").fill(p)
+        page.click("#one")
+        page.locator("#p").fill("0.5")
+        moved.set()
+        wait_for(lambda: len(arrived) == 4, "all commands")
+    assert arrived == [("p", 0.1), ("p", 0.4), ("step", None), ("p", 0.5)]
+
+
 def test_hostile_commands_are_refused_and_the_game_continues(served):
     _, url = served
 

@@ -276,15 +276,17 @@ def test_after_a_kill_during_the_removal_the_old_run_is_not_restored(tmp_path, m
     assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
 
 
-def test_after_a_kill_before_the_new_run_wrote_anything_the_old_run_is_restored(tmp_path, module_run):
-    for missing in (True, False):
-        folder, aside, old = killed(tmp_path / str(missing), module_run)
-        for path in folder.iterdir():
+@pytest.mark.parametrize("left", [None, (), (".replacement",), (".replacement", ".lock")])
+def test_after_a_kill_before_the_new_run_wrote_anything_the_old_run_is_restored(tmp_path, module_run, left):
+    folder, aside, old = killed(tmp_path, module_run)
+    (folder / ".lock").touch()
+    for path in folder.iterdir():
+        if path.name not in (left or ()):
             path.unlink()
-        if missing:
-            folder.rmdir()
-        launch.prepare(module_run, folder, resume=True, overwrite=False)
-        assert files(folder) == old and not aside.exists()
+    if left is None:
+        folder.rmdir()
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(folder) == old and not aside.exists()
 
 
 @pytest.mark.parametrize("options", [(False, False), (True, False), (False, True)])
