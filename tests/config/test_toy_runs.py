@@ -98,7 +98,7 @@ def test_a_section_with_a_field_that_cannot_be_hashed_is_refused(
 ) -> None:
     base: Any = CorridorProblem if group == "problems" else ReturnToGo
 
-    class Odd(base):
+    class Odd(base):  # type: ignore[misc]
         section: ClassVar[str] = "odd_section"
         Config: ClassVar[type] = config_with(hint, default)
 

@@ -7,6 +7,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from icrl_dist.results import evaluate
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import NULL, Adversary, Variation
 from tests.calls import keeping, noting
+from tests.jobs import in_problem
 from tests.optional import known
 from tests.problems.darkroom.test_exact_agents import Transition, likelihood
 from tests.problems.darkroom.test_solver import ADVERSARIES, ALPHA, HORIZON, SIZE, Room, every_cell, normalized, slow_q
@@ -107,7 +109,9 @@ def test_exact_decisions_equal_enumeration(room: Room, prior: Callable[[Room], l
     assert np.abs(decided[:, 0] - decided[:, -1]).max() > 0.2, "the contexts changed nothing"
 
 
-def test_model_decisions_are_the_models_one_prefix_at_a_time(run: Run, model: PretrainedTransformer, monkeypatch) -> None:
+def test_model_decisions_are_the_models_one_prefix_at_a_time(
+    run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(divergence, "_CHUNK", 2)
     context = walks([group[1] for group in divergence.training_variations(run, heldout=False)[:3]])
     length = context.actions.shape[1]
@@ -153,7 +157,9 @@ def test_by_the_second_prior_goals_and_adversaries_are_independent(run: Run) -> 
     "change",
     [{"method": "dpt"}, {"adversary": AdversaryConfig(count=1)}, {"adversary": AdversaryConfig(count=2, p_max=0.0)}],
 )
-def test_without_disturbance_in_training_there_is_none_in_the_contexts(run, model, monkeypatch, change) -> None:
+def test_without_disturbance_in_training_there_is_none_in_the_contexts(
+    run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 2)
     run = dataclasses.replace(run, **change)
     found = [pair for heldout in (False, True) for pair in measured(run, model, heldout)]
@@ -210,7 +216,9 @@ def test_each_context_is_disturbed_by_its_own_adversary(run: Run, kind: str) -> 
 
 
 @pytest.mark.parametrize("heldout", [False, True])
-def test_contexts_take_the_goals_in_turn_each_under_one_of_its_adversaries(run, model, monkeypatch, heldout) -> None:
+def test_contexts_take_the_goals_in_turn_each_under_one_of_its_adversaries(
+    run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch, heldout: bool
+) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 14)
     run = dataclasses.replace(run, adversary=AdversaryConfig(count=3))
     asked = list[tuple[str, list[Variation]]]()
@@ -253,9 +261,11 @@ class Uniform(PretrainedTransformer):
 
 @pytest.mark.parametrize(("heldout", "labels"), [(False, "soft"), (True, "soft"), (True, "heuristic")])
 @pytest.mark.parametrize("prior", range(len(PRIORS)))
-def test_a_model_that_is_the_exact_posterior_has_no_divergence(run, monkeypatch, heldout, labels, prior) -> None:
+def test_a_model_that_is_the_exact_posterior_has_no_divergence(
+    run: Run, monkeypatch: pytest.MonkeyPatch, heldout: bool, labels: str, prior: int
+) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 9)
-    run = dataclasses.replace(run, darkroom=dataclasses.replace(run.section("darkroom"), labels=labels))
+    run = in_problem(run, "darkroom", darkroom=dataclasses.replace(run.section("darkroom"), labels=labels))
     model = Exact(registry.of(run).spec, run.model).eval()
     model.set_hypotheses(run, divergence.hypotheses(run, heldout)[prior])
     found = list(zip(*measured(run, model, heldout), strict=True))
@@ -263,7 +273,7 @@ def test_a_model_that_is_the_exact_posterior_has_no_divergence(run, monkeypatch,
     assert any(one.kl.mean() > 1e-3 for one in found[1 - prior]), "the two priors are equal"
 
 
-def test_the_divergence_of_a_uniform_model_equals_a_slow_loop(run: Run, monkeypatch) -> None:
+def test_the_divergence_of_a_uniform_model_equals_a_slow_loop(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 5)
     asked: list[RoomContext] = []
     monkeypatch.setattr(divergence, "contexts", keeping(asked, divergence.contexts))
