@@ -50,21 +50,10 @@ fi
 """Records its name and arguments.  ``ray exec FILE COMMAND`` also runs COMMAND in a shell, as Ray does on the head, and
 ``ray job submit -- COMMAND`` calls COMMAND with its arguments."""
 
-_PROGRAMS: tuple[str, ...] = (
-    "icrl-dist",
-    "ray",
-    "make",
-    "git",
-    "pip",
-    "python",
-    "python3",
-    "python3.11",
-    "ssh",
-    "ssh-copy-id",
-    "rm",
-    "cd",
+_PROGRAMS = (
+    *("icrl-dist", "ray", "make", "git", "pip", "python", "python3", "python3.11", "ssh", "ssh-copy-id", "rm", "cd"),
+    *("aws", "gcloud", "openssl", "head", "nohup", "jq", "du", "deploy/zenoh/certificates.sh", ".venv/bin/python"),
 )
-_PROGRAMS += ("aws", "gcloud", "openssl", "head", "nohup", "jq", "du", "deploy/zenoh/certificates.sh", ".venv/bin/python")
 
 
 class Command(NamedTuple):
