@@ -45,10 +45,12 @@ class Cost:
         self.started += event in ("subprocess.Popen", "os.fork", "os.posix_spawn")
 
     def pytest_collection_finish(self) -> None:
+        """Write the CPU time up to here."""
         self._write("collection", "collection", _cpu_here(), 0.0, 0)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Write what this test cost, with the fixtures that were made for it."""
         cpu, wall, started = _cpu_elsewhere() + _cpu_here(), time.monotonic(), self.started
         try:
             return (yield)

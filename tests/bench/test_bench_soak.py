@@ -29,6 +29,7 @@ input()
 """
 
 
+@pytest.mark.integration
 def test_the_memory_of_a_process_is_measured_and_grows_with_its_allocations():
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", HOLDER], text=True, bufsize=1, **pipes) as holder:

@@ -11,6 +11,8 @@ from icrl_dist.types import Identity
 from learner import checkpoints, reporter, service
 from tests.learner.test_service import no_tensorboard, run_inline, same
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["no_tensorboard"]
 
 

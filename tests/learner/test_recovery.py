@@ -20,6 +20,8 @@ from icrl_dist.types import Identity
 from learner import reporter, service
 from tests.learner.test_service import no_tensorboard, parent, run_inline, same
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["no_tensorboard", "parent"]
 
 

@@ -15,6 +15,8 @@ from icrl_dist.telemetry.metrics import NAMES, TEXTS
 from learner import reporter, service
 from tests.toys.return_to_go import ReturnToGo
 
+pytestmark = pytest.mark.integration
+
 METRICS = service.Metrics
 
 

@@ -16,6 +16,8 @@ from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
 from learner import checkpoints, reporter, service
 
+pytestmark = pytest.mark.integration
+
 
 def run_inline(run, folder, report=lambda event: None, **options):
     train.prepare(run, folder, **{"resume": False, "overwrite": False, **options})

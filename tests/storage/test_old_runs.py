@@ -23,6 +23,8 @@ from icrl_dist.storage.files import StoreError
 from icrl_dist.stream.validation import VERSION
 from learner import checkpoints, service
 
+pytestmark = pytest.mark.integration
+
 OLD = Path(__file__).parents[1] / "config" / "written_by_0_1_0"
 TEXT = (OLD / "icag.toml").read_text()
 METRICS = service.Metrics
