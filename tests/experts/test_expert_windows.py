@@ -25,10 +25,11 @@ from icrl_dist.types import NULL, Variation
 from tests.experts.histories import EPISODES, HORIZON, run
 from tests.jobs import InMemoryDataset, do, in_problem, jobs_of
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["run"]
 
 
-@pytest.mark.integration
 def test_in_meta_world_labels_come_from_the_scripted_policy_at_the_true_states(small_run):
     sac = SACConfig(hidden=(8,), batch=8, random_steps=10, warmup=10, steps=60, cache="")
     run = in_problem(
@@ -132,7 +133,6 @@ def test_a_job_of_one_task_has_no_decoys(windowed):
     validate(dataclasses.replace(one_task_jobs, pretrain=dataclasses.replace(one_task_jobs.pretrain, decoy_fraction=0.0)), "x")
 
 
-@pytest.mark.integration
 def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed(windowed):
     run = dataclasses.replace(windowed, optim=dataclasses.replace(windowed.optim, queries=8))
     method = methods.of(run)

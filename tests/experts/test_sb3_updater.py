@@ -54,6 +54,7 @@ def test_settings_that_stable_baselines3_does_not_support_are_refused(more):
         SACBatch(**{"seeds": [0], "spec": SPEC, "config": SMALL, "device": "cpu", "backend": BACKEND, **more})
 
 
+@pytest.mark.integration
 def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_bytes(run, monkeypatch):  # noqa: F811
     trained, real = [], stable_baselines3.SAC.train
     monkeypatch.setattr(stable_baselines3.SAC, "train", lambda self, *given: trained.append(type(self)) or real(self, *given))

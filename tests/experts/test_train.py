@@ -19,6 +19,8 @@ from tests.experts.histories import EPISODES, HORIZON, Breaking, KilledError, di
 from tests.jobs import FixedWeights, decoded, do, jobs_of
 from tests.results.row_blocks import frame
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["run", "trained"]
 
 
