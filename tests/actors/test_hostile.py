@@ -23,6 +23,8 @@ from learner.worker_api import WorkerAPI
 from tests.e2e.training import wait_for
 from tests.jobs import jobs_of
 
+pytestmark = pytest.mark.integration
+
 KEYS = StreamKeys("test")
 HOSTILE = Path(__file__).parent / "hostile"
 WORKER = """  # hostile-worker

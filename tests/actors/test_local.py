@@ -8,6 +8,8 @@ import pytest
 
 from actors import local
 
+pytestmark = pytest.mark.integration
+
 CHILD = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import time; time.sleep(600)'])"
 
 

@@ -13,6 +13,8 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
 from tests.contracts.link_battery import eventually
 
+pytestmark = pytest.mark.integration
+
 KEYS = StreamKeys("run")
 
 

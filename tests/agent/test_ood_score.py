@@ -170,6 +170,7 @@ def deployed(agent, env, episodes=2):
     return np.stack(found)
 
 
+@pytest.mark.integration
 def test_surprise_rises_on_an_unseen_kind_of_disturbance_and_not_on_unseen_goals():
     """The shipped agent on goals that were used neither in training nor in calibration."""
     agent = load_agent("darkroom", seed=0)

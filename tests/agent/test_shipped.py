@@ -65,6 +65,7 @@ def test_shipped_agents_are_small_and_their_manifests_name_run_seed_and_digests(
         assert {"run", "seed", "versions", "weights_digest", "dataset_digest", "test_goals"} <= set(manifest)
 
 
+@pytest.mark.integration
 def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["evaluate", "--pretrained", "darkroom", "--episodes", "5", "--seeds", "1", "--p", "0", "--json"]
@@ -83,6 +84,7 @@ def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_
     assert load_agent("darkroom").manifest["size"] == 10
 
 
+@pytest.mark.integration
 def test_a_shipped_agent_with_shuffled_weights_is_no_better_than_a_random_policy():
     """All that the agent learned of the environment is in its weights."""
     checkpoint = load_checkpoint(shipped("darkroom"))

@@ -135,6 +135,7 @@ def test_without_any_return_losses_are_none_and_the_table_has_a_row():
     assert "too small to measure a loss" in disturbance.describe({"adversaries": 2, "problems": [row]})
 
 
+@pytest.mark.integration
 def test_an_expert_is_trained_once_without_disturbance_and_used_for_every_preset(monkeypatch, tmp_path):
     trained = list[int]()
     monkeypatch.setattr(batched, "train", noting(trained, lambda env, *rest, **more: env.batch, batched.train))

@@ -103,6 +103,7 @@ def test_a_step_of_the_peer_uses_the_mean_loss_over_all_non_empty_prefixes() -> 
         torch.testing.assert_close(before[name] - parameter, at.grad, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.integration
 @torch.no_grad()
 def test_both_held_out_losses_are_over_the_same_prefixes() -> None:
     drawn = quality.pretraining_data(0).draw(1, 0, 5, 1)

@@ -21,6 +21,7 @@ def on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "file_system", lambda folder: "ext4")
 
 
+@pytest.mark.integration
 def test_it_measures_with_and_without_fsync_and_removes_its_files(
     on_disk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

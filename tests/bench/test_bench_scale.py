@@ -24,6 +24,7 @@ def test_replayed_trajectories_differ_only_in_their_trial():
     }
 
 
+@pytest.mark.integration
 def test_it_measures_every_number_of_workers_and_removes_its_files(on_disk, tmp_path, monkeypatch):
     stored = []
     real = scale._ingest

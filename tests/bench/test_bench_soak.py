@@ -29,6 +29,7 @@ input()
 """
 
 
+@pytest.mark.integration
 def test_the_memory_of_a_process_is_measured_and_grows_with_its_allocations():
     command, pipe = [sys.executable, "-c", HOLDER], subprocess.PIPE
     with subprocess.Popen(command, text=True, bufsize=1, stdin=pipe, stdout=pipe) as holder:

@@ -97,6 +97,7 @@ print(json.dumps(rates.measure(override(load("demo"), sys.argv[1:], "test"), "de
 """
 
 
+@pytest.mark.integration
 def test_the_demo_takes_the_estimated_time(tmp_path):
     """Within a factor of two, with the demo's room, model, tasks, adversaries and batches, but fewer steps and trials.
 

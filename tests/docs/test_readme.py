@@ -5,7 +5,11 @@ import io
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.optional import known
+
+pytestmark = pytest.mark.integration
 
 
 def test_the_example_runs_and_prints_ten_returns():

@@ -159,9 +159,9 @@ def test_a_tap_without_certificates_is_refused_with_the_remedy(capsys, certified
     assert "none/ca.pem: cannot be read" in capsys.readouterr().err
 
 
-def test_a_run_with_tls_has_the_digests_of_a_run_without(certified, reference, tmp_path):
+def test_a_run_with_tls_and_four_workers_has_the_digests_of_one_process(certified, reference, tmp_path):
     folder = tmp_path / "secure"
-    tls = ["--actors", "1", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", certified]
+    tls = ["--actors", "4", "--oversubscribe", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", certified]
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(start("train", *SMOKE, *NO_RESTARTS, *tls, "--out", folder))
         stack.callback(run.terminate)

@@ -28,6 +28,7 @@ from tests.experts.sac_cases import (
 from tests.optional import known
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("updates", "actors", "critics"), [(1, 2e-6, 4e-5), (10, 6e-6, 4e-5), (50, 6e-4, 2e-4)])
 def test_updates_equal_those_of_stable_baselines3(updates, actors, critics, tmp_path, monkeypatch):
     engine = SACBatch(range(N), SPEC, PAPER, "cpu")

@@ -145,6 +145,7 @@ def test_a_setting_is_in_the_key_if_and_only_if_it_changes_the_history(run, unch
     assert changes == (name != "cache"), "another value would show it"
 
 
+@pytest.mark.integration
 def test_no_setting_outside_of_the_problem_and_sac_is_in_the_key(run):
     """Neither those of the model, of workers and the stream, nor of evaluation and alerts."""
 

@@ -27,6 +27,8 @@ from tests.experts.histories import EPISODES, HORIZON, run
 from tests.jobs import InMemoryDataset, do, in_problem, jobs_of
 from tests.optional import known
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["run"]
 
 

@@ -109,6 +109,7 @@ def test_nan_weights_stop_a_training():
         train(Line(2), LINE, 28, [0], device="cpu")
 
 
+@pytest.mark.integration
 def test_an_expert_learns_to_balance_the_pole_within_12000_steps():
     """Mean action, over ten evaluation episodes, every 1,000 steps."""
     ran = subprocess.run([sys.executable, "-m", "tests.experts.pole"], capture_output=True, text=True, timeout=550)

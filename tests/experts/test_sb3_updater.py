@@ -60,6 +60,7 @@ def test_settings_that_stable_baselines3_does_not_support_are_refused(more):
         SACBatch(**{"seeds": [0], "spec": SPEC, "config": SMALL, "device": "cpu", "backend": BACKEND, **more})
 
 
+@pytest.mark.integration
 def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_bytes(run, monkeypatch):  # noqa: F811
     trained, sac = list[type](), stable_baselines3.SAC
     monkeypatch.setattr(sac, "train", noting(trained, lambda self, *given: type(self), sac.train))

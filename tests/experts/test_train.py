@@ -22,6 +22,8 @@ from tests.jobs import FixedWeights, decoded, do, jobs_of
 from tests.optional import known
 from tests.results.row_blocks import frame
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["run", "trained"]
 
 

@@ -12,6 +12,8 @@ from learner import checkpoints, reporter, service
 from tests.calls import noting
 from tests.learner.test_service import no_tensorboard, run_inline, same
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["no_tensorboard"]
 
 

@@ -26,6 +26,8 @@ from tests.calls import noting
 from tests.learner.test_service import no_tensorboard, parent, run_inline, same
 from tests.optional import known
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["no_tensorboard", "parent"]
 
 

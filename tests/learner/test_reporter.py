@@ -16,6 +16,8 @@ from icrl_dist.telemetry.metrics import NAMES, TEXTS, Metrics
 from learner import reporter, service
 from tests.toys.return_to_go import ReturnToGo
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture
 def train(small_run, tmp_path, monkeypatch):

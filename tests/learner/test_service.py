@@ -20,6 +20,8 @@ from icrl_dist.telemetry.metrics import Metrics
 from learner import checkpoints, reporter, service
 from tests.calls import noting
 
+pytestmark = pytest.mark.integration
+
 
 def run_inline(run, folder, report=lambda event: None, **options):
     train.prepare(run, folder, **{"resume": False, "overwrite": False, **options})

@@ -191,6 +191,7 @@ def test_the_page_has_every_column():
     assert rows.document() in page, "put the output of `icrl_dist.results.rows.document()` into docs/data.md"
 
 
+@pytest.mark.integration
 def test_workers_and_the_learner_start_without_pandas_and_pyarrow():
     script = (
         "import sys, actors.worker, learner.service, icrl_dist.results.rows\nprint({'pandas', 'pyarrow'} & set(sys.modules))"

@@ -23,6 +23,8 @@ from icrl_dist.results.summaries import Interval
 from tests.results.row_blocks import block, frame
 from tests.results.test_statistics import slow_bootstrap, slow_improvement, slow_iqm, slow_mean, slow_minimum, slow_ratio
 
+pytestmark = pytest.mark.integration
+
 LAST = 3
 SEEDS, EPISODES, LEVELS = 2, 3, (0.0, 0.3)
 TINY = (

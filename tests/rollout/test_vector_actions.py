@@ -1,6 +1,7 @@
 """The code of discrete actions also learns and deploys vector actions."""
 
 import numpy as np
+import pytest
 import torch
 
 from icrl_dist.agent.in_context_agent import InContextAgent
@@ -82,6 +83,7 @@ def examples(goal, rng, episodes):
     return Examples(acted, seen, paid, states, Valley.optimal(states, np.array(goal)), False, of)
 
 
+@pytest.mark.integration
 def test_the_same_code_learns_and_deploys_vector_actions():
     rng = np.random.default_rng(0)
     spec = Valley([0]).spec

@@ -24,6 +24,8 @@ from icrl_dist.stream.validation import VERSION
 from icrl_dist.telemetry.metrics import Metrics
 from learner import checkpoints, service
 
+pytestmark = pytest.mark.integration
+
 OLD = Path(__file__).parents[1] / "config" / "written_by_0_1_0"
 TEXT = (OLD / "icag.toml").read_text()
 
