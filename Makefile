@@ -6,13 +6,16 @@ READY := $(VENV)/.ready
 # What Python compiles and pytest rewrites is kept for every process after the first.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check format env clean
+.PHONY: demo test test-fast check format env clean
 
 demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
 	$(BIN)/icrl-dist train demo --overwrite
 
 test: env ## every test, file by file in three processes: many of them wait
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+test-fast: env ## the tests of one process each, without Ray, Zenoh, browsers and trainings
+	$(BIN)/python -m pytest -m unit -n 2 --dist loadfile --no-loadscope-reorder
 
 check: env ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

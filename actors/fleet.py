@@ -76,32 +76,25 @@ class Fleet:
         ``actors``, or 1.  Raises ConfigError if this machine has fewer cores than workers and not
         ``oversubscribe``: the remaining workers would never start.  Raises FleetFailed if Ray does not
         start here in several attempts, or in one after which ``stopped()`` is true; ``note`` is called
-        before each new attempt.
+        before each new attempt.  The environment variables that Ray needs are set until ``close``.
         """
-        os.environ.update(_SETTINGS)
-        import ray
-
-        self._ray: Any = ray
+        local.refuse_running_session()
         self._address, self._restarts = address, restarts
         self._at_least = at_least or actors or 1
         if address is None:
             actors = actors or 1
             if not oversubscribe:
                 check_cores(actors)
-            options = {"num_cpus": actors, "object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
-            try:
-                local.start_ray(ray, note, stopped, **options)
-            except RuntimeError as error:
-                raise FleetFailed(str(error)) from error
-        else:
-            try:
-                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-            except (ConnectionError, ray.exceptions.AuthenticationError) as error:
-                raise ConfigError(f"--address {address}: {error}; `ray status` there shows whether a cluster is up") from None
+        self._variables = local.set_variables(_SETTINGS)
+        try:
+            self._ray = _connected(address, actors, note, stopped)
+        except BaseException:
+            local.set_variables(self._variables)
+            raise
         self.deaths = 0
         """Number of workers that died, except those that were lost with their node."""
         self._placement = Placement(actors)
-        self._cluster = Cluster(ray, self._placement) if address is not None else None
+        self._cluster = Cluster(self._ray, self._placement) if address is not None else None
         if address is None:
             self._placement.join(Node("", "127.0.0.1", "", actors or 1))
         self._budget: dict[int, int] = {}
@@ -310,6 +303,25 @@ class Fleet:
             self._kill(actor)
         self._running.clear()
         self._ray.shutdown()
+        local.set_variables(self._variables)
+
+
+def _connected(address: str | None, actors: int | None, note: Callable[[str], None], stopped: Callable[[], bool]) -> Any:
+    """Ray, started on this machine for ``actors`` workers or connected to the cluster at ``address``; as ``Fleet``."""
+    import ray
+
+    if address is None:
+        options = {"num_cpus": actors, "object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
+        try:
+            local.start_ray(ray, note, stopped, **options)
+        except RuntimeError as error:
+            raise FleetFailed(str(error)) from error
+    else:
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+            raise ConfigError(f"--address {address}: {error}; `ray status` there shows whether a cluster is up") from None
+    return ray
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,17 @@
-"""Ray on one computer.  Ray is an argument: only ``fleet`` imports it."""
+"""Ray in this process and on this computer.  Ray is an argument: only ``fleet`` imports it."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import psutil
+
+from icrl_dist.config.run import ConfigError
 
 TRIES = 3
 """Attempts to start Ray before a run fails."""
@@ -47,3 +51,24 @@ def _end(processes: set[psutil.Process]) -> None:
         with contextlib.suppress(psutil.NoSuchProcess):
             process.kill()
     psutil.wait_procs(family, timeout=5.0)
+
+
+def refuse_running_session() -> None:
+    """Raises ConfigError if this process already uses Ray: a run would end that session, and all its work, with its own."""
+    ray = sys.modules.get("ray")
+    if ray is not None and ray.is_initialized():
+        raise ConfigError(
+            "engine 'ray': this process already uses Ray, and a run starts and ends a session of its own: call ray.shutdown() "
+            "first, train in another process (`icrl-dist train`), or use engine='inline'"
+        )
+
+
+def set_variables(values: Mapping[str, str | None]) -> dict[str, str | None]:
+    """Set environment variables, None to remove one; returns the former values."""
+    former = {name: os.environ.get(name) for name in values}
+    for name, value in values.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    return former

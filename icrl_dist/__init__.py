@@ -1,7 +1,9 @@
 """Robust in-context reinforcement learning, distributed.
 
-``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in;
-``oracle`` computes exact solutions of Dark Room; ``read_results`` reads the returns of evaluations.
+``train`` trains a run, ``load_run`` reads one to change it, ``evaluate`` evaluates its agent; ``read_results`` reads
+the returns of evaluations, ``compare`` compares trainings, ``read_dataset`` reads the trajectories that a run collected.
+``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in; ``oracle`` computes
+exact solutions of Dark Room.  docs/python.md has an example of each.
 """
 
 from __future__ import annotations
@@ -12,38 +14,77 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from icrl_dist.agent.in_context_agent import InContextAgent
     from icrl_dist.agent.loading import load_agent
+    from icrl_dist.config.run import ConfigError, Run, load_run
     from icrl_dist.interfaces import Method, Problem
+    from icrl_dist.launch.learner_process import TrainFailed
+    from icrl_dist.launch.train import TrainInterrupted
+    from icrl_dist.launch.whole_run import TrainResult, train
     from icrl_dist.problems.darkroom import solver as oracle
     from icrl_dist.problems.registry import make
+    from icrl_dist.results.reports import Evaluation
     from icrl_dist.results.rows import read_results
-    from icrl_dist.types import NULL, Adversary, Task, Variation
+    from icrl_dist.results.suites import evaluate
+    from icrl_dist.results.tables import compare
+    from icrl_dist.storage.files import StoreError
+    from icrl_dist.storage.reading import StoredData, read_dataset
+    from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "NULL",
     "Adversary",
+    "ConfigError",
+    "Evaluation",
+    "Identity",
     "InContextAgent",
     "Method",
     "Problem",
+    "Run",
+    "StoreError",
+    "StoredData",
     "Task",
+    "TrainFailed",
+    "TrainInterrupted",
+    "TrainResult",
+    "Trajectory",
     "Variation",
+    "compare",
+    "evaluate",
     "load_agent",
+    "load_run",
     "make",
     "oracle",
+    "read_dataset",
     "read_results",
+    "train",
 ]
 
 _MODULES = {
     "InContextAgent": "icrl_dist.agent.in_context_agent",
     "load_agent": "icrl_dist.agent.loading",
+    "ConfigError": "icrl_dist.config.run",
+    "Run": "icrl_dist.config.run",
+    "load_run": "icrl_dist.config.run",
     "Method": "icrl_dist.interfaces",
     "Problem": "icrl_dist.interfaces",
+    "TrainFailed": "icrl_dist.launch.learner_process",
+    "TrainInterrupted": "icrl_dist.launch.train",
+    "TrainResult": "icrl_dist.launch.whole_run",
+    "train": "icrl_dist.launch.whole_run",
     "make": "icrl_dist.problems.registry",
+    "Evaluation": "icrl_dist.results.reports",
     "read_results": "icrl_dist.results.rows",
+    "evaluate": "icrl_dist.results.suites",
+    "compare": "icrl_dist.results.tables",
+    "StoreError": "icrl_dist.storage.files",
+    "StoredData": "icrl_dist.storage.reading",
+    "read_dataset": "icrl_dist.storage.reading",
     "NULL": "icrl_dist.types",
     "Adversary": "icrl_dist.types",
+    "Identity": "icrl_dist.types",
     "Task": "icrl_dist.types",
+    "Trajectory": "icrl_dist.types",
     "Variation": "icrl_dist.types",
 }
 

@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for programs that tests start: several programs share the cores
 
@@ -44,25 +45,89 @@ from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.stream.memory_link import MemoryHub, MemoryLink
 from icrl_dist.types import Task
 
+HERE = Path(__file__).parent
 FIRST = ("e2e", "learner", "actors")
 """Folders with slow tests, which run first so that no core is idle at the end."""
+TIERS = ("unit", "integration", "e2e")
+"""The markers of which each test has one, see CONTRIBUTING.md."""
 
 
+def tier(item: pytest.Item) -> str:
+    """The tier of a test without a marker of its own.
+
+    A fixture that is made once for a module (or for all) exists because it trains, or starts a process or a session.
+    """
+    if "e2e" in item.path.relative_to(HERE).parts:
+        return "e2e"
+    made = [one for found in item._fixtureinfo.name2fixturedefs.values() for one in found]  # type: ignore[attr-defined]
+    shared = {one.argname for one in made if one.scope != "function" and one.baseid.startswith("tests")}
+    return "integration" if shared - {"module_run"} else "unit"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``-m unit``, do not import modules without unit tests: their imports cost more than many tests."""
+    if config.option.markexpr != "unit" or HERE not in collection_path.parents:
+        return None
+    if collection_path.is_dir():
+        return True if collection_path.name == "e2e" else None
+    return True if collection_path.suffix == ".py" and NO_UNIT_TEST in collection_path.read_text() else None
+
+
+NO_UNIT_TEST = "\npytestmark = pytest.mark.integration\n"
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    here = Path(__file__).parent
-
     def position(item: pytest.Item) -> int:
-        folder = item.path.relative_to(here).parts[0]
+        folder = item.path.relative_to(HERE).parts[0]
         return FIRST.index(folder) if folder in FIRST else len(FIRST)
 
     items.sort(key=position)
+    for item in items:
+        if not any(map(item.get_closest_marker, TIERS)):
+            item.add_marker(tier(item))
+
+
+running_unit_test = False
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    global running_unit_test
+    running_unit_test = item.get_closest_marker("unit") is not None
+    try:
+        return (yield)
+    finally:
+        running_unit_test = False
+
+
+def refuse_in_unit_tests(what: str) -> None:
+    if running_unit_test:
+        raise AssertionError(f"a unit test {what}: mark it with @pytest.mark.integration")
+
+
+def refuse_processes(event: str, arguments: tuple[Any, ...]) -> None:
+    """An audit hook.  Programs outside this environment pass: libraries run some (fc-list) when they are first used."""
+    if event == "subprocess.Popen" and str(arguments[0]).startswith(sys.prefix):
+        refuse_in_unit_tests("starts a Python process")
+
+
+sys.addaudithook(refuse_processes)
 
 
 def pytest_collection_finish() -> None:
-    """Exclude imported objects from garbage collection: they stay until the end."""
+    """Exclude imported objects from garbage collection, because they stay until the end; guard Zenoh."""
     gc.collect()
     gc.freeze()
     gc.enable()
+    if zenoh := sys.modules.get("zenoh"):
+        opened = zenoh.open
+
+        def open_session(*arguments: Any) -> Any:
+            refuse_in_unit_tests("opens a Zenoh session")
+            return opened(*arguments)
+
+        zenoh.open = open_session  # type: ignore[attr-defined]
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ first, whether or not there are arrays among them: most of the time of a whole r
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import typing
 from collections.abc import Callable
@@ -26,7 +27,7 @@ _shapes = jaxtyping.jaxtyped
 
 def install(package: str) -> None:
     """Check every call of what is imported from the package from now on."""
-    jaxtyping.jaxtyped = _checked  # which the import hook puts before every function and class
+    jaxtyping.jaxtyped = _checked  # type: ignore[assignment]  # the import hook puts it before every function and class
     jaxtyping.install_import_hook(package, None)
 
 
@@ -34,10 +35,25 @@ def _checked(thing: Any = None, *, typechecker: None = None) -> Any:
     if thing is None:
         return _checked
     if isinstance(thing, FunctionType):
-        return _check(thing)
-    if dataclasses.is_dataclass(thing) and "__init__" in vars(thing):
-        thing.__init__ = _check(thing.__init__)
+        return _check(thing) if inspect.iscoroutinefunction(thing) else _check_when_called(thing)
+    has_own_init = dataclasses.is_dataclass(thing) and "__init__" in vars(thing)
+    if has_own_init:
+        thing.__init__ = _check_when_called(thing.__init__)
     return thing
+
+
+def _check_when_called(function: FunctionType) -> Callable[..., Any]:
+    """The same as ``_check``, which compiles the check at the first call: a process calls few of the functions it imports."""
+    checked: Callable[..., Any] | None = None
+
+    @functools.wraps(function)
+    def check(*arguments: Any, **named: Any) -> Any:
+        nonlocal checked
+        if checked is None:
+            checked = _check(function)
+        return checked(*arguments, **named)
+
+    return check
 
 
 def _check(function: FunctionType) -> Callable[..., Any]:

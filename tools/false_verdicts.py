@@ -57,7 +57,7 @@ def main() -> None:
         for _ in range(chosen.runs):
             tasks = rng.normal(size=(trainings if chosen.own_tasks else 1, TASKS, 1))
             pair = [method(rng, trainings, tasks, chosen.noise, chosen.own_tasks) for _ in range(2)]
-            verdicts = [row.verdict != "not shown" for row in comparison.compare(*pair)]
+            verdicts = [row.verdict != "not shown" for row in comparison.compare(pair[0], pair[1])]
             scores = np.stack([one.scores() for one in pair])
             drawn = statistics.bootstrap(scores, statistics.mean, rng, chosen.resamples, pair[0].crossed)
             low, high = np.percentile(drawn[:, 1] - drawn[:, 0], (2.5, 97.5))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -31,8 +33,11 @@ class InContextAgent:
         seed: int | None = None,
         deploy: Deployment | None = None,
         outcomes: OutcomeModel | None = None,
+        threads: int | None = None,
     ) -> None:
-        """Raises ConfigError for a deployment rule that the model was not trained for."""
+        """Raises ConfigError for a deployment rule that the model was not trained for, and for ``threads`` below 1."""
+        if threads is not None and threads < 1:
+            raise ConfigError(f"threads = {threads}: use at least 1, or None for the number that torch is set to")
         self._trained, self.spec = trained, trained.spec
         self.outcomes = outcomes
         """The model's prediction of outcomes, for ``surprise``; None for a checkpoint that was not calibrated."""
@@ -41,6 +46,8 @@ class InContextAgent:
         ``test_goals`` as ``[x, y]`` pairs, ``size`` and ``horizon``."""
         self.deploy: Deployment = deploy or trained.method.deployment(trained.run)
         """The deployment rule."""
+        self.threads = threads
+        """CPU threads of torch in the agent's methods; the process's own number is set again after each.  None: that number."""
         self._rng = np.random.default_rng(seed)
         self.reset_context()
 
@@ -79,7 +86,9 @@ class InContextAgent:
         Raises ValueError for a batch of another shape.
         """
         states = self._shaped("obs", obs, np.float32, self.spec.observation)
-        return self._policy.act(states, self._rng.random((len(states), 1 if self.spec.discrete else self.spec.actions)))
+        draws = self._rng.random((len(states), 1 if self.spec.discrete else self.spec.actions))
+        with self._own_threads():
+            return self._policy.act(states, draws)
 
     def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
         """Record one transition per environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, others ``(B,)``.
@@ -91,13 +100,14 @@ class InContextAgent:
         ended = self._shaped("done", done, np.bool_)
         if ended.any() != ended.all():
             raise ValueError("done: the episodes of a batch must end together; use one agent per horizon")
-        self._policy.observe(
+        transition = (
             self._shaped("obs", obs, np.float32, size),
             self._shaped("action", action, *((np.int64,) if spec.discrete else (np.float32, spec.actions))),
             self._shaped("reward", reward, np.float32),
             self._shaped("next_obs", next_obs, np.float32, size),
-            bool(ended.all()),
         )
+        with self._own_threads():
+            self._policy.observe(*transition, bool(ended.all()))
 
     def distribution(self, states: ArrayLike, row: int = 0) -> Float[np.ndarray, "Q A"]:
         """T_theta(. | s, D) over discrete actions at states ``(Q, S)``, given the context of environment ``row``.
@@ -106,11 +116,22 @@ class InContextAgent:
         """
         if not self.spec.discrete:
             raise ValueError("distribution: the actions of this agent are vectors; use an agent with discrete actions")
-        return self._policy.distribution(np.asarray(states, np.float32), row)
+        with self._own_threads():
+            return self._policy.distribution(np.asarray(states, np.float32), row)
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
         """The context D of environment ``row``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
         return self._policy.context(row)
+
+    @contextlib.contextmanager
+    def _own_threads(self) -> Iterator[None]:
+        before = torch.get_num_threads()
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
 
     def _shaped(self, name: str, value: ArrayLike, dtype: type, *rest: int) -> np.ndarray:
         array: np.ndarray = np.asarray(value, dtype)

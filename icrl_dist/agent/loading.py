@@ -7,6 +7,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
 from icrl_dist.agent.trained_model import TrainedModel
@@ -23,17 +25,25 @@ SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
 """Names of the agents in the package; docs/results/engine.md describes the training of each."""
 
 
-def load_agent(what: str | Path, seed: int | None = None, deploy: Deployment | None = None) -> InContextAgent:
+def load_agent(
+    what: str | Path, seed: int | None = None, deploy: Deployment | None = None, threads: int | None = 1
+) -> InContextAgent:
     """The agent of a run folder (its newest version), of a checkpoint file, or of the package, by its name.
 
     ``load_agent("darkroom")`` loads the agent of the package; write ``"./darkroom"`` for a run folder of that name.
 
-    Raises ConfigError if there is no such agent or it was not trained for the rule ``deploy``, StoreError
-    if the file was not written by this system.  Loading executes no code from the file.
+    ``seed``: of the draws of its actions; None: other draws each time.  ``deploy``: the deployment rule, ``paper`` or
+    ``committed``; None: the rule that it was trained for.
+    ``threads``: CPU threads of torch while the agent acts and observes; None: the number that torch is set to.  More
+    than one helps large batches on idle cores.  On busy cores threads that wait for each other can take a hundred
+    times as long (docs/decisions/073-openmp-wait-policy.md).  Outside these calls the process's own number holds.
+
+    Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy`` or if ``threads`` is
+    below 1, StoreError if the file was not written by this system.  Loading executes no code from the file.
     """
     checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint))
+    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
 
 
 def shipped(name: str | Path) -> Path:
@@ -94,7 +104,8 @@ def trained(checkpoint: Checkpoint) -> TrainedModel:
     try:
         run = parse_written(checkpoint.manifest["run"], "checkpoint")
         spec, method = spec_from(checkpoint.manifest["spec"]), methods.of(run)
-        model = method.build(spec, run)
+        with torch.random.fork_rng(()):  # an untrained model takes random numbers of the process
+            model = method.build(spec, run)
         load_weights(model, checkpoint.part("model"))
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StoreError(f"checkpoint: not an agent of this version of icrl-dist ({' '.join(str(error).split())})") from None

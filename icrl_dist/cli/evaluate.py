@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import OK
-from icrl_dist.config.run import ConfigError, Deployment, validate
+from icrl_dist.config.run import ConfigError, Deployment
 
 
 @dataclass(frozen=True)
 class EvaluateArguments:
     """Evaluate a trained agent on tasks that it did not train on, beside T^0, exact agents and the oracle."""
 
-    what: tyro.conf.Positional[Path | None] = None
+    what: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_DIR]")] = None
     """A run folder, or a checkpoint file."""
     pretrained: str | None = None
     """Instead, the name of an agent that is part of the package: ``darkroom``.  Its report is
@@ -47,54 +46,19 @@ class EvaluateArguments:
 
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     """Evaluate, print the table and keep the report.  Returns the exit code."""
-    from icrl_dist.agent.loading import checkpoint_file
-    from icrl_dist.config.run import parse_written
-    from icrl_dist.console.display import Display
-    from icrl_dist.methods import registry as methods
-    from icrl_dist.results import heldout
-    from icrl_dist.results.rows import is_unfinished
-    from icrl_dist.storage.checkpoint import load_checkpoint
-
-    what, folder = _source_and_output(arguments)
-    checkpoint = load_checkpoint(checkpoint_file(what))
-    run = parse_written(str(checkpoint.manifest.get("run", "")), str(what))
-    options = {name: getattr(arguments, name) for name in ("episodes", "seeds", "p", "prior")}
-    chosen = {name: value for name, value in options.items() if value not in (None, ())}
-    if arguments.suite == "posterior":
-        chosen = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 2} | chosen
-    run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
-    validate(run, "evaluate")
-    heldout.check_suite(run, arguments.suite)
-    deploy = "paper" if arguments.suite == "posterior" else arguments.deploy or methods.of(run).deployment(run)
-    answer: dict[str, Any] = {"suite": arguments.suite, "deploy": deploy, "what": str(what)}
-    report = folder / "report" / heldout.report_name(run, what, arguments.suite, deploy)
-    results = (heldout.run_folder(what) or folder) / "results"  # the rows of a checkpoint in a run folder belong to that run
-    if arguments.what is not None and is_unfinished(what):
-        console.print(
-            f"{what}: this run is not finished; the newest version so far is evaluated", highlight=False, markup=False
-        )
-    if arguments.suite == "online":
-        with Display(console) as display:
-            frame = heldout.online(run, what, results, display, arguments.deploy)
-        answer |= heldout.show_online(run, report, frame, console)
-    elif arguments.suite == "posterior":
-        with Display(console) as display:
-            divergences = heldout.posterior(run, what, results, display)
-        answer |= heldout.show_posterior(run, report, divergences, console)
-    else:
-        answer |= heldout.show_offline(run, heldout.offline(run, what, results, arguments.deploy), console)
-    if arguments.json:
-        print(json.dumps(answer))
-    return OK
-
-
-def _source_and_output(arguments: EvaluateArguments) -> tuple[Path, Path]:
-    """The run folder or checkpoint to evaluate, and the folder that its report and result rows are written below."""
     from icrl_dist.agent.loading import shipped
+    from icrl_dist.console.display import Display
+    from icrl_dist.results import suites
 
-    what, name = arguments.what, arguments.pretrained
-    if what is not None and name is None:
-        return what, what if what.is_dir() else what.parent
-    if what is None and name is not None:
-        return shipped(name), Path("runs") / f"{name}-pretrained"
-    raise ConfigError("evaluate: name a run folder or a checkpoint file, or with --pretrained an agent of the package")
+    what: str | Path | None = arguments.what if arguments.pretrained is None else arguments.pretrained
+    if what is None or None not in (arguments.what, arguments.pretrained):
+        raise ConfigError("evaluate: name a run folder or a checkpoint file, or with --pretrained an agent of the package")
+    if arguments.pretrained is not None:
+        shipped(arguments.pretrained)  # a name of the package only, never that of a folder
+    options = {name: getattr(arguments, name) for name in ("suite", "deploy", "episodes", "seeds", "prior")}
+    with Display(console) as display:
+        found = suites.evaluate(what, **options, p=arguments.p or None, progress=display.report)
+    console.print(found)
+    if arguments.json:
+        print(json.dumps(found.summary))
+    return OK

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -17,7 +17,7 @@ from icrl_dist.config.run import ConfigError
 class ExportArguments:
     """Write the trained agent of a run to one file for use elsewhere."""
 
-    what: tyro.conf.Positional[Path]
+    what: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
     """A run folder, of which the newest version is exported, or a checkpoint file."""
     to: Literal["agent"] = "agent"
     """``agent``: weights and manifest in one file for ``icrl_dist.load_agent``, without the state that
@@ -40,6 +40,6 @@ def export(arguments: ExportArguments, console: Console) -> int:
     if out.exists() and not is_slim(out):
         raise ConfigError(f"--out {out}: exists and is not an exported agent; name another file")
     with Display(console) as display:
-        save_checkpoint(out, slim(heldout.calibrate(source, display)))
+        save_checkpoint(out, slim(heldout.calibrate(source, display.report)))
     console.print(f"{out}: {out.stat().st_size / 1000:.0f} kB, for icrl_dist.load_agent", highlight=False, markup=False)
     return OK

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shlex
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,25 +13,22 @@ import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK
-from icrl_dist.config import plugins
-from icrl_dist.config.run import ConfigError, Run, override, run_type, validate
-from icrl_dist.storage.fork import parse_source
-
-LOCAL_ACTORS = 2
-"""Default number of workers without a cluster."""
+from icrl_dist.config.run import Run, override, run_type
 
 
 @dataclass(frozen=True)
 class TrainArguments:
     """Train a method on a run file, then evaluate it on held-out tasks.
 
-    RUN is the name of a packaged run (demo, smoke, darkroom) or the path of a TOML file.  Every
-    setting of the run can be overridden: ``icrl-dist train demo --method icag --adversary.count 4``.
-    ``icrl-dist train --from runs/demo@0 --set adversary.count=16`` starts from T^0 of another run,
-    with its data and its other settings.
+    RUN is the name of a packaged run (demo, smoke, darkroom) or the path of a TOML file.
+
+    Every setting of the run can be overridden: ``icrl-dist train demo --method icag --adversary.count 4``.
+
+    With --from, a run starts from T^ROUND of another run, with its data and its other settings:
+    ``icrl-dist train --from runs/demo@0 --set adversary.count=16``.
     """
 
-    run: tyro.conf.Positional[str] = ""
+    run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[RUN]")] = ""
     """Name of a packaged run, or path of a run file.  If it is left out, --from supplies the
     settings of the other run."""
     source: Annotated[str | None, tyro.conf.arg(name="from")] = None
@@ -67,80 +62,37 @@ class TrainArguments:
 
 
 def train(arguments: TrainArguments, console: Console) -> int:
-    """Train and evaluate.  Returns the exit code, FAILED if a variation is quarantined.
-
-    Heavy modules are imported inside: neither the learner nor the workers wait for torch here.
-    """
-    from actors.fleet import check_cores
+    """Train and evaluate.  Returns the exit code, FAILED if a variation is quarantined."""
     from icrl_dist.console.display import Display
-    from icrl_dist.launch import run_folder
-    from icrl_dist.launch import train as launch
-    from icrl_dist.storage.files import atomic_write, hold
+    from icrl_dist.launch import whole_run
+    from icrl_dist.launch.train import TrainInterrupted
 
-    if not arguments.run and not arguments.source:
-        raise ConfigError("train: name a RUN, such as demo, or another run to start from with --from RUN_DIR@ROUND")
-    source = parse_source(arguments.source) if arguments.source else None
-    name = Path(arguments.run).stem or f"{source[0].name}-from-{source[1]}" if source else Path(arguments.run).stem
-    run = override(arguments.config, arguments.set, "--set")
-    validate(run, arguments.run or str(arguments.source))
-    trains = plugins.find("methods", run.method).trains
+    options = ("engine", "address", "actors", "min_actors", "oversubscribe", "source", "resume", "overwrite")
+    given = {name: getattr(arguments, name) for name in options}
+    run = override(arguments.config, arguments.set, "--set") if arguments.run or arguments.source else None
     try:
-        folder = (arguments.out or Path("runs") / name).expanduser().absolute()
-    except RuntimeError as error:
-        raise ConfigError(f"--out {arguments.out}: {error}") from None
-    for option, value in (("--actors", arguments.actors), ("--min-actors", arguments.min_actors)):
-        if value is not None and value < 1:
-            raise ConfigError(f"{option} {value}: at least 1 worker is needed")
-    actors = LOCAL_ACTORS if arguments.actors is None and arguments.address is None else arguments.actors
-    if arguments.engine == "ray" and arguments.address is None and not arguments.oversubscribe:
-        check_cores(actors or LOCAL_ACTORS)
-    if arguments.engine == "ray":
-        launch.check_security(run, arguments.address)
-    transaction = launch.prepare(run, folder, arguments.resume, arguments.overwrite, source)
-    started = time.monotonic()
-    with contextlib.ExitStack() as locks:
-        try:
-            with Display(console) as display:
-                with transaction:
-                    report = transaction.commit_at_checkpoint(display.report)
-                    if arguments.engine == "inline":
-                        result = launch.train_inline(run, folder, report)
-                    else:
-                        options = (arguments.oversubscribe, arguments.min_actors)
-                        result = launch.train_ray(run, folder, actors, arguments.address, report, *options)
-                locks.enter_context(hold(folder))  # no other command can replace the run during its evaluation
-                from icrl_dist.results import heldout  # imports torch, so it comes after the training
-
-                if trains:
-                    with launch.interruptible():
-                        heldout.save_calibrated(folder, display)
-                        frame = heldout.online(run, folder, folder / "results", display)
-        except launch.TrainInterrupted:
-            text = f"`{_resume_command(arguments.given)}` continues from the checkpoint"
-            if transaction.rolled_back or not folder.exists():
-                text = f"{folder} is as it was before" if transaction.rolled_back else "nothing had been done yet"
-            console.print(f"interrupted; {text}", highlight=False, markup=False, soft_wrap=True)
-            return INTERRUPTED
-        result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
-        if not trains:
-            evaluation = heldout.show_experts(run, folder, console)
-        else:
-            evaluation = heldout.show_online(run, folder / "report" / heldout.report_name(run, folder), frame, console)
-        result = run_folder.final_result(folder, result, evaluation)
-        atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
+        with Display(console) as display:
+            out = arguments.out if arguments.out is not None else whole_run.default_folder(arguments.run, arguments.source)
+            made = whole_run.train(run, out, **given, progress=display.report)
+    except TrainInterrupted as error:
+        text = f"`{_resume_command(arguments.given)}` continues from the checkpoint" if error.resumable else str(error)
+        console.print(f"interrupted; {text}", highlight=False, markup=False, soft_wrap=True)
+        return INTERRUPTED
+    result = made.result
+    console.print(made.evaluation)
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
-        f"trajectories, {result['seconds']:.0f} s, run folder {folder}",
+        f"trajectories, {result['seconds']:.0f} s, run folder {made.folder}",
         highlight=False,
         markup=False,
     )
     if result.get("staleness"):
         console.print(f"asynchronous: trajectories by policy lag in versions: {result['lag']}; digests differ between runs")
-    for quarantined in result["quarantined"]:
+    for quarantined in made.quarantined:
         console.print(f"quarantined: {quarantined['variation']}: {quarantined['cause']}", highlight=False, markup=False)
     if arguments.json:
         print(json.dumps(result))
-    return FAILED if result["quarantined"] else OK
+    return FAILED if made.quarantined else OK
 
 
 def _resume_command(given: Sequence[str]) -> str:

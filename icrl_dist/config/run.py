@@ -44,6 +44,7 @@ __all__ = [
     "dumps",
     "load",
     "load_folder",
+    "load_run",
     "override",
     "parse",
     "parse_written",
@@ -123,6 +124,19 @@ def load(name_or_path: str) -> Run:
     file, problem = runs[name_or_path]
     text = (resources.files("icrl_dist.config.runs") / f"{file}.toml").read_text(encoding="utf-8")
     return parse(f'problem = "{problem}"\n{text}' if problem else text, name_or_path)
+
+
+def load_run(what: str | Path, *settings: str) -> Run:
+    """A run to change and train: ``load_run("smoke", "icaa.rounds=2", "seed=3")``.
+
+    ``what``: the name of a packaged run, the path of a run file, or that of a run folder (a ``Path``, or text with a
+    "/").  ``settings``: SECTION.NAME=VALUE, or NAME=VALUE for ``seed``, ``method`` and ``problem``.
+    ``dataclasses.replace(run, seed=3)`` changes a run too; ``icrl_dist.train`` checks it.
+    Raises ConfigError, with the nearest name, for an unknown run or key, and for an impossible value.
+    """
+    is_path = isinstance(what, Path) or "/" in what
+    run = load_folder(Path(what)) if is_path and Path(what).is_dir() else load(str(what))
+    return override(run, settings, str(what))
 
 
 _RUN_FILE = "run.toml"

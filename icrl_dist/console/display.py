@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+ReportEvent = Callable[[dict[str, Any]], None]
+"""Shows one event of a run, such as ``{"event": "note", "text": ...}``."""
+Show = bool | ReportEvent
+"""What a function shows of its progress: True for lines and bars on standard output, False for nothing, or a receiver."""
 
 _PERIOD_S = 10.0
 """Seconds between progress lines where there is no terminal."""
@@ -74,6 +81,18 @@ class Display:
             self._printed[name] = (time.monotonic(), done == total)
             if done or event.get("doing"):
                 self.console.print(f"{name:<26} {done:>7}/{total:<7} {info}", highlight=False)
+
+
+@contextlib.contextmanager
+def reporting(progress: Show) -> Iterator[ReportEvent]:
+    """The function that receives the events of some work, as a context around the work."""
+    if callable(progress):
+        yield progress
+    elif progress:
+        with Display(Console(soft_wrap=True)) as display:
+            yield display.report
+    else:
+        yield lambda event: None
 
 
 def _name(event: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import ConfigError, Run
-from icrl_dist.launch.run_folder import ReportEvent
+from icrl_dist.console.display import ReportEvent
 
 
 class TrainFailed(RuntimeError):  # noqa: N818
@@ -49,7 +49,10 @@ class LearnerProcess:
         command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
         self._log = (self._folder / "learner.err").open("ab")
         pipe = subprocess.PIPE
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True)
+        environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}  # idle torch threads sleep: decision 073
+        self._process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True, env=environment
+        )
         threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:

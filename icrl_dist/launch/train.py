@@ -8,30 +8,34 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import os
-import platform
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
+from icrl_dist.console.display import ReportEvent
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.learner_process import TrainFailed
-from icrl_dist.launch.run_folder import FolderTransaction, ReportEvent
+from icrl_dist.launch.run_folder import FolderTransaction
 from icrl_dist.storage.files import atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
+from icrl_dist.telemetry import provenance
 
 
 class TrainInterrupted(Exception):  # noqa: N818
-    """The run was interrupted; its checkpoint is written."""
+    """The run was interrupted by SIGINT or SIGTERM; the message says what its folder holds now."""
+
+    def __init__(self, text: str = "its checkpoint is written", resumable: bool = True) -> None:
+        super().__init__(text)
+        self.resumable = resumable
+        """Whether the run can be resumed in its folder."""
 
 
 def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> FolderTransaction:
@@ -85,7 +89,7 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
             status = file.stat()
             atomic_write(file, lambda to: to.write(dumps(run).encode()))
             os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))  # its time is the start of the run
-        atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
+        provenance.create(folder)
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
 
@@ -112,17 +116,6 @@ def check_security(run: Run, address: str | None) -> None:
         require_ray_token(address)
 
 
-def environment() -> dict[str, Any]:
-    """Versions and machine of this process, the content of ``env.json``."""
-    names = ("icrl-dist", "numpy", "torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "scipy")
-    return {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "cores": len(os.sched_getaffinity(0)),
-        "versions": {name: metadata.version(name) for name in names},
-    }
-
-
 def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
     """Run the learner in this process with one worker on a thread.  Returns the learner's result."""
     import torch
@@ -132,7 +125,7 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
     from learner.service import Interrupted, RunFailed, Service
 
     hub = MemoryHub()
-    with hub.link() as learner_link, hub.link() as worker_link:
+    with _torch_unchanged(), hub.link() as learner_link, hub.link() as worker_link:
         try:
             service = Service(run, folder, learner_link, report)
         except RunFailed as error:
@@ -161,6 +154,20 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
                 worker.stop()
                 thread.join(timeout=30)
                 service.close()
+
+
+@contextlib.contextmanager
+def _torch_unchanged() -> Iterator[None]:
+    """Restore what the learner sets in torch for the whole process: its random numbers and its deterministic mode."""
+    import torch
+
+    mode = torch.get_deterministic_debug_mode()
+    initialized: bool = torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    with torch.random.fork_rng(range(torch.cuda.device_count()) if initialized else ()):
+        try:
+            yield
+        finally:
+            torch.set_deterministic_debug_mode(mode)
 
 
 def train_ray(
@@ -244,7 +251,7 @@ def _remove_if_refused(folder: Path) -> Iterator[None]:
     try:
         yield
     except (ConfigError, TrainInterrupted):
-        if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
+        if {file.name for file in folder.iterdir()} <= {"run.toml", provenance.FILE}:
             run_folder.remove(folder)
         raise
 
@@ -260,8 +267,12 @@ def interruptible() -> contextlib.AbstractContextManager[object]:
 
 @contextlib.contextmanager
 def _on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
-    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them."""
-    signals = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them.
+
+    The former handlers are set at the end.  Outside the main thread Python allows no handlers, and nothing is changed.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    signals = [number for number in numbers if signal.getsignal(number) is not None]  # another could not be set again
 
     def handle() -> list[Any]:
         return [signal.signal(number, lambda *_: stop()) for number in signals]

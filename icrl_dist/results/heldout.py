@@ -1,35 +1,30 @@
-"""Evaluation of a run folder's models on held-out tasks, compared with references: reports, figures and tables."""
+"""Evaluation of a run folder's models on held-out tasks, compared with references, as result rows."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from rich.console import Console
 
 from icrl_dist.agent import ood_score
 from icrl_dist.agent.loading import calibrated, checkpoint_file, outcomes_of, trained
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment, Run
-from icrl_dist.console.display import Display
+from icrl_dist.console.display import ReportEvent
 from icrl_dist.interfaces import Batch, MakePolicy, Method, Policy, Reference
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
-from icrl_dist.results import evaluate, plots, rows, summaries, training_rows
+from icrl_dist.results import evaluate, rows, training_rows
 from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.names import key_of
-from icrl_dist.results.returns import Returns, returns
-from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Dataset
-from icrl_dist.storage.files import atomic_write
 from icrl_dist.types import Variation
 
 if TYPE_CHECKING:
@@ -51,19 +46,19 @@ def _agent(checkpoint: Checkpoint, deploy: Deployment | None = None) -> tuple[Ag
     return Agent(key_of(version), rule, version, str(checkpoint.manifest.get("weights_digest", ""))), model
 
 
-def calibrate(what: Path, display: Display) -> Checkpoint:
+def calibrate(what: Path, report: ReportEvent) -> Checkpoint:
     """The newest checkpoint with its outcome readout, which is fitted now if it is missing."""
 
     def progress(episodes: int) -> None:
         event = {"event": "progress", "stage": "evaluate", "phase": "calibrating surprise"}
-        display.report(event | {"step": episodes, "steps": 2 * ood_score.EPISODES})
+        report(event | {"step": episodes, "steps": 2 * ood_score.EPISODES})
 
     return calibrated(load_checkpoint(checkpoint_file(what)), progress)
 
 
-def save_calibrated(folder: Path, display: Display) -> None:
+def save_calibrated(folder: Path, report: ReportEvent) -> None:
     """Calibrate the newest checkpoint of a run; the file is written only if it was not calibrated before."""
-    calibrated = calibrate(folder, display)
+    calibrated = calibrate(folder, report)
     file = checkpoint_file(folder)
     if calibrated.part("outcomes") and not load_checkpoint(file).part("outcomes"):
         save_checkpoint(file, calibrated)
@@ -87,7 +82,7 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     return f"{suite}-{prefix}{agent}-{rule}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
 
 
-def online(run: Run, what: Path, results: Path, display: Display, deploy: Deployment | None = None) -> pd.DataFrame:
+def online(run: Run, what: Path, results: Path, report: ReportEvent, deploy: Deployment | None = None) -> pd.DataFrame:
     """Online returns of the folder's models, the newest first, and of the problem's references, as result rows.
 
     The rows are written to the folder ``results``.  Models are deployed by ``deploy``; None: by the rule that they
@@ -112,8 +107,8 @@ def online(run: Run, what: Path, results: Path, display: Display, deploy: Deploy
         agents[newest._replace(deployment="paper")] = evaluate.in_context(model, run.context, "paper")
     agents |= {Agent(key): reference for key, reference in problem.references(run).items()}
     if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
-        display.report({"event": "note", "text": missing})
-    evaluated = evaluate.online(run, agents, _count(display, "held-out evaluation", run, len(agents)))
+        report({"event": "note", "text": missing})
+    evaluated = evaluate.online(run, agents, _count(report, "held-out evaluation", run, len(agents)))
     for one, score in zip((one for one in evaluated if one.agent == newest), scores, strict=False):
         column = np.full(one.returns.shape, np.nan)
         column[:, :, -1] = score.score().reshape(column.shape[:2])
@@ -148,8 +143,6 @@ def run_folder(what: Path) -> Path | None:
 def check_suite(run: Run, suite: str) -> None:
     """Raises ConfigError if the run's problem or method does not support the suite."""
     problem, method = registry.of(run), methods.of(run)
-    if not problem.evaluated:
-        raise ConfigError(f"--suite {suite}: {run.problem} has no tasks to evaluate on: change [{problem.section}]")
     if suite == "offline" and not evaluate.sources(run):
         lacks = "has no reference 'random' and none that is given the task"
         raise ConfigError(f"--suite offline: {run.problem} {lacks}, so nothing collects data; use --suite online")
@@ -165,47 +158,18 @@ def offline(run: Run, what: Path, results: Path, deploy: Deployment | None = Non
     return _recorded(run, what, results, "offline", {"evaluated": evaluated}, deploy)
 
 
-def show_online(run: Run, report: Path, frame: pd.DataFrame, console: Console) -> dict[str, Any]:
-    """Print the table; write the numbers to ``report``.json and the figure to ``report``.png.  Returns both, and summaries."""
-    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), returns(frame)
-    _, tasks, evaluations, _ = found[0].returns.shape
-    title = f"{run.method.upper()} on {registry.of(run).title(tasks)}, {evaluations} seeds"
-    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
-    figure = plots.adaptation(numbers, report.with_name(f"{report.name}.png"), title)
-    console.print(returns_table(frame, f"Return by online episode: {title}"))
-    _show_diverged(found, console)
-    for p, score in scores.items():
-        text = f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
-        console.print(text, highlight=False, markup=False)
-    console.print(f"figure {figure}", highlight=False, markup=False)
-    return {**summaries.adaptation(frame), "surprise": scores, "rows": numbers, "figure": str(figure)}
-
-
-def _show_diverged(found: Sequence[Returns], console: Console) -> None:
-    for one in found:
-        if one.diverged:
-            text = f"{one.name}, p = {one.p:g}: the simulation diverged in {one.diverged} of {one.returns.size} episodes; "
-            console.print(text + "their return up to that step counts", highlight=False, markup=False)
-
-
-def show_experts(run: Run, folder: Path, console: Console) -> dict[str, Any]:
-    """Print the returns of the first and the last recorded episode of each expert; returns them.
-
-    The returns of all recorded episodes are written as result rows.
-    """
+def experts(run: Run, folder: Path) -> pd.DataFrame:
+    """The returns of all recorded episodes of a run's experts, which are written as result rows."""
     data = Dataset(folder / "dataset", readonly=True)
     blocks = [training_rows.of_expert(run, folder.name, data.trials(key)) for key in data.variations("pretrain", 0)]
     data.close()
-    frame = rows.read([rows.append(folder / "results", "experts", {}, blocks)])
-    experts = summaries.experts(frame)
-    console.print(experts_table(experts))
-    return {"experts": experts}
+    return rows.read([rows.append(folder / "results", "experts", {}, blocks)])
 
 
-def posterior(run: Run, what: Path, results: Path, display: Display) -> dict[str, Any]:
+def posterior(run: Run, what: Path, results: Path, report: ReportEvent) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Comparison of the newest model with the exact posterior, on training and on held-out tasks.
 
-    The online returns are written as result rows to the folder ``results``.
+    Returns the online returns, which are written as result rows to the folder ``results``, and the numbers.
     """
     agent, model = _agent(load_checkpoint(checkpoint_file(what)), "paper")
     suite, split = registry.of(run).posterior, registry.of(run).split
@@ -220,62 +184,38 @@ def posterior(run: Run, what: Path, results: Path, display: Display) -> dict[str
         return probs
 
     act = evaluate.in_context(model, run.context, "paper")
-    report: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
     total = len(suite.kinds) * len(suite.levels(run))
     for name, heldout in (("kl_nats", False), ("kl_heldout", True)):
         event = {"event": "progress", "stage": "evaluate", "phase": f"contexts, {_goals(heldout)}", "steps": total}
         found = []
         for pair in suite.divergences(run, decide, act, heldout):
             found.append(pair)
-            display.report(event | {"step": len(found)})
+            report(event | {"step": len(found)})
         for prior, ones in zip(suite.priors, zip(*found, strict=True), strict=True):
-            report |= {f"{name}{prior}{part}": value for part, value in suite.summary(ones).items()}
-            report[f"{name}{prior}_curves"] = suite.curves(ones)
+            numbers |= {f"{name}{prior}{part}": value for part, value in suite.summary(ones).items()}
+            numbers[f"{name}{prior}_curves"] = suite.curves(ones)
     evaluated = {}
     for name, tasks in (("test", split.test), ("train", split.train[: len(split.test)])):
-        progress = _count(display, f"online, {_goals(name == 'test')}", run, 2)
+        progress = _count(report, f"online, {_goals(name == 'test')}", run, 2)
         evaluated[name] = posterior_suite.online(run, (agent, act), tasks, progress)
     frame = _recorded(run, what, results, "posterior", evaluated, "paper")
     for name, which in (("paper_gap", "test"), ("paper_gap_train", "train")):
-        report[name] = posterior_suite.gaps(frame[frame["tasks"] == which])
-    return report
-
-
-def show_posterior(run: Run, report: Path, found: dict[str, Any], console: Console) -> dict[str, Any]:
-    """Print the tables; write ``report``.json and the figure ``report``.png.  Returns the report without its curves."""
-    problem = registry.of(run)
-    title = f"{run.method.upper()} compared with the exact posterior: {problem.title(len(problem.evaluated))}"
-    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
-    figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
-    assert problem.posterior is not None, "``check_suite`` refuses problems without one"
-    for prior, meaning in problem.posterior.priors.items():
-        console.print(kl_table(found, prior, f"KL(exact || model) in nats, where {meaning}"))
-    adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
-    console.print(gap_table(found, f"Online return by Algorithm 1 compared with the exact agent's: {adversary}"))
-    console.print(f"figure {figure}", highlight=False, markup=False)
-    return {key: value for key, value in found.items() if not key.endswith("_curves")} | {"figure": str(figure)}
+        numbers[name] = posterior_suite.gaps(frame[frame["tasks"] == which])
+    return frame, numbers
 
 
 def _goals(heldout: bool) -> str:
     return f"{'held-out' if heldout else 'training'} goals"
 
 
-def _count(display: Display, phase: str, run: Run, agents: int) -> Callable[[str, float, int], None]:
+def _count(report: ReportEvent, phase: str, run: Run, agents: int) -> Callable[[str, float, int], None]:
     """A progress callback that displays every episode of every agent at every p as one step."""
     total, done = agents * len(run.evaluate.p) * run.evaluate.episodes, 0
 
     def progress(agent: str, p: float, episodes: int) -> None:
         nonlocal done
         done += 1
-        display.report({"event": "progress", "stage": "evaluate", "phase": phase, "step": done, "steps": total})
+        report({"event": "progress", "stage": "evaluate", "phase": phase, "step": done, "steps": total})
 
     return progress
-
-
-def show_offline(run: Run, frame: pd.DataFrame, console: Console) -> dict[str, Any]:
-    """Print the table; returns the numbers."""
-    found = returns(frame)
-    title = registry.of(run).title(found[0].returns.shape[1])
-    console.print(returns_table(frame, f"One episode given data collected before: {title}"))
-    _show_diverged(found, console)
-    return {"rows": summaries.result_rows(frame)}

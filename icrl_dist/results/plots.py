@@ -1,4 +1,7 @@
-"""Figures of evaluations, from numbers that are computed from result rows."""
+"""Figures of evaluations, from numbers that are computed from result rows.
+
+They are made without pyplot, so the backend and the open figures of the process stay as they are.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +28,12 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
 
     ``rows``: of ``summaries.result_rows``.  Returns ``path``.
     """
-    pyplot = _pyplot()
+    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     levels = sorted({row["p"] for row in rows})
-    figure, axes = pyplot.subplots(
-        1, len(levels), figsize=(max(7.0, 4.6 * len(levels)), 4.2), sharey=True, squeeze=False, layout="constrained"
-    )
+    figure = Figure(figsize=(max(7.0, 4.6 * len(levels)), 4.2), layout="constrained")
+    axes = figure.subplots(1, len(levels), sharey=True, squeeze=False)
     for axis, p in zip(axes[0], levels, strict=True):
         here = [row for row in rows if row["p"] == p]
         episodes = range(1, len(here[0]["episodes"]) + 1)
@@ -66,10 +68,12 @@ def _disturbed(rows: Sequence[Mapping[str, Any]]) -> str:
 def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:
     """T_theta compared with the exact posterior: KL by prefix, probabilities and online return.  Returns ``path``.
 
-    ``report``: the result of ``heldout.posterior``.
+    ``report``: the numbers of ``heldout.posterior``.
     """
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(2, 3, figsize=(14, 8), layout="constrained")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14, 8), layout="constrained")
+    axes = figure.subplots(2, 3)
     for row, (name, (goals, color)) in zip(axes, _GOALS.items(), strict=True):
         row[0].sharey(row[1])
         for axis, (prior, meaning) in zip(row, _PRIORS.items(), strict=False):
@@ -120,17 +124,7 @@ def _is_exact(row: Mapping[str, Any]) -> bool:
     return str(row["key"]).startswith("exact:")
 
 
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
 def _saved(figure: Any, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
-    _pyplot().close(figure)
     return path

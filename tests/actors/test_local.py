@@ -8,6 +8,8 @@ import pytest
 
 from actors import local
 
+pytestmark = pytest.mark.integration
+
 CHILD = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import time; time.sleep(600)'])"
 
 
@@ -51,7 +53,7 @@ def failing_ray():
 
 def test_ray_is_started_again_and_only_the_processes_of_failed_starts_are_ended(failing_ray):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        ray, notes = failing_ray(2), []
+        ray, notes = failing_ray(2), list[str]()
         local.start_ray(ray, notes.append, num_cpus=2)
         assert other.poll() is None
         other.communicate(b"\n")

@@ -124,7 +124,7 @@ def untrained(small_run):
 
 
 def test_calibration_deploys_in_training_tasks_under_new_adversaries_and_repeats(small_run, untrained):
-    reported = []
+    reported = list[int]()
     once, again = ood_score.calibrate(untrained, reported.append), ood_score.calibrate(untrained)
     assert reported == list(range(1, 2 * ood_score.EPISODES + 1))
     for name, array in once.arrays().items():
@@ -170,6 +170,7 @@ def deployed(agent, env, episodes=2):
     return np.stack(found)
 
 
+@pytest.mark.integration
 def test_surprise_rises_on_an_unseen_kind_of_disturbance_and_not_on_unseen_goals():
     """The shipped agent on goals that were used neither in training nor in calibration."""
     agent = load_agent("darkroom", seed=0)

@@ -11,6 +11,7 @@ import torch
 from icrl_dist.agent.loading import SHIPPED, load_agent, shipped, trained
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, parse
+from icrl_dist.interfaces import MakePolicy, Reference
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
@@ -28,7 +29,7 @@ def folder(small_run, tmp_path):
         torch.manual_seed(version)
         model = PretrainedTransformer(spec, small_run.model)
         opt = Optimizer(model, small_run.optim)
-        sum(p.sum() for p in model.parameters()).backward()
+        torch.stack([p.sum() for p in model.parameters()]).sum().backward()
         opt.step(1e-3)
         about = checkpoints.manifest(small_run, spec, version, 1)
         weights = checkpoints.weights(version, model)
@@ -64,6 +65,7 @@ def test_shipped_agents_are_small_and_their_manifests_name_run_seed_and_digests(
         assert {"run", "seed", "versions", "weights_digest", "dataset_digest", "test_goals"} <= set(manifest)
 
 
+@pytest.mark.integration
 def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["evaluate", "--pretrained", "darkroom", "--episodes", "5", "--seeds", "1", "--p", "0", "--json"]
@@ -82,6 +84,7 @@ def test_a_shipped_agent_is_loaded_by_its_name_and_finds_goals_it_never_trained_
     assert load_agent("darkroom").manifest["size"] == 10
 
 
+@pytest.mark.integration
 def test_a_shipped_agent_with_shuffled_weights_is_no_better_than_a_random_policy():
     """All that the agent learned of the environment is in its weights."""
     checkpoint = load_checkpoint(shipped("darkroom"))
@@ -93,7 +96,9 @@ def test_a_shipped_agent_with_shuffled_weights_is_no_better_than_a_random_policy
         for parameter in shuffled.model.parameters():
             parameter.copy_(parameter.flatten()[torch.randperm(parameter.numel())].view_as(parameter))
     models = {"trained": untouched, "shuffled": shuffled}
-    agents = {evaluate.Agent(key): evaluate.in_context(model, run.context) for key, model in models.items()}
+    agents: dict[evaluate.Agent, MakePolicy | Reference] = {
+        evaluate.Agent(key): evaluate.in_context(model, run.context) for key, model in models.items()
+    }
     agents[evaluate.Agent("random")] = registry.of(run).references(run)["random"]
     whole, mixed, random = (result.returns.mean() for result in evaluate.online(run, agents))
     assert whole > 40 and mixed < 5 and random < 5
@@ -120,3 +125,37 @@ def test_a_file_of_that_name_does_not_hide_the_shipped_agent(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     save_checkpoint(tmp_path / "darkroom", Checkpoint({}, {}))
     assert load_agent("darkroom").manifest["method"] == "icag"
+
+
+def test_an_agent_uses_its_own_number_of_threads_and_leaves_that_of_the_process(monkeypatch):
+    during = []
+
+    def seen(call):
+        def observed(*arguments):
+            during.append(torch.get_num_threads())
+            return call(*arguments)
+
+        return observed
+
+    def play(agent):
+        for name in ("act", "observe", "distribution"):
+            monkeypatch.setattr(agent._policy, name, seen(getattr(agent._policy, name)))
+        during.clear()
+        (action,) = agent.act(np.zeros((1, 2)))
+        agent.observe(np.zeros((1, 2)), [action], [0.0], np.ones((1, 2)), [False])
+        agent.distribution(np.zeros((1, 2)))
+        return during
+
+    torch.set_num_threads(2)
+    try:
+        assert play(load_agent("darkroom", seed=0)) == [1, 1, 1]
+        assert play(load_agent("darkroom", seed=0, threads=3)) == [3, 3, 3]
+        assert play(load_agent("darkroom", seed=0, threads=None)) == [2, 2, 2]
+        agent = load_agent("darkroom")
+        with pytest.raises(ValueError, match="obs has shape"):
+            agent.act(np.zeros((2, 2)))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+    with pytest.raises(ConfigError, match="threads = 0: use at least 1"):
+        load_agent("darkroom", threads=0)

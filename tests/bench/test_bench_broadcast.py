@@ -11,6 +11,7 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.models.weights import weights_of
 
 
+@pytest.mark.integration
 def test_it_reports_a_ratio_for_each_size() -> None:
     result = broadcast.run(workers=2, pairs=1)
     for size in broadcast.WIDTHS:

@@ -5,6 +5,12 @@ import io
 import re
 from pathlib import Path
 
+import pytest
+
+from tests.optional import known
+
+pytestmark = pytest.mark.integration
+
 
 def test_the_example_runs_and_prints_ten_returns():
     (code,) = re.findall(r"```python\n(.*?)```", Path("README.md").read_text(), re.DOTALL)
@@ -12,4 +18,4 @@ def test_the_example_runs_and_prints_ten_returns():
     with contextlib.redirect_stdout(printed):
         exec(code, {})
     lines = printed.getvalue().splitlines()
-    assert [int(re.fullmatch(r"episode (\d+): return \d+", line)[1]) for line in lines] == list(range(1, 11))
+    assert [int(known(re.fullmatch(r"episode (\d+): return \d+", line))[1]) for line in lines] == list(range(1, 11))

@@ -1,6 +1,7 @@
 """TLS streams: which clients are accepted, what each role may do, and that a whole run gives the same digests."""
 
 import contextlib
+import functools
 import json
 import shutil
 
@@ -101,7 +102,7 @@ def test_each_role_may_do_what_it_needs(certified):
         monitor = stack.enter_context(ZenohLink.connect(*connect, security.client(certified, "monitor")))
         monitor.subscribe("icrl/*/mon/trajectories/**", lambda key, payload: received.append((key, payload)))
         for link, topic in ((worker, "trajectories/w0"), (learner, "trajectories/learner")):
-            eventually(lambda link=link, topic=topic: published(link, KEYS.monitor(topic), b"look", received), OPEN_S)
+            eventually(functools.partial(published, link, KEYS.monitor(topic), b"look", received), OPEN_S)
         assert worker.has_subscribers(KEYS.monitor("trajectories/w0")) and not worker.has_subscribers(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
         eventually(lambda: worker.has_subscribers(KEYS.monitor("belief/w0")), OPEN_S)
@@ -158,9 +159,9 @@ def test_a_tap_without_certificates_is_refused_with_the_remedy(capsys, certified
     assert "none/ca.pem: cannot be read" in capsys.readouterr().err
 
 
-def test_a_run_with_tls_has_the_digests_of_a_run_without(certified, reference, tmp_path):
+def test_a_run_with_tls_and_four_workers_has_the_digests_of_one_process(certified, reference, tmp_path):
     folder = tmp_path / "secure"
-    tls = ["--actors", "1", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", certified]
+    tls = ["--actors", "4", "--oversubscribe", "--stream.endpoint", "tls/127.0.0.1:0", "--stream.certificates", certified]
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(start("train", *SMOKE, *NO_RESTARTS, *tls, "--out", folder))
         stack.callback(run.terminate)

@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from icrl_dist.agent.loading import load_agent
+from icrl_dist.cli import main
 from icrl_dist.config.run import load
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems.darkroom.exact_agents import RULES
@@ -37,6 +38,7 @@ from tests.e2e.training import (
     wait_for,
     workers_of,
 )
+from tests.optional import known
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,8 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "smoke"
     process = start("train", *SMALLER, *NO_RESTARTS, "--out", folder, "--json")
     endpoint = endpoint_of(folder)
-    script = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs" / "tap.md").read_text(), re.DOTALL)
+    page = (Path(__file__).parents[2] / "docs" / "tap.md").read_text()
+    script = known(re.search(r"```python\n(.*?)```", page, re.DOTALL))
     commands = {
         "tap": [*CLI, "tap", "--connect", endpoint],
         "documented": [sys.executable, "-c", script.group(1), endpoint, folder.name],
@@ -131,11 +134,10 @@ def test_tap_and_the_documented_script_print_one_line_per_trajectory(undisturbed
         assert sum(i.startswith("adapt/1") for i in identities) == 14 * (20 + 1), name
 
 
-def test_evaluate_prints_returns_and_those_of_the_oracle(undisturbed):
-    process = start("evaluate", undisturbed[0], "--episodes", "2", "--seeds", "2", "--p", "0", "0.4", "--json")
-    output = finish(process)
-    assert process.returncode == 0, output
-    rows = json.loads(output.splitlines()[-1])["rows"]
+def test_evaluate_prints_returns_and_those_of_the_oracle(undisturbed, capsys):
+    words = ["evaluate", str(undisturbed[0]), "--episodes", "2", "--seeds", "2", "--p", "0", "0.4", "--json"]
+    assert main.main(words) == 0
+    rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
     agents = 4 + len(RULES)
     assert [row["p"] for row in rows] == [0.0] * agents + [0.4] * agents
     assert all(len(row["episodes"]) == 2 for row in rows)
@@ -176,7 +178,7 @@ def raylets_of(process):
     return found
 
 
-def test_sigterm_has_the_effect_of_ctrl_c(tmp_path):
+def test_sigterm_leaves_a_checkpoint_and_no_process_and_resume_continues(reference, tmp_path):
     folder = tmp_path / "terminated"
     process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", folder)
     family, raylets = [], []
@@ -196,6 +198,11 @@ def test_sigterm_has_the_effect_of_ctrl_c(tmp_path):
     assert "SIGTERM" not in output and "--resume" in output
     _, alive = psutil.wait_procs(family, timeout=60)
     assert not [p.cmdline() for p in alive]
+    assert (folder / "checkpoints" / "version-0000.npz").exists()
+    again = start("train", *SMOKE, *NO_RESTARTS, "--engine", "inline", "--out", folder, "--resume")  # gives the same bytes
+    output = finish(again)
+    assert again.returncode == 0, output
+    assert equal(result_of(folder), reference)
 
 
 def test_sigterm_while_ray_starts_has_the_effect_of_ctrl_c(tmp_path):
@@ -206,27 +213,3 @@ def test_sigterm_while_ray_starts_has_the_effect_of_ctrl_c(tmp_path):
     assert process.returncode == 130 and output.splitlines()[-1].startswith("interrupted; "), output
     _, alive = psutil.wait_procs(family, timeout=60)
     assert not [p.cmdline() for p in alive]
-
-
-def test_ctrl_c_leaves_a_checkpoint_and_no_process_and_resume_continues(reference, tmp_path):
-    folder = tmp_path / "interrupted"
-    process = start("train", *SMOKE, *NO_RESTARTS, "--actors", "1", "--out", folder, start_new_session=True)
-    family = []
-
-    def interrupt():
-        family.extend(descendants_of(process))
-        os.killpg(process.pid, signal.SIGINT)
-
-    with on_first_adapt_trajectory(folder, interrupt) as interrupted:
-        assert interrupted.wait(300)
-    output = finish(process)
-    assert process.returncode == 130, output
-    assert "--resume" in output and (folder / "checkpoints" / "version-0000.npz").exists()
-    _, alive = psutil.wait_procs(family, timeout=60)
-    assert not [p.cmdline() for p in alive]
-    again = start(
-        "train", *SMOKE, *NO_RESTARTS, "--engine", "inline", "--out", folder, "--resume"
-    )  # inline gives the same bytes
-    output = finish(again)
-    assert again.returncode == 0, output
-    assert equal(result_of(folder), reference)

@@ -7,9 +7,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
-from tests.e2e.training import CLI, NO_RESTARTS, endpoint_of, equal, finish, on_first_adapt_trajectory, result_of, start
+from icrl_dist.storage.checkpoint import version_file
+from learner import checkpoints
+from tests.e2e.training import (
+    CLI,
+    NO_RESTARTS,
+    descendants_of,
+    endpoint_of,
+    equal,
+    finish,
+    on_first_adapt_trajectory,
+    result_of,
+    start,
+)
 
 ROOT = Path(__file__).parents[2]
 RUN = """
@@ -59,53 +72,77 @@ def installed(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(installed, tmp_path_factory):
-    """A whole run through Ray and Zenoh, with a tap beside it."""
+def interrupted(installed, tmp_path_factory):
+    """A run through Ray and Zenoh with a tap beside it, stopped by Ctrl-C in the first round."""
     environment, run = installed
     folder = tmp_path_factory.mktemp("runs") / "toy"
-    process = start("train", run, *NO_RESTARTS, "--out", folder, "--json", env=environment)
+    process = start("train", run, *NO_RESTARTS, "--out", folder, env=environment, start_new_session=True)
     tap = [*CLI, "tap", "--connect", endpoint_of(folder), "--count", "3", "--timeout", "60"]
-    tapped = subprocess.run(tap, env=environment, capture_output=True, text=True, timeout=200)
+    family = []
+
+    def interrupt():
+        family.extend(descendants_of(process))
+        os.killpg(process.pid, signal.SIGINT)
+
+    with subprocess.Popen(tap, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tapping:
+        with on_first_adapt_trajectory(folder, interrupt) as acted:
+            output = finish(process)
+        tapped = tapping.communicate(timeout=200)
+    assert acted.is_set() and process.returncode == 130, output
+    return folder, output, tapped, family
+
+
+@pytest.fixture(scope="module")
+def trained(installed, interrupted):
+    """The folder of the same run, resumed through Ray and Zenoh, and the weights digest of its first version before."""
+    environment, run = installed
+    folder = interrupted[0]
+    before = checkpoints.read_manifest(version_file(folder, 0))["weights_digest"]
+    process = start("train", run, *NO_RESTARTS, "--out", folder, "--resume", env=environment)
     output = finish(process)
     assert process.returncode == 0, output
-    return folder, output, tapped
+    return folder, before
+
+
+def test_they_are_watched(interrupted):
+    _, _, (printed, errors), _ = interrupted
+    rows = [json.loads(line) for line in printed.splitlines()]
+    assert len(rows) == 3 and {row["problem"] for row in rows} == {"toy-corridor"}, errors
+    assert {row["adversary"]["kind"] for row in rows} <= {"null", "slip"}
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_no_process(interrupted):
+    folder, output, _, family = interrupted
+    assert "--resume" in output and version_file(folder, 0).exists()
+    _, alive = psutil.wait_procs(family, timeout=60)
+    assert family and not [p.cmdline() for p in alive]
 
 
 def test_they_train_through_ray_and_are_evaluated(trained):
-    folder, _, _ = trained
-    result = result_of(folder)
+    result = result_of(trained[0])
     assert (result["version"], result["trajectories"]) == (1, 32 + 4 * 2 * 3)
     agents = {row["agent"] for row in result["rows"]}
     assert agents == {"T^1 (return-to-go)", "T^0", "random"}
     assert all(len(row["episodes"]) == 3 and row["optimum"] is None for row in result["rows"])
 
 
-def test_they_are_watched(trained):
-    _, _, tapped = trained
-    rows = [json.loads(line) for line in tapped.stdout.splitlines()]
-    assert len(rows) == 3 and {row["problem"] for row in rows} == {"toy-corridor"}, tapped.stderr
-    assert {row["adversary"]["kind"] for row in rows} <= {"null", "slip"}
-
-
-def test_one_process_makes_the_same_bytes(installed, trained, tmp_path):
+@pytest.fixture(scope="module")
+def inline(installed, tmp_path_factory):
+    """The folder of the same run in one process."""
     environment, run = installed
-    again = start("train", run, "--engine", "inline", "--out", tmp_path / "inline", env=environment)
-    output = finish(again)
-    assert again.returncode == 0, output
-    assert equal(result_of(tmp_path / "inline"), result_of(trained[0]))
+    folder = tmp_path_factory.mktemp("runs") / "inline"
+    process = start("train", run, "--engine", "inline", "--out", folder, env=environment)
+    output = finish(process)
+    assert process.returncode == 0, output
+    return folder
 
 
-def test_an_interrupted_run_is_resumed_to_the_same_bytes(installed, trained, tmp_path):
-    environment, run = installed
-    folder = tmp_path / "toy"
-    process = start("train", run, *NO_RESTARTS, "--out", folder, env=environment)
-    with on_first_adapt_trajectory(folder, lambda: process.send_signal(signal.SIGINT)) as acted:
-        output = finish(process)
-    assert acted.is_set() and process.returncode == 130, output
-    again = start("train", run, *NO_RESTARTS, "--out", folder, "--resume", env=environment)
-    output = finish(again)
-    assert again.returncode == 0, output
-    assert equal(result_of(folder), result_of(trained[0]))
+def test_one_process_makes_the_same_bytes_as_ray(trained, inline):
+    assert trained[1] == checkpoints.read_manifest(version_file(inline, 0))["weights_digest"]
+
+
+def test_an_interrupted_run_is_resumed_to_the_same_bytes(trained, inline):
+    assert equal(result_of(trained[0]), result_of(inline))
 
 
 def test_their_agent_is_deployed_from_python(installed, trained):

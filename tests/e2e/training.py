@@ -38,11 +38,14 @@ def result_of(folder):
 
 
 def wait_for(condition, what, timeout=300):
+    """Wait until the condition holds; returns its value.  Looking at processes is costly: a tenth of a core at most."""
     deadline = time.monotonic() + timeout
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"{what} did not happen within {timeout} s"
-        time.sleep(0.02)
-    return value
+    while True:
+        began = time.monotonic()
+        if value := condition():
+            return value
+        assert began < deadline, f"{what} did not happen within {timeout} s"
+        time.sleep(0.02 + 9 * (time.monotonic() - began))
 
 
 def endpoint_of(folder):
@@ -50,10 +53,16 @@ def endpoint_of(folder):
     return wait_for(lambda: file.exists() and file.read_text().strip(), "the start of the learner")
 
 
+class Acted(threading.Event):
+    """Set once something was done; ``link`` is the connection on which it was awaited."""
+
+    link: ZenohLink
+
+
 @contextlib.contextmanager
 def on_first_adapt_trajectory(folder, act, round_=0):
     """Call ``act`` once, when a trajectory of the round appears on the monitor plane; the yielded event is set after it."""
-    acted = threading.Event()
+    acted = Acted()
 
     def receive(key, payload):
         _, fields = wire.decode_message(payload)

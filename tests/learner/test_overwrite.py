@@ -17,6 +17,8 @@ from icrl_dist.storage.files import held, hold
 from tests.launch.test_run_folder import files
 from tests.learner.test_service import no_tensorboard
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["no_tensorboard"]
 
 

@@ -13,6 +13,8 @@ from icrl_dist.cli.main import main
 from tests.monitor.fake_feed import BEGAN, FakeFeed, episode, run_folder
 from tests.monitor.terminal import drive, rows, text
 
+pytestmark = pytest.mark.integration
+
 
 def test_p_freezes_the_view_of_a_live_run_and_unfreezes_it():
     feed = FakeFeed()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from rich.console import Console
 from icrl_dist.results import rows
 
 
-def block(returns: Any, agent: str = "t0", p: float = 0.0, seed: int = 0, **others: Any) -> dict[str, Any]:
+def block(returns: Any, agent: str = "t0", p: float | None = 0.0, seed: int = 0, **others: Any) -> dict[str, Any]:
     """A block of rows of one training.  ``returns``: by task, evaluation seed and episode; ``optimum``: by task."""
     values = np.asarray(returns, float)
     task, evaluation, episode = (index.ravel() for index in np.indices(values.shape))
@@ -48,7 +49,7 @@ def block(returns: Any, agent: str = "t0", p: float = 0.0, seed: int = 0, **othe
     }
 
 
-def frame(*blocks: dict[str, Any], suite: str = "online") -> Any:
+def frame(*blocks: Mapping[str, Any], suite: str = "online") -> Any:
     """The blocks, written to a file and read again."""
     with tempfile.TemporaryDirectory() as folder:
         return rows.read([rows.append(Path(folder), suite, {}, blocks)])

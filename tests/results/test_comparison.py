@@ -114,7 +114,7 @@ def test_methods_are_compared_in_one_suite_and_with_one_kind_of_data():
         (random, r"suite are online of .* and offline"),
         (frame(block(TWO, tasks="test")), r"tasks are evaluated of .* and test"),
         (frame(block(TWO, prior="unseen")), r"prior are uniform of .* and unseen"),
-        (frame(block(TWO, problem="toy")), r"problem are darkroom of .* and toy"),
+        (frame(block(TWO, problem="dmc-hopper-hop")), r"problem are darkroom of .* and dmc-hopper-hop"),
     ):
         with pytest.raises(ConfigError, match=expected):
             tables.compare(frame(block(TWO)), other)
@@ -137,7 +137,7 @@ def test_a_share_is_one_of_the_agents_own_optimum():
 
 def test_a_ratio_to_returns_that_may_be_0_has_no_verdict():
     first, second = (frame(block([[[one]] for one in values])) for values in ((0.0, 3.0, 0.0), (1.0, 8.0, 2.0)))
-    rows = {row.statistic: row for row in compare(*(newest_model(one)[0] for one in (first, second)))}
+    rows = {row.statistic: row for row in compare(newest_model(first)[0], newest_model(second)[0])}
     assert rows["ratio"].effect.value == pytest.approx(8 / 3) and math.isnan(rows["ratio"].effect.low)
     assert rows["ratio"].verdict == "not shown"
     losses = frame(block([[[-1.0]], [[-2.0]]], optimum=[-1.0, -1.0]))
@@ -152,7 +152,7 @@ def test_the_minimum_keeps_its_tasks():
     good = np.tile([[[10.0], [10.1]]], (20, 1, 1))
     bad = good.copy()
     bad[3] = 0
-    (rows,) = (compare(*(newest_model(frame(block(one)))[0] for one in (good, bad))),)
+    rows = compare(newest_model(frame(block(good)))[0], newest_model(frame(block(bad)))[0])
     worst = next(row for row in rows if row.statistic == "minimum")
     assert worst.effect.value == pytest.approx(-10.05) and worst.verdict == "lower" and worst.effect.high < -9
 

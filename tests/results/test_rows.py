@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,6 +58,7 @@ def test_the_rows_of_an_evaluation_are_its_returns(small_run, tmp_path):
     key = ["agent", "p", "task_index", "evaluation_seed", "episode"]
     by_key = {tuple(row[name] for name in key): row for row in frame.to_dict("records")}
     for one in found:
+        assert one.optimum is not None
         for (task, seed, episode), value in np.ndenumerate(one.returns):
             row, variation = by_key[one.agent.key, one.p, task, seed, episode], one.variations[task]
             assert row["return"] == value and row["optimum"] == one.optimum[task]
@@ -125,7 +127,7 @@ def test_the_rows_of_several_runs_are_read_together(folder, tmp_path):
     assert frame.groupby("training_seed").size().to_dict() == {0: 24, 1: 12}
 
 
-def rewritten(folder: Path, change) -> None:
+def rewritten(folder: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     """Replace the folder's file by a changed table, as another version or another program would write it."""
     (file,) = (folder / "results").iterdir()
     table = change(pq.read_table(file))
@@ -211,7 +213,7 @@ def test_a_return_of_nan_ends_an_evaluation_after_its_first_episode(small_run, m
             found = step(*arguments)
             return found._replace(reward=found.reward * np.nan)
 
-        env.step = poor
+        monkeypatch.setattr(env, "step", poor)
         return env
 
     monkeypatch.setattr(type(problem), "batch", batch)
@@ -227,8 +229,8 @@ def test_a_return_of_nan_ends_an_evaluation_after_its_first_episode(small_run, m
 @pytest.mark.parametrize(("seed", "stored"), [(7, 7), ("north", None), ((1, 2), None), (True, None), (2**63, None)])
 def test_a_split_seed_that_is_no_number_of_64_bits_is_null(small_run, monkeypatch, tmp_path, seed, stored):
     config = SimpleNamespace(split_seed=seed)
-    monkeypatch.setattr(evaluate.registry, "of", lambda run: SimpleNamespace(config=config))
-    rows.append(tmp_path / "results", "online", {}, [block(RETURNS) | evaluate.of_run(small_run, "run")])
+    monkeypatch.setattr(registry, "of", lambda run: SimpleNamespace(config=config))
+    rows.append(tmp_path / "results", "online", {}, [{**block(RETURNS), **evaluate.of_run(small_run, "run")}])
     frame = read_results(tmp_path)
     assert (frame.split_seed.isna().all() and stored is None) or set(frame.split_seed) == {stored}
     assert returns(frame)[0].cells[0][0][0] == stored
@@ -255,6 +257,7 @@ def test_the_page_has_every_column():
     assert rows.document() in page, "put the output of `icrl_dist.results.rows.document()` into docs/data.md"
 
 
+@pytest.mark.integration
 def test_workers_and_the_learner_start_without_pandas_and_pyarrow():
     script = (
         "import sys, actors.worker, learner.service, icrl_dist.results.rows\nprint({'pandas', 'pyarrow'} & set(sys.modules))"

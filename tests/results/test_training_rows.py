@@ -60,7 +60,8 @@ def test_a_round_that_a_resumed_run_rates_again_is_read_once(small_run, tmp_path
 
 @pytest.mark.parametrize("fault", ["disk", "nan"])
 def test_rows_that_cannot_be_written_end_no_training(small_run, tmp_path, monkeypatch, fault):
-    method, notes = methods.of(small_run), []
+    method = methods.of(small_run)
+    notes: list[str] = []
     phase = method.phases(small_run)[1]
     trajectories = [trial for one in trials_of(small_run, phase, FixedWeights(small_run)) for trial in one]
     rated = list(method.label_quality(small_run, phase, InMemoryDataset(trajectories)))

@@ -29,6 +29,8 @@ from tests.results.test_statistics import (
     slow_ratio,
 )
 
+pytestmark = pytest.mark.integration
+
 LAST = 3
 SEEDS, EPISODES, LEVELS = 2, 3, (0.0, 0.3)
 TINY = (
@@ -224,9 +226,10 @@ def test_every_number_of_a_comparison_follows_from_the_rows(runs):
 
 def test_the_examples_of_the_page_run(runs, capsys):
     page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
-    reading, comparing = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(reading.replace("runs/demo", str(runs["icaa", 0].folder)), {})
-    assert "oracle" in capsys.readouterr().out
+    reading, trajectories, comparing = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for example, shown in ((reading, "oracle"), (trajectories, "adapt/0/0/1/2")):
+        exec(example.replace("runs/demo", str(runs["icaa", 0].folder)), {})
+        assert shown in capsys.readouterr().out
     folders = {f"runs/{method}-{seed}": str(run.folder) for (method, seed), run in runs.items()}
     for name, folder in folders.items():
         comparing = comparing.replace(name, folder)

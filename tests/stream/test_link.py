@@ -67,6 +67,7 @@ class TestMemoryLink(LinkBattery, CreditBattery):
             link.close()
 
 
+@pytest.mark.integration
 class TestZenohLink(LinkBattery, CreditBattery):
     @pytest.fixture
     def links(self) -> Iterator[Links]:
@@ -106,7 +107,7 @@ def test_names_that_cannot_be_keys_are_refused() -> None:
 def test_a_dispatcher_survives_an_action_that_raises(caplog: pytest.LogCaptureFixture) -> None:
     dispatcher, ran = Dispatcher("test"), list[str]()
     dispatcher.post(lambda: ran.append("later"), 1.0)
-    dispatcher.post(lambda: 1 / 0)  # type: ignore[arg-type]
+    dispatcher.post(lambda: 1 / 0)
     dispatcher.post(lambda: ran.append("now"))
     dispatcher.post(lambda: ran.append("never"), 60.0)
     eventually(lambda: ran == ["now", "later"])
@@ -114,6 +115,7 @@ def test_a_dispatcher_survives_an_action_that_raises(caplog: pytest.LogCaptureFi
     assert "ZeroDivisionError" in caplog.text
 
 
+@pytest.mark.integration
 def test_a_port_in_use_and_an_absent_learner_are_named_in_the_error() -> None:
     with ZenohLink.listen(ANYWHERE) as link:
         endpoint = link.endpoints[0]
@@ -126,6 +128,7 @@ def test_a_port_in_use_and_an_absent_learner_are_named_in_the_error() -> None:
             ZenohLink.listen(bad)
 
 
+@pytest.mark.integration
 def test_a_worker_reconnects_to_a_restarted_learner() -> None:
     first = ZenohLink.listen(ANYWHERE)
     endpoint, seen = first.endpoints[0], list[tuple[str, bool]]()
@@ -189,6 +192,7 @@ def kill(process: subprocess.Popen[bytes]) -> None:
     process.wait(10)
 
 
+@pytest.mark.integration
 def test_the_death_of_a_worker_is_reported() -> None:
     seen: list[tuple[str, bool]] = []
     with ZenohLink.listen(ANYWHERE) as learner:
@@ -201,6 +205,7 @@ def test_the_death_of_a_worker_is_reported() -> None:
         eventually(lambda: seen[1:] == [("doomed", False)], 2.0)
 
 
+@pytest.mark.integration
 def test_a_killed_and_restarted_learner_loses_nothing(tmp_path: Path) -> None:
     with ZenohLink.listen(ANYWHERE) as free:
         endpoint = free.endpoints[0]
@@ -224,11 +229,13 @@ def test_a_killed_and_restarted_learner_loses_nothing(tmp_path: Path) -> None:
     assert sorted(map(int, stored.read_text().split())) == list(range(800))
 
 
+@pytest.mark.integration
 def test_a_process_that_does_not_close_its_link_still_exits() -> None:
     with ZenohLink.listen(ANYWHERE) as learner:
         assert run(UNCLOSED, learner.endpoints[0]).wait(15) == 0
 
 
+@pytest.mark.integration
 def test_the_documented_tap_prints_a_line_a_trajectory(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "tap.md").read_text()
     found = re.search(r"```python\n(.*?)```", text, re.DOTALL)

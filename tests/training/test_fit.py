@@ -83,6 +83,7 @@ def test_every_parameter_gets_a_gradient() -> None:
     assert without == []
 
 
+@pytest.mark.integration
 def test_a_fit_learns_the_corridor() -> None:
     """From log 2 = 0.69 to near the minimum: of the prefixes 0 to 8, only at 0 is the label uncertain."""
     model, pools = corridor()

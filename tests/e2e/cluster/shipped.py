@@ -4,7 +4,6 @@ import contextlib
 import json
 import re
 import subprocess
-import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import psutil
 from icrl_dist.storage.dataset import Dataset
 from tests.e2e import simulated_nodes
 from tests.e2e.cluster import files
+from tests.e2e.training import wait_for
 
 # Small, so that most of the time goes to the cluster itself; a round is long enough for faults in the middle.
 SMALL = "--pretrain.contexts 28 --pretrain.steps 4 --icaa.steps 4 --evaluate.episodes 1 --evaluate.seeds 1 --evaluate.p 0"
@@ -54,13 +54,14 @@ class ShippedCluster:
         words = self.client.command(*self.ray("dashboard", self.FILE))
         with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             try:
-                wait_until(lambda: self.status_without_token() or process.poll() is not None, "the tunnel to the head")
+                wait_for(lambda: self.status_without_token() or process.poll() is not None, "the tunnel to the head")
                 assert process.poll() is None, "`ray dashboard` ended"
                 yield
             finally:
-                for one in [*psutil.Process(process.pid).children(recursive=True), process]:
+                for one in psutil.Process(process.pid).children(recursive=True):
                     with contextlib.suppress(psutil.NoSuchProcess):
                         one.kill()
+                process.kill()
 
     def status_without_token(self):
         """HTTP status of the job server for a request without a token; None without an answer."""
@@ -148,16 +149,6 @@ def _namespaces(process):
     with contextlib.suppress(OSError):  # the process has ended
         return {(Path("/proc") / str(process) / "ns" / kind).readlink() for kind in ("net", "mnt", "pid")}
     return set()
-
-
-def wait_until(condition, what, timeout=250):
-    deadline = time.monotonic() + timeout
-    while True:
-        began = time.monotonic()
-        if condition():
-            return
-        assert began < deadline, f"{what}: not within {timeout} s"
-        time.sleep(0.05 + 4 * (time.monotonic() - began))  # a fifth of a core at most
 
 
 def one_line(text):

@@ -16,7 +16,8 @@ import psutil
 import pytest
 
 from tests.e2e import simulated_nodes
-from tests.e2e.cluster.shipped import TRAIN, one_line, started, underway, up, wait_until
+from tests.e2e.cluster.shipped import TRAIN, one_line, started, underway, up
+from tests.e2e.training import wait_for
 
 CUT_S = 20.0
 
@@ -65,7 +66,7 @@ class TestJobs:
     """Jobs that `ray job` submits to the cluster from outside."""
 
     def test_the_nodes_join_and_requests_without_a_token_are_refused(self, jobs):
-        wait_until(lambda: jobs.running("raylet/raylet") == [1, 1], "a raylet on each worker node")
+        wait_for(lambda: jobs.running("raylet/raylet") == [1, 1], "a raylet on each worker node")
         refused = subprocess.run(
             jobs.client.command("env", "RAY_AUTH_MODE=disabled", "ray", "status", f"--address={jobs.head.address}:6379"),
             stdout=subprocess.PIPE,
@@ -77,11 +78,9 @@ class TestJobs:
 
     def test_a_submitted_run_equals_one_in_one_process_and_prints_its_placement(self, jobs, inline, tmp_path):
         with underway(tmp_path, jobs.job("submit", "--", *jobs.train("smoke").split())) as (process, printed):
-            wait_until(
-                lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "a worker on each node"
-            )
+            wait_for(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "a worker on each node")
             assert process.poll() is None and not jobs.head.processes("WorkerActor.work"), printed()
-            wait_until(lambda: "round 0" in printed() or process.poll() is not None, "the output of round 0")
+            wait_for(lambda: "round 0" in printed() or process.poll() is not None, "the output of round 0")
             assert process.poll() is None, "the output came only at the end"
             assert process.wait(timeout=400) == 0, printed()
         assert re.search(r"learner on head \(cpu, 1 threads\) listens at tls/", printed())
@@ -123,7 +122,7 @@ class TestJobs:
         """Both workers are disconnected in the middle of a round, so that the run cannot continue without them."""
         words = jobs.job("submit", "--submission-id", "stopped", "--", *jobs.train("stopped").split())
         with underway(tmp_path, words) as (process, printed):
-            wait_until(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "workers")
+            wait_for(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "workers")
             with jobs.suspended():
                 subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=250)
                 process.wait(timeout=200)
@@ -131,7 +130,7 @@ class TestJobs:
             assert "was stopped" in printed(), printed()
         assert not jobs.head.processes("learner") and not jobs.head.processes("icrl-dist train")
         with underway(tmp_path, jobs.exec(jobs.train("stopped", "--resume"))) as (process, printed):
-            wait_until(lambda: "round 0" in printed() or process.poll() is not None, "a round")
+            wait_for(lambda: "round 0" in printed() or process.poll() is not None, "a round")
             with contextlib.ExitStack() as cut:
                 with jobs.suspended():
                     cut.enter_context(jobs.cut_off())
@@ -144,7 +143,7 @@ class TestJobs:
 def test_killed_raylets_a_killed_learner_and_a_node_that_joins_during_a_round(cluster, inline, tmp_path):
     """All workers and the learner die in the middle of a round; a node outside the cluster file does the rest."""
     with underway(tmp_path, cluster.exec(cluster.train("killed"))) as (process, printed):
-        wait_until(lambda: "round 0" in printed() or process.poll() is not None, "the first round")
+        wait_for(lambda: "round 0" in printed() or process.poll() is not None, "the first round")
         assert process.poll() is None, printed()
         for word, nodes in (("raylet/raylet", cluster.workers), ("-m learner", (cluster.head,))):
             for node in nodes:
@@ -178,13 +177,13 @@ def joins(cluster):
 def test_ray_down_and_ray_stop_end_every_process(cluster):
     stop = "for host; do ssh -i ~/.ssh/id_ed25519 -o StrictHostKeyChecking=no $host icrl-dist/.venv/bin/ray stop & done; wait"
     cluster.client.run(*cluster.ray("down", "-y", cluster.FILE), timeout=250)
-    wait_until(lambda: not left(cluster.head), "everything on the head ended", 60)
+    wait_for(lambda: not left(cluster.head), "everything on the head ended", 60)
     with ThreadPoolExecutor() as pool:
         late = pool.submit(cluster.late.run, "ray", "stop", timeout=250)
         cluster.client.run("bash", "-c", stop, "stop", *(worker.address for worker in cluster.workers), timeout=250)
         late.result()
     for worker in (*cluster.workers, cluster.late):
-        wait_until(lambda worker=worker: not left(worker), "everything ended", 60)
+        wait_for(lambda worker=worker: not left(worker), "everything ended", 60)
 
 
 def left(node):

@@ -1,0 +1,119 @@
+"""What an evaluation gives its user: rows, tables, a summary, and the files of its report."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, ConsoleOptions
+from rich.jupyter import JupyterMixin
+from rich.table import Table
+from rich.text import Text
+
+from icrl_dist.config.run import Run
+from icrl_dist.problems import registry
+from icrl_dist.results import plots, summaries
+from icrl_dist.results.returns import Returns, returns
+from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
+from icrl_dist.storage.files import atomic_write
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation(JupyterMixin):
+    """The result of one evaluation.  A notebook shows its tables, and so does ``print``."""
+
+    rows: pd.DataFrame = field(repr=False)
+    """The new result rows, one per evaluated episode; docs/data.md explains the columns."""
+    tables: tuple[Table, ...] = field(repr=False)
+    """The tables that the command line prints."""
+    notes: tuple[str, ...] = field(repr=False)
+    """Lines below the tables."""
+    summary: dict[str, Any] = field(repr=False)
+    """The numbers of the tables as JSON values: what ``icrl-dist evaluate --json`` prints."""
+
+    @property
+    def figure(self) -> Path | None:
+        """The figure of the report, a PNG file; None for an evaluation without one."""
+        return Path(self.summary["figure"]) if "figure" in self.summary else None
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | Text]:
+        yield from self.tables
+        yield from map(Text, self.notes)
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=120, soft_wrap=True)
+        with console.capture() as captured:
+            console.print(self)
+        return captured.get().rstrip("\n")
+
+
+def online(run: Run, report: Path, frame: pd.DataFrame) -> Evaluation:
+    """The evaluation with these rows of suite ``online``.
+
+    Writes the numbers to ``report``.json, the figure to ``report``.png.
+    """
+    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), returns(frame)
+    _, tasks, evaluations, _ = found[0].returns.shape
+    title = f"{run.method.upper()} on {registry.of(run).title(tasks)}, {evaluations} seeds"
+    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
+    figure = plots.adaptation(numbers, report.with_name(f"{report.name}.png"), title)
+    surprises = [
+        f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
+        for p, score in scores.items()
+    ]
+    return Evaluation(
+        frame,
+        (returns_table(frame, f"Return by online episode: {title}"),),
+        (*_diverged(found), *surprises, f"figure {figure}"),
+        {**summaries.adaptation(frame), "surprise": scores, "rows": numbers, "figure": str(figure)},
+    )
+
+
+def _diverged(found: Sequence[Returns]) -> list[str]:
+    return [
+        f"{one.name}, p = {one.p:g}: the simulation diverged in {one.diverged} of {one.returns.size} episodes; "
+        "their return up to that step counts"
+        for one in found
+        if one.diverged
+    ]
+
+
+def offline(run: Run, frame: pd.DataFrame) -> Evaluation:
+    """The evaluation with these rows of suite ``offline``."""
+    found = returns(frame)
+    title = registry.of(run).title(found[0].returns.shape[1])
+    table = returns_table(frame, f"One episode given data collected before: {title}")
+    return Evaluation(frame, (table,), tuple(_diverged(found)), {"rows": summaries.result_rows(frame)})
+
+
+def posterior(run: Run, report: Path, frame: pd.DataFrame, found: dict[str, Any]) -> Evaluation:
+    """The evaluation with these rows of suite ``posterior`` and the distances ``found``.
+
+    Writes the distances to ``report``.json, the figure to ``report``.png; the summary leaves out their curves.
+    """
+    problem = registry.of(run)
+    title = f"{run.method.upper()} compared with the exact posterior: {problem.title(len(problem.evaluated))}"
+    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
+    figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
+    assert problem.posterior is not None, "``check_suite`` refuses problems without one"
+    tables = [
+        kl_table(found, prior, f"KL(exact || model) in nats, where {meaning}")
+        for prior, meaning in problem.posterior.priors.items()
+    ]
+    adversary = f"{run.evaluate.prior} adversary, {run.evaluate.episodes} episodes, {run.evaluate.seeds} seeds"
+    tables.append(gap_table(found, f"Online return by Algorithm 1 compared with the exact agent's: {adversary}"))
+    summary = {key: value for key, value in found.items() if not key.endswith("_curves")} | {"figure": str(figure)}
+    return Evaluation(frame, tuple(tables), (f"figure {figure}",), summary)
+
+
+def experts(frame: pd.DataFrame) -> Evaluation:
+    """The evaluation with these rows of suite ``experts``."""
+    found = summaries.experts(frame)
+    return Evaluation(frame, (experts_table(found),), (), {"experts": found})

@@ -1,0 +1,91 @@
+"""One evaluation, as the command and Python ask for it: settings, suite, report."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from icrl_dist.agent.loading import SHIPPED, checkpoint_file, shipped
+from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
+from icrl_dist.console.display import Show, reporting
+from icrl_dist.methods import registry as methods
+from icrl_dist.results import heldout, reports
+from icrl_dist.results.reports import Evaluation
+from icrl_dist.results.rows import is_unfinished
+from icrl_dist.storage.checkpoint import load_checkpoint
+
+Suite = Literal["online", "offline", "posterior"]
+Prior = Literal["uniform", "unseen"]
+
+
+def evaluate(
+    what: str | Path,
+    *,
+    suite: Suite = "online",
+    deploy: Deployment | None = None,
+    episodes: int | None = None,
+    seeds: int | None = None,
+    p: Sequence[float] | None = None,
+    prior: Prior | None = None,
+    progress: Show = False,
+) -> Evaluation:
+    """Evaluate a trained agent on tasks that it did not train on, beside T^0, exact agents and the oracle.
+
+    ``what``: a run folder, a checkpoint file, or the name of an agent of the package (``"darkroom"``; ``"./darkroom"``
+    is a folder of that name).  The new rows are also written to ``results/`` of the run, the numbers and the figure to
+    its ``report/``; for an agent of the package to runs/NAME-pretrained.
+
+    ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
+    of a random or an expert episode; ``posterior`` for the distance to the exact posterior.
+    ``deploy``: the deployment rule, ``paper`` or ``committed``; None for the rule that the model was trained for.
+    Suite ``posterior`` always uses ``paper``.
+    ``episodes``: online episodes; ``seeds``: evaluations per task; ``p``: override probabilities of the test adversary,
+    0 to 1; ``prior``: distribution of the test adversaries.  None: the run's (suite ``posterior``: 40 episodes, 2
+    seeds, p 0, 0.2, 0.4 and 0.6, uniform).
+    ``progress``: True shows it on standard output; a function receives each event, a dictionary.
+
+    Raises ConfigError if there is no such agent or a setting is impossible, StoreError for a file that was not written
+    by this system.  The messages name the options of the command line.
+    """
+    source, folder = _source_and_output(what)
+    for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
+        if value is not None and value not in get_args(choices):
+            raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
+    run = parse_written(str(load_checkpoint(checkpoint_file(source)).manifest.get("run", "")), str(source))
+    chosen: dict[str, Any] = {
+        "episodes": episodes,
+        "seeds": seeds,
+        "p": None if p is None else tuple(map(float, p)),
+        "prior": prior,
+    }
+    given = {name: value for name, value in chosen.items() if value is not None}
+    if suite == "posterior":
+        given = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 2} | given
+    run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **given))
+    validate(run, "evaluate")
+    heldout.check_suite(run, suite)
+    rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)
+    report = folder / "report" / heldout.report_name(run, source, suite, rule)
+    results = (heldout.run_folder(source) or folder) / "results"  # rows of a checkpoint in a run folder belong to that run
+    with reporting(progress) as show:
+        if source.is_dir() and is_unfinished(source):
+            text = f"{source}: this run is not finished; the newest version so far is evaluated"
+            show({"event": "note", "text": text})
+        if suite == "online":
+            found = reports.online(run, report, heldout.online(run, source, results, show, deploy))
+        elif suite == "offline":
+            found = reports.offline(run, heldout.offline(run, source, results, deploy))
+        else:
+            found = reports.posterior(run, report, *heldout.posterior(run, source, results, show))
+    answer = {"suite": suite, "deploy": rule, "what": str(source)}
+    return dataclasses.replace(found, summary=answer | found.summary)
+
+
+def _source_and_output(what: str | Path) -> tuple[Path, Path]:
+    """The run folder or checkpoint to evaluate, and the folder that its report and result rows are written below."""
+    if what in SHIPPED:
+        return shipped(what), Path("runs") / f"{what}-pretrained"
+    source = Path(what)
+    return source, source if source.is_dir() else source.parent

@@ -1,0 +1,240 @@
+"""``icrl_dist.train``: the command's results, exceptions in place of exit codes, and a process left as it was."""
+
+import contextlib
+import dataclasses
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib
+import pytest
+import torch
+
+import icrl_dist
+from actors import fleet, local
+from icrl_dist.cli import main
+from icrl_dist.config.run import ConfigError, dumps
+from icrl_dist.launch import learner_process, whole_run
+from icrl_dist.launch import train as launch
+from icrl_dist.results import heldout, reports
+from tests.actors.fake_ray import FakeRay
+from tests.learner.test_service import no_tensorboard
+from tests.results.row_blocks import block, frame
+
+__all__ = ["no_tensorboard"]
+
+
+def state():
+    """What a run could change in its process."""
+    return {
+        "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)],
+        "random": torch.get_rng_state().tolist(),
+        "deterministic": torch.get_deterministic_debug_mode(),
+        "threads": torch.get_num_threads(),
+        "backend": matplotlib.get_backend(auto_select=False),
+        "variables": dict(os.environ),
+    }
+
+
+@pytest.fixture(scope="module")
+def made(module_run, no_tensorboard, tmp_path_factory):
+    """A run from Python: its result, what it printed, and the state of the process before and after it."""
+    folder = tmp_path_factory.mktemp("python") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MUJOCO_GL", "disabled")  # set by the first import of a continuous problem
+        output, before = folder.with_name("output"), state()
+        with output.open("w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+            result = icrl_dist.train(module_run, folder, engine="inline")
+        return SimpleNamespace(result=result, printed=output.read_text(), before=before, after=state())
+
+
+def test_a_run_from_python_has_the_results_of_the_command(made, module_run, tmp_path):
+    (tmp_path / "small.toml").write_text(dumps(module_run))
+    words = ["train", str(tmp_path / "small.toml"), "--engine", "inline", "--out", str(tmp_path / "run")]
+    assert main.main(words) == 0
+    there = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert made.result.result == json.loads((made.result.folder / "result.json").read_text())
+    differing = {name for name in there if there[name] != made.result.result[name]}
+    assert differing == {"folder", "seconds", "figure"} and there.keys() == made.result.result.keys()
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {path.name for path in made.result.folder.iterdir()}
+    rows = icrl_dist.read_results(made.result.folder)
+    assert made.result.evaluation.rows["return"].sum() == rows[rows.suite == "online"]["return"].sum()
+    assert made.result.evaluation.figure.is_file()
+
+
+def test_a_run_from_python_prints_nothing_and_leaves_its_process_as_it_was(made):
+    assert made.printed == ""
+    assert made.after == made.before
+
+
+def test_a_run_in_another_thread_and_its_events(module_run, tmp_path, no_tensorboard):
+    events: list[dict[str, Any]] = []
+    made: list[Any] = []
+    run = dataclasses.replace(module_run, method="icag")
+    thread = threading.Thread(
+        target=lambda: made.append(icrl_dist.train(run, tmp_path / "run", engine="inline", progress=events.append))
+    )
+    thread.start()
+    thread.join()
+    assert made[0].result["trajectories"] > 0
+    assert {"pretrain", "fit", "evaluate"} <= {event.get("phase", "") for event in events} | {
+        event.get("stage", "") for event in events
+    }
+
+
+def test_a_handler_that_python_cannot_set_again_is_not_replaced(monkeypatch):
+    """``signal.getsignal`` gives None for a handler of an extension, and ``signal.signal`` refuses None."""
+    get, was = signal.getsignal, signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None if number == signal.SIGTERM else get(number))
+    with launch.interruptible():
+        assert get(signal.SIGTERM) is was and get(signal.SIGINT) is not signal.default_int_handler
+    assert (get(signal.SIGINT), get(signal.SIGTERM)) == (signal.default_int_handler, was)
+
+
+@pytest.fixture
+def session(monkeypatch):
+    """A Ray session of the caller; ``ended`` lists what was done to it."""
+    ray = SimpleNamespace(is_initialized=lambda: True, ended=[])
+    ray.shutdown = lambda: ray.ended.append("shutdown")
+    ray.init = lambda **_: ray.ended.append("init")
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    return ray
+
+
+def test_a_process_that_uses_ray_keeps_its_session(session, module_run, tmp_path):
+    for address in (None, "auto"):
+        with pytest.raises(ConfigError, match=r"already uses Ray.*call ray\.shutdown\(\) first.*engine='inline'$"):
+            icrl_dist.train(module_run, tmp_path / "run", address=address, actors=1)
+        with pytest.raises(ConfigError, match="already uses Ray"):
+            fleet.Fleet(1, 0, address, oversubscribe=True)
+    assert session.ended == [] and not (tmp_path / "run").exists()
+
+
+REAL_SESSION = """
+import sys, ray
+ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
+import icrl_dist
+try:
+    icrl_dist.train("smoke", sys.argv[1], actors=1)
+except icrl_dist.ConfigError as error:
+    print("refused:", error)
+print("kept:", ray.is_initialized() and ray.get(ray.remote(lambda: 7).remote()))
+ray.shutdown()
+"""
+
+
+def test_a_real_session_of_ray_still_works_after_the_refusal(tmp_path):
+    ran = subprocess.run([sys.executable, "-c", REAL_SESSION, tmp_path / "run"], capture_output=True, text=True)
+    assert "refused: engine 'ray': this process already uses Ray" in ran.stdout, ran.stderr
+    assert "kept: 7" in ran.stdout, ran.stderr
+
+
+@pytest.mark.parametrize("start_fails", [False, True])
+def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
+    def start(ray, *_, **__):
+        assert os.environ["RAY_worker_niceness"] == "0"  # noqa: SIM112 - Ray's name
+        if start_fails:
+            raise RuntimeError("Ray did not start")
+
+    ray = FakeRay(1)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(local, "start_ray", start)
+    monkeypatch.setenv("RAY_worker_niceness", "5")
+    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
+    before = dict(os.environ)
+    with pytest.raises(fleet.FleetFailed) if start_fails else contextlib.nullcontext():
+        fleet.Fleet(1, 0).close()
+    assert dict(os.environ) == before
+
+
+def test_the_learner_process_has_the_waiting_policy_also_without_the_command_line(monkeypatch, tmp_path):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    program = tmp_path / "program"
+    program.write_text('#!/bin/sh\necho "$OMP_WAIT_POLICY" > "$3/policy"\n')
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    process = learner_process.LearnerProcess(tmp_path, "tcp/127.0.0.1:0", 0)
+    process._process.wait()
+    process.end()
+    assert (tmp_path / "policy").read_text() == "PASSIVE\n" and "OMP_WAIT_POLICY" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, "name a RUN, such as demo, or another run"),
+        ({"run": "smoke", "engine": "rai"}, "--engine rai: choose one of ray, inline"),
+        ({"run": "smok"}, "did you mean 'smoke'?"),
+        ({"run": "smoke", "actors": 0}, "--actors 0: at least 1 worker is needed"),
+        ({"run": icrl_dist.load_run("smoke")}, "a Run has no name; name its run folder, as in out='runs/mine'"),
+        ({"run": dataclasses.replace(icrl_dist.load_run("smoke"), seed=-1), "out": "x"}, "run: seed = -1"),
+        ({"source": "nowhere@0"}, "nowhere holds no run"),
+    ],
+)
+def test_impossible_calls_are_refused_in_one_line_and_make_no_folder(options, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        inspect.unwrap(icrl_dist.train)(**{"engine": "inline", **options})  # without the tests' check of types
+    assert expected in str(refused.value) and "\n" not in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_exists_needs_resume_or_overwrite(made, module_run):
+    with pytest.raises(ConfigError, match="use --resume to continue the run, --overwrite to replace it"):
+        icrl_dist.train(module_run, made.result.folder, engine="inline")
+
+
+def test_an_interrupted_run_says_what_its_folder_holds(module_run, tmp_path, monkeypatch):
+    def interrupted(run, folder, report):
+        raise launch.TrainInterrupted
+
+    monkeypatch.setattr(launch, "train_inline", interrupted)
+    with pytest.raises(icrl_dist.TrainInterrupted, match=r"holds the checkpoint: resume=True") as stopped:
+        icrl_dist.train(module_run, tmp_path / "run", engine="inline")
+    assert stopped.value.resumable
+    with pytest.raises(icrl_dist.TrainInterrupted, match=r"run is as it was before$") as stopped:
+        icrl_dist.train(module_run, tmp_path / "run", engine="inline", overwrite=True)
+    assert not stopped.value.resumable and (tmp_path / "run" / "run.toml").exists()
+
+
+def test_quarantined_variations_are_in_the_result_and_give_exit_code_1(module_run, tmp_path, monkeypatch, capsys):
+    left_out = [{"variation": "adapt/0/1/1", "cause": "worker w0 died"}]
+    produced = {"dataset_digest": "d", "weights_digest": "w", "trajectories": 3, "quarantined": left_out}
+    monkeypatch.setattr(launch, "train_inline", lambda *_: dict(produced))
+    monkeypatch.setattr(heldout, "save_calibrated", lambda *_: None)
+    monkeypatch.setattr(heldout, "online", lambda *_: frame(block([[[1.0, 2.0]]])))
+    monkeypatch.setattr(heldout, "report_name", lambda *_: "online")
+    made = icrl_dist.train(module_run, tmp_path / "run", engine="inline")
+    assert made.quarantined == left_out
+    assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "other")]) == 1
+    assert "quarantined: adapt/0/1/1: worker w0 died" in capsys.readouterr().out
+
+
+def test_load_run_takes_names_files_and_folders(made, module_run, tmp_path):
+    assert icrl_dist.load_run(made.result.folder) == icrl_dist.load_run(str(made.result.folder)) == module_run
+    (tmp_path / "small.toml").write_text(dumps(module_run))
+    for what in (tmp_path / "small.toml", str(tmp_path / "small.toml")):
+        assert icrl_dist.load_run(what, "seed=3") == dataclasses.replace(module_run, seed=3)
+    changed = icrl_dist.load_run("smoke", "icaa.rounds=2", "method=icag")
+    assert (changed.icaa.rounds, changed.method, changed.problem) == (2, "icag", "darkroom")
+    with pytest.raises(ConfigError, match=r"smoke: unknown key icaa.round; did you mean 'rounds'\?"):
+        icrl_dist.load_run("smoke", "icaa.round=2")
+
+
+def test_the_default_folder_is_named_after_the_run(made):
+    names = {"demo": "demo", "mine/small.toml": "small", "experts-dmc": "experts-dmc"}
+    assert {name: whole_run.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
+    assert whole_run.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
+
+
+def test_an_evaluation_is_shown_by_print_and_by_a_notebook(module_run, tmp_path):
+    found = reports.online(module_run, tmp_path / "report", frame(block([[[1.0, 2.0]]])))
+    for text in (str(found), found._repr_mimebundle_([], [])["text/plain"]):
+        assert "Return by online episode" in text and "T^0" in text and "figure" in text
+    assert repr(found) == "Evaluation()"

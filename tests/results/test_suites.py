@@ -1,0 +1,70 @@
+"""``icrl_dist.evaluate``: the command's evaluation as an object, and impossible calls in one line."""
+
+import inspect
+import io
+import json
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+import icrl_dist
+from icrl_dist.cli import main
+from icrl_dist.config.run import ConfigError
+from tests.results.test_evaluate import folder
+
+__all__ = ["folder"]
+
+
+@pytest.mark.parametrize("suite", ["online", "offline", "posterior"])
+def test_an_evaluation_from_python_is_that_of_the_command(folder, suite, monkeypatch, capsys):
+    output = io.StringIO()
+    random = torch.get_rng_state()
+    found = icrl_dist.evaluate(folder, suite=suite, episodes=6, seeds=2, p=[0.0, 0.2])
+    assert torch.equal(torch.get_rng_state(), random)
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(main, "Console", lambda *_, **__: Console(file=output, width=120, soft_wrap=True))
+    words = ["evaluate", str(folder), "--suite", suite, "--episodes", "6", "--seeds", "2", "--p", "0", "0.2", "--json"]
+    assert main.main(words) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(found.summary))
+    assert str(found) in output.getvalue(), "print shows the command's tables"
+    frame = icrl_dist.read_results(folder)
+    assert len(frame) == len(found.rows) and set(found.rows.suite) == {suite}
+    assert (found.figure is None) == (suite == "offline")
+
+
+def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(folder, capsys):
+    events: list[dict[str, Any]] = []
+    (folder / "run.toml").touch()
+    icrl_dist.evaluate(folder, episodes=1, seeds=1, p=[0.0], progress=events.append)
+    assert "this run is not finished" in events[0]["text"] and events[-1]["step"] == events[-1]["steps"]
+    assert capsys.readouterr().out == ""
+    icrl_dist.evaluate(folder, episodes=1, seeds=1, p=[0.0], progress=True)
+    printed = capsys.readouterr().out
+    assert "this run is not finished" in printed and "held-out evaluation" in printed
+
+
+def test_an_agent_of_the_package_is_named_and_a_path_is_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = icrl_dist.evaluate("darkroom", suite="offline", seeds=1, p=[0.0])
+    assert found.summary["what"].endswith("darkroom.npz") and list(tmp_path.glob("runs/darkroom-pretrained/results/*"))
+    with pytest.raises(ConfigError, match="darkroom: no such run folder or checkpoint"):
+        icrl_dist.evaluate("./darkroom")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"suite": "onlin"}, "--suite onlin: choose one of online, offline, posterior"),
+        ({"deploy": "comitted"}, "--deploy comitted: choose one of paper, committed"),
+        ({"p": [1.5]}, "evaluate.p = 1.5: a probability lies in [0, 1]"),
+        ({"p": []}, "evaluate.p"),
+        ({"prior": "seen"}, "--prior seen: choose one of uniform, unseen"),
+        ({"seeds": 0}, "evaluate.seeds = 0: must be above 0"),
+    ],
+)
+def test_impossible_calls_are_refused_in_one_line(folder, options, expected):
+    with pytest.raises(ConfigError) as refused:
+        inspect.unwrap(icrl_dist.evaluate)(folder, **options)
+    assert expected in str(refused.value) and "\n" not in str(refused.value)
