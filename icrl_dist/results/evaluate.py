@@ -87,7 +87,7 @@ class Result:
 def of_run(run: Run, name: str) -> Block:
     """The columns of result rows that are equal in all rows of a run."""
     split_seed = getattr(registry.of(run).config, "split_seed", None)
-    whole = isinstance(split_seed, int) and not isinstance(split_seed, bool) and abs(split_seed) < 2**63
+    whole = isinstance(split_seed, int | np.integer) and not isinstance(split_seed, bool) and abs(int(split_seed)) < 2**63
     return {
         "run": name,
         "method": run.method,

@@ -161,7 +161,7 @@ def offline(run: Run, what: Path, results: Path, deploy: Deployment | None = Non
 def experts(run: Run, folder: Path) -> pd.DataFrame:
     """The returns of all recorded episodes of a run's experts, which are written as result rows."""
     data = Dataset(folder / "dataset", readonly=True)
-    blocks = [training_rows.of_expert(run, folder.name, data.trials(key)) for key in data.variations("pretrain", 0)]
+    blocks = [training_rows.of_expert(run, folder.resolve().name, data.trials(key)) for key in data.variations("pretrain", 0)]
     data.close()
     return rows.read([rows.append(folder / "results", "experts", {}, blocks)])
 

@@ -167,7 +167,7 @@ def check_pairs(first: Returns, second: Returns) -> None:
         if one != two:
             raise ConfigError(
                 f"result rows at p = {first.p:g}: {what} are {one} of {first.name} and {two} of {second.name}, so rows have no "
-                "partner: choose rows that both have, or evaluate again with equal settings"
+                "partner: choose rows that both have, as of one evaluation in read_results(..., all=True)"
             )
     for seed, ones, twos in zip(first.training_seeds, first.cells, second.cells, strict=True):
         for index, (here, there) in enumerate(zip(ones, twos, strict=True)):

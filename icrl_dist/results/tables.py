@@ -55,7 +55,8 @@ def _shape(found: Sequence[Returns]) -> tuple[int, ...]:
             shapes = ["{} trainings, {} tasks, {} evaluations, {} episodes".format(*of.returns.shape) for of in (found[0], one)]
             raise ConfigError(
                 f"one table needs evaluations of equal size: {found[0].name} at p = {found[0].p:g} has {shapes[0]}, and "
-                f"{one.name} at p = {one.p:g} has {shapes[1]}; choose rows of one p or evaluation"
+                f"{one.name} at p = {one.p:g} has {shapes[1]}; choose rows of one p, or of one "
+                "evaluation in read_results(..., all=True)"
             )
     return found[0].returns.shape
 

@@ -31,7 +31,7 @@ def rate_labels(
         context_trials = one.context_trials
         blocks.append(
             {
-                **_of_trials(run, folder.name, one.trials),
+                **_of_trials(run, folder.resolve().name, one.trials),
                 "agent": np.array([key_of(trial.policy_version) for trial in one.trials], object),
                 "policy_version": np.array([trial.policy_version for trial in one.trials]),
                 "weights_digest": np.array([trial.weights_digest for trial in one.trials], object),

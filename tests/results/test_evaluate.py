@@ -25,7 +25,7 @@ from icrl_dist.problems.darkroom import divergence, room
 from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent
 from icrl_dist.problems.darkroom.problem import ORACLE
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft_labels
-from icrl_dist.results import evaluate, statistics, summaries
+from icrl_dist.results import evaluate, plots, statistics, summaries
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.returns import returns
 from icrl_dist.results.statistics import mean_and_error
@@ -248,6 +248,8 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
     (report,) = (folder / "report").glob("posterior-T*-paper-uniform-p0_0.2_0.4_0.6-6episodes-2seeds.json")
     kept = json.loads(report.read_text())
     assert {key: kept[key] for key in answer if key in kept}.items() <= answer.items()
+    kept["paper_gap"]["0"] |= {"low": None, "high": None}
+    assert plots.agreement(kept, folder / "without-interval.png", "").exists()
     assert all(len(c["kl"]) == 17 for c in kept["kl_heldout_any_curves"]["by_prefix"])
     assert Path(answer["figure"]).read_bytes().startswith(b"\x89PNG")
     assert all(meaning in printed.err for meaning in divergence.PRIORS.values()) and f"{answer['kl_nats']:.4f}" in printed.err

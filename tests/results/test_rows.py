@@ -226,7 +226,9 @@ def test_a_return_of_nan_ends_an_evaluation_after_its_first_episode(small_run, m
         evaluate.offline(small_run, {})
 
 
-@pytest.mark.parametrize(("seed", "stored"), [(7, 7), ("north", None), ((1, 2), None), (True, None), (2**63, None)])
+@pytest.mark.parametrize(
+    ("seed", "stored"), [(7, 7), ("north", None), ((1, 2), None), (True, None), (2**63, None), (np.int64(7), 7)]
+)
 def test_a_split_seed_that_is_no_number_of_64_bits_is_null(small_run, monkeypatch, tmp_path, seed, stored):
     config = SimpleNamespace(split_seed=seed)
     monkeypatch.setattr(registry, "of", lambda run: SimpleNamespace(config=config))
