@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from icrl_dist.storage.reading import StoredData, read_dataset
     from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "NULL",

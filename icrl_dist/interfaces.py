@@ -352,6 +352,11 @@ class Problem(abc.ABC):
         """The tasks of online evaluation; by default the test tasks."""
         return self.split.test
 
+    @property
+    def evaluated_count(self) -> int:
+        """Number of tasks of online evaluation."""
+        return len(self.evaluated)
+
     def at_test_start(self, task: Task) -> Task:
         """The task with the initial state of test episodes."""
         return task

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from icrl_dist.problems import registry
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_format, save_checkpoint, version_file
 from icrl_dist.stream import wire
 from icrl_dist.stream.validation import VERSION
+from icrl_dist.telemetry import provenance
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.types import Spec, Weights
 
@@ -26,8 +26,11 @@ PARTIAL = "partial.npz"
 """File name of the checkpoint of a fit that is not finished."""
 
 
-def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]:
-    """The manifest of a checkpoint: what its deployment needs, and its origin."""
+def manifest(run: Run, spec: Spec, version: int, threads: int, device: str = "cpu") -> dict[str, Any]:
+    """The manifest of a checkpoint: what its deployment needs, and its origin.
+
+    ``threads``: CPU threads of the fit; ``device``: ``cpu``, or the name of the GPU.
+    """
     return {
         "method": run.method,
         "version": version,
@@ -38,9 +41,8 @@ def manifest(run: Run, spec: Spec, version: int, threads: int) -> dict[str, Any]
         "horizon": spec.horizon,
         "window": run.model.window,
         **registry.of(run).manifest(),
-        "threads": threads,
         "format": VERSION,
-        "versions": {name: metadata.version(name) for name in ("icrl-dist", "numpy", "torch")},
+        "made_by": provenance.record(run.problem, run.method, threads, device),
     }
 
 

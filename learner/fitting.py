@@ -29,6 +29,8 @@ class Fitting:
         ``threads``: CPU threads of fits.
         """
         self._run, self._folder, self._spec, self._threads = run, folder, spec, threads
+        self.device_name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+        """``cpu``, or the name of the GPU."""
         self.method = method
         """The method whose loss a fit minimizes."""
         self._partial = folder / "checkpoints" / checkpoints.PARTIAL
@@ -105,5 +107,5 @@ class Fitting:
         return checkpoints.weights(self.version, self._model)
 
     def _save(self, path: Path, weights: Weights, **fields: object) -> None:
-        manifest = checkpoints.manifest(self._run, self._spec, self.version, self._threads)
+        manifest = checkpoints.manifest(self._run, self._spec, self.version, self._threads, self.device_name)
         checkpoints.save(path, weights, self._optimizer, {**manifest, **fields})

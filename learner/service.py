@@ -21,6 +21,7 @@ from icrl_dist.storage import checkpoint, files
 from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.stream.link import Link, StreamKeys
+from icrl_dist.telemetry import provenance
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints
@@ -103,6 +104,9 @@ class Service:
         self._serving = False
         if newest := self._fitting.resume():
             self._broadcast.publish(newest)
+        made_by = provenance.record(run.problem, run.method, self._threads, self._fitting.device_name)
+        if changed := provenance.add_session(folder, self.version, made_by):
+            self._reporter.event({"event": "note", "text": changed})
 
     @property
     def version(self) -> int:
@@ -112,8 +116,8 @@ class Service:
     @property
     def device(self) -> str:
         """The device of fits: ``cuda, NVIDIA H100`` or ``cpu, 2 threads``."""
-        device = self._device
-        return f"cuda, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else f"cpu, {self._threads} threads"
+        name = self._fitting.device_name
+        return f"cuda, {name}" if self._device.type == "cuda" else f"cpu, {self._threads} threads"
 
     # Called from other threads.
 

@@ -79,7 +79,8 @@ def test_replace_keeps_the_type_and_the_other_parameters() -> None:
     assert other == Task.of("darkroom", goal=(0, 0), size=3, start=(1, 1))
     assert type(other) is Task
     assert task["goal"] == (1, 2)
-    assert Task("null") != NULL, "a task equals an adversary of the same kind"
+    null_task: object = Task("null")
+    assert null_task != NULL, "a task equals an adversary of the same kind"
 
 
 IDENTITIES = [Identity(s, *rest) for s in STAGES for rest in itertools.product((0, 1, 2, 11), repeat=4)]

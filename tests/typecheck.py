@@ -26,7 +26,7 @@ _shapes = jaxtyping.jaxtyped
 
 def install(package: str) -> None:
     """Check every call of what is imported from the package from now on."""
-    jaxtyping.jaxtyped = _checked  # which the import hook puts before every function and class
+    jaxtyping.jaxtyped = _checked  # type: ignore[assignment]  # the import hook puts it before every function and class
     jaxtyping.install_import_hook(package, None)
 
 
@@ -35,7 +35,8 @@ def _checked(thing: Any = None, *, typechecker: None = None) -> Any:
         return _checked
     if isinstance(thing, FunctionType):
         return _check(thing)
-    if dataclasses.is_dataclass(thing) and "__init__" in vars(thing):
+    has_own_init = dataclasses.is_dataclass(thing) and "__init__" in vars(thing)
+    if has_own_init:
         thing.__init__ = _check(thing.__init__)
     return thing
 

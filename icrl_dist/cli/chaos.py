@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -24,7 +25,7 @@ class ChaosArguments:
     again, nothing was repaired.  ``icrl-dist chaos smoke`` takes some minutes on two cores.
     """
 
-    run: tyro.conf.Positional[str] = "smoke"
+    run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[RUN]")] = "smoke"
     """Name of a packaged run, or path of a run file."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """SECTION.NAME=VALUE, such as icaa.trials=60.  Can be repeated."""

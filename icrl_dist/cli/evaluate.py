@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -18,7 +18,7 @@ from icrl_dist.config.run import ConfigError, Deployment
 class EvaluateArguments:
     """Evaluate a trained agent on tasks that it did not train on, beside T^0, exact agents and the oracle."""
 
-    what: tyro.conf.Positional[Path | None] = None
+    what: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_DIR]")] = None
     """A run folder, or a checkpoint file."""
     pretrained: str | None = None
     """Instead, the name of an agent that is part of the package: ``darkroom``.  Its report is

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -18,12 +19,12 @@ from icrl_dist.types import Identity
 class ExplainArguments:
     """Show the origin of a training example: task, adversary, weights, seed, worker, labels, bytes.
 
-    Without IDENTITY: print the whole ledger, one JSON line per trajectory.
+    Without IDENTITY: print all trajectories, one JSON line each.
     """
 
-    what: tyro.conf.Positional[Path]
+    what: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
     """Run folder."""
-    identity: tyro.conf.Positional[str | None] = None
+    identity: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[IDENTITY]")] = None
     """STAGE/ROUND/TASK/VARIATION/TRIAL, such as adapt/0/3/1/7."""
     rerun: bool = False
     """Repeat the rollout on this machine and compare every byte."""
@@ -32,7 +33,7 @@ class ExplainArguments:
 
 
 def explain(arguments: ExplainArguments, console: Console) -> int:
-    """Print the origin of one trajectory, or the whole ledger.  Returns FAILED if a stored byte has changed."""
+    """Print the origin of one trajectory, or of all.  Returns FAILED if a stored byte has changed."""
     from icrl_dist.diagnostics import explain as origin
 
     if arguments.identity is None:

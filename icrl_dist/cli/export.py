@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -17,7 +17,7 @@ from icrl_dist.config.run import ConfigError
 class ExportArguments:
     """Write the trained agent of a run to one file for use elsewhere."""
 
-    what: tyro.conf.Positional[Path]
+    what: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
     """A run folder, of which the newest version is exported, or a checkpoint file."""
     to: Literal["agent"] = "agent"
     """``agent``: weights and manifest in one file for ``icrl_dist.load_agent``, without the state that

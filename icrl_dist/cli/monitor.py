@@ -9,7 +9,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -22,12 +22,12 @@ from icrl_dist.config.run import ConfigError, load_folder
 class MonitorArguments:
     """Watch a run live in the terminal or in a browser, or replay a run that has ended.
 
-    Without WHAT: the newest active run under runs/.  A view only reads the monitor plane, so it
+    Without RUN_DIR: the newest active run under runs/.  A view only reads the monitor plane, so it
     cannot slow the run down.  ``icrl-dist monitor runs/demo`` replays the run in that folder, at any
     speed, if it has ended.
     """
 
-    what: tyro.conf.Positional[Path | None] = None
+    what: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_DIR]")] = None
     """Run folder.  An active run is shown live; a run that has ended or crashed is replayed."""
     connect: str | None = None
     """Instead, the endpoint of a learner, such as tcp/127.0.0.1:7447."""
@@ -76,13 +76,13 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
 class TapArguments:
     """Print one JSON line per trajectory, live, from the monitor plane of an active run.
 
-    ``icrl-dist tap --task 3 --adversary dirichlet --every 10`` prints every tenth trajectory that
-    passes both filters.
+    For example, ``icrl-dist tap --task 3 --adversary dirichlet --every 10`` prints every tenth
+    trajectory that passes both filters.
 
     A tap cannot slow the run down: messages that it does not read in time are dropped.
     """
 
-    what: tyro.conf.Positional[Path | None] = None
+    what: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_DIR]")] = None
     """Folder of an active run.  Default, without --connect: the newest under runs/."""
     connect: str | None = None
     """Endpoint of a learner, such as tcp/127.0.0.1:7447."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -21,7 +22,7 @@ class PlanArguments:
     during which nothing else should run.  The nodes are assumed to be as fast as this machine.
     """
 
-    run: tyro.conf.Positional[str]
+    run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
     """Name of a packaged run, or path of a run file."""
     nodes: int = 1
     """Nodes that run workers."""

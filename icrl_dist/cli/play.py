@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -21,7 +22,7 @@ class PlayArguments:
     beside the exact posterior.
     """
 
-    what: tyro.conf.Positional[Path | None] = None
+    what: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_DIR]")] = None
     """A run folder, or a checkpoint file."""
     pretrained: str | None = None
     """Instead, the name of an agent that is part of the package: ``darkroom``."""

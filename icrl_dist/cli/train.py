@@ -20,13 +20,15 @@ from icrl_dist.config.run import Run, override, run_type
 class TrainArguments:
     """Train a method on a run file, then evaluate it on held-out tasks.
 
-    RUN is the name of a packaged run (demo, smoke, darkroom) or the path of a TOML file.  Every
-    setting of the run can be overridden: ``icrl-dist train demo --method icag --adversary.count 4``.
-    ``icrl-dist train --from runs/demo@0 --set adversary.count=16`` starts from T^0 of another run,
-    with its data and its other settings.
+    RUN is the name of a packaged run (demo, smoke, darkroom) or the path of a TOML file.
+
+    Every setting of the run can be overridden: ``icrl-dist train demo --method icag --adversary.count 4``.
+
+    With --from, a run starts from T^ROUND of another run, with its data and its other settings:
+    ``icrl-dist train --from runs/demo@0 --set adversary.count=16``.
     """
 
-    run: tyro.conf.Positional[str] = ""
+    run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[RUN]")] = ""
     """Name of a packaged run, or path of a run file.  If it is left out, --from supplies the
     settings of the other run."""
     source: Annotated[str | None, tyro.conf.arg(name="from")] = None

@@ -60,7 +60,7 @@ def _check_section(cls: Any) -> None:
     """Raises an error if a run file cannot hold this section, or if it cannot be hashed, which the cache of problems needs."""
     if not dataclasses.is_dataclass(cls) or cls.__hash__ is None:
         raise TypeError(f"class {cls.__name__}: use @dataclass(frozen=True)")
-    for name, hint in typing.get_type_hints(cls).items():
+    for name, hint in _fields(cls).items():
         for part in _classes(hint):
             if part.__hash__ is None:
                 raise TypeError(
@@ -69,12 +69,18 @@ def _check_section(cls: Any) -> None:
     schema.check(typing.cast(Any, cls)())  # each field has a type that can be decoded, and a default in its range
 
 
+def _fields(cls: Any) -> dict[str, Any]:
+    """The types of a dataclass's fields; class variables are no fields."""
+    hints = typing.get_type_hints(cls)
+    return {item.name: hints[item.name] for item in dataclasses.fields(cls)}
+
+
 def _classes(hint: Any) -> Iterator[type]:
     """The classes in a type annotation, those of a dataclass's fields included."""
     origin = typing.get_origin(hint) or hint
     if isinstance(origin, type):
         yield origin
-    fields = typing.get_type_hints(hint).values() if dataclasses.is_dataclass(hint) else ()
+    fields = _fields(hint).values() if dataclasses.is_dataclass(hint) else ()
     for part in (*typing.get_args(hint), *fields):
         yield from _classes(part)
 

@@ -81,13 +81,18 @@ class Run:
         return getattr(self, name)
 
 
-@functools.cache
 def run_type(problem: str | None) -> type[Run]:
     """``Run`` with the sections of this problem (with None, of all problems) and of the installed methods.
 
-    Raises ConfigError for a problem that is not installed.
+    Equal sections give the same class, so that runs are equal if their settings are.  Raises ConfigError
+    for a problem that is not installed.
     """
-    added = [(name, kind, field(default_factory=kind)) for name, kind in plugins.sections(problem).items()]
+    return _run_type(tuple(plugins.sections(problem).items()))
+
+
+@functools.cache
+def _run_type(sections: tuple[tuple[str, type], ...]) -> type[Run]:
+    added = [(name, kind, field(default_factory=kind)) for name, kind in sections]
     made = dataclasses.make_dataclass("Run", added, bases=(Run,), frozen=True, namespace={"__doc__": Run.__doc__})
     made.__module__ = __name__
     return cast(type[Run], made)

@@ -19,6 +19,7 @@ from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import wire
+from icrl_dist.telemetry import provenance
 from icrl_dist.types import Adversary, Identity, Task
 
 
@@ -47,6 +48,7 @@ def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, 
         "learned_by": [f"T^{later}" for later in range(version, newest_version(folder) + 1)],
         "from_ancestor": version <= max((newest for newest, _ in lineage.ancestors), default=-1),
         "intact": wire.trajectory_digest(trajectory) == row.sha256,
+        "sessions": provenance.sessions(folder),
     }
     if row.policy_version >= 0:
         manifest = load_checkpoint(checkpoint_file(folder, row.policy_version)).manifest
@@ -106,6 +108,10 @@ def describe(answer: dict[str, Any]) -> str:
         "stored": f"segment {answer['segment']}, byte {answer['byte']}, {answer['bytes']} bytes",
         "sha256": answer["sha256"] + (" (intact)" if answer["intact"] else " (CHANGED)"),
     }
+    if (sessions := answer["sessions"]) and not answer["from_ancestor"]:
+        facts["run by"] = provenance.text(sessions[0])
+        changed = dict.fromkeys(provenance.differences(sessions[0], later) for later in sessions[1:])
+        facts["run by"] += "".join(f"; continued with other software or hardware: {text}" for text in changed if text)
     facts["labels"] += f"from {origin.get(answer['label_origin'], answer['label_origin'])}"
     if "rerun_equal" in answer:
         facts["rerun"] = "the same bytes" if answer["rerun_equal"] else "DIFFERENT bytes: another machine or other versions?"

@@ -147,7 +147,7 @@ def recover(folder: Path) -> None:
     """Finish a replacement of the run in ``folder`` that was interrupted by a kill.
 
     If the run in ``folder`` replaced the old one and has a checkpoint, the old run is removed.  If
-    ``folder`` does not exist or is empty, the old run is restored.  In every other case nothing is
+    ``folder`` does not exist or holds nothing of a run, the old run is restored.  In every other case nothing is
     changed and ConfigError is raised; also while the command that replaces the run is still active.
     """
     aside = aside_of(folder)
@@ -160,8 +160,9 @@ def recover(folder: Path) -> None:
         raise ConfigError(f"{aside}: is not a run that --overwrite replaced; move it away, then repeat the command")
     if removing or (token == _token(folder) and _has_checkpoint(folder)):
         remove(aside)
-    elif not os.path.lexists(folder) or _is_empty(folder):
-        aside.rename(folder)  # this replaces an empty folder
+    elif not os.path.lexists(folder) or _is_empty(folder) or _has_only(folder, token):
+        remove(folder)
+        aside.rename(folder)
         (folder / _TOKEN).unlink()
     else:
         raise ConfigError(
@@ -178,6 +179,11 @@ def _token(folder: Path) -> bytes:
 
 def _is_empty(folder: Path) -> bool:
     return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
+
+
+def _has_only(folder: Path, token: bytes) -> bool:
+    """Whether a folder holds nothing but this token and a lock."""
+    return _token(folder) == token and {path.name for path in folder.iterdir()} <= {_TOKEN, ".lock"}
 
 
 def _has_checkpoint(folder: Path) -> bool:

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import os
-import platform
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +26,7 @@ from icrl_dist.storage.files import atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
+from icrl_dist.telemetry import provenance
 
 
 class TrainInterrupted(Exception):  # noqa: N818
@@ -91,7 +89,7 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
             status = file.stat()
             atomic_write(file, lambda to: to.write(dumps(run).encode()))
             os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))  # its time is the start of the run
-        atomic_write(folder / "env.json", lambda env: env.write(json.dumps(environment(), indent=1).encode() + b"\n"))
+        provenance.create(folder)
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
 
@@ -116,17 +114,6 @@ def check_security(run: Run, address: str | None) -> None:
         security.files(run.stream.certificates, role)
     if address and not endpoints.parse(run.stream.endpoint).loopback:
         require_ray_token(address)
-
-
-def environment() -> dict[str, Any]:
-    """Versions and machine of this process, the content of ``env.json``."""
-    names = ("icrl-dist", "numpy", "torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "scipy")
-    return {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "cores": len(os.sched_getaffinity(0)),
-        "versions": {name: metadata.version(name) for name in names},
-    }
 
 
 def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
@@ -264,7 +251,7 @@ def _remove_if_refused(folder: Path) -> Iterator[None]:
     try:
         yield
     except (ConfigError, TrainInterrupted):
-        if {file.name for file in folder.iterdir()} <= {"run.toml", "env.json"}:
+        if {file.name for file in folder.iterdir()} <= {"run.toml", provenance.FILE}:
             run_folder.remove(folder)
         raise
 

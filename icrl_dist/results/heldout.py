@@ -133,8 +133,6 @@ def _recorded(
 def check_suite(run: Run, suite: str) -> None:
     """Raises ConfigError if the run's problem or method does not support the suite."""
     problem, method = registry.of(run), methods.of(run)
-    if not problem.evaluated:
-        raise ConfigError(f"--suite {suite}: {run.problem} has no tasks to evaluate on: change [{problem.section}]")
     if suite == "offline" and not evaluate.sources(run):
         lacks = "has no reference 'random' and none that is given the task"
         raise ConfigError(f"--suite offline: {run.problem} {lacks}, so nothing collects data; use --suite online")

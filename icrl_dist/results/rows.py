@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from icrl_dist import __version__, version
 from icrl_dist.config.run import ConfigError
 from icrl_dist.storage.files import StoreError, atomic_write
+from icrl_dist.telemetry import provenance
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,6 +47,13 @@ COLUMNS: dict[str, Column] = {
     "written": Column("string", "when, in UTC"),
     "package_version": Column("string", "version of icrl-dist"),
     "code_digest": Column("string", "SHA-256 of the code of icrl-dist"),
+    "commit": Column("string", "Git commit of that code, with `-dirty` if it was changed; empty outside a Git checkout"),
+    "libraries": Column(
+        "string",
+        "versions of Python and of libraries, JSON; also the package of the problem or method if it is not this one",
+    ),
+    "instruction_set": Column("string", "vector instructions that torch used, such as `AVX512`"),
+    "threads": Column("int64", "CPU threads of torch"),
     "run": Column("string", "name of the run: the name of its folder or of the checkpoint file"),
     "method": Column("string", "method of the run, such as `icaa`"),
     "problem": Column("string", "problem of the run, such as `darkroom`"),
@@ -80,7 +87,9 @@ COLUMNS: dict[str, Column] = {
     ),
 }
 """The columns of the result rows, in the files' order."""
-_PROVENANCE = ("format", "evaluation", "written", "package_version", "code_digest")
+_MADE_BY = ("package_version", "code_digest", "commit", "instruction_set", "threads")
+"""The columns that are entries of ``provenance.record``."""
+_PROVENANCE = ("format", "evaluation", "written", *_MADE_BY, "libraries")
 _MEASURED = ("return", "optimum", "diverged", "surprise", "agreement", "ceiling")
 KEY = tuple(name for name in COLUMNS if name not in (*_PROVENANCE, *_MEASURED))
 """The columns that name an episode: rows that are equal in all of them are repetitions of one episode."""
@@ -99,17 +108,18 @@ def append(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) 
     now = datetime.now(UTC)
     while (path := folder / f"{suite}-{digest}-{now:%Y%m%dT%H%M%S.%f}Z.parquet").exists():
         now += timedelta(microseconds=1)
-    provenance = {
-        "format": FORMAT,
-        "evaluation": path.stem,
-        "written": now.isoformat(),
-        "package_version": __version__,
-        "code_digest": version.digest(),
-        "suite": suite,
-    }
-    table = pa.concat_tables([_table({**block, **provenance}) for block in blocks])
+    fixed = {"format": FORMAT, "evaluation": path.stem, "written": now.isoformat(), "suite": suite}
+    table = pa.concat_tables([_table({**block, **fixed, **_made_by(block)}) for block in blocks])
     atomic_write(path, lambda file: pq.write_table(table, file, compression="zstd"))
     return path
+
+
+def _made_by(block: Block) -> dict[str, Any]:
+    """The columns that say what wrote the rows of a block: this process."""
+    import torch
+
+    found = provenance.record(block["problem"], block["method"], torch.get_num_threads())
+    return {name: found[name] for name in _MADE_BY} | {"libraries": json.dumps({**found["libraries"], **found["plugins"]})}
 
 
 def _schema() -> pa.Schema:

@@ -15,6 +15,12 @@ from icrl_dist.config.toml import ConfigError
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.stream.validation import VERSION
 
+FORMAT = 1
+"""Number of the file format of checkpoints and agents.  It changes when older readers would misread a file.
+
+The entry ``format`` of the manifest is another number: that of the data to which the weights were fitted.
+"""
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -53,10 +59,14 @@ def newest_version(folder: Path) -> int:
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; at every moment ``path`` holds the old one or the new one, whole."""
+    """Write a checkpoint of format ``FORMAT``; at every moment ``path`` holds the old one or the new one, whole."""
     manifest = np.frombuffer(json.dumps(checkpoint.manifest).encode(), dtype=np.uint8)
     arrays: dict[str, Any] = {f"a/{name}": value for name, value in checkpoint.arrays.items()}
-    atomic_write(path, lambda file: np.savez(file, manifest=manifest, **arrays))
+    atomic_write(path, lambda file: np.savez(file, file_format=np.array(FORMAT), manifest=manifest, **arrays))
+
+
+class _OtherFormat(Exception):  # noqa: N818
+    """A checkpoint of another file format, whose number is the message."""
 
 
 _RENAMED = {"stretch": "window", "produces": "next_version"}
@@ -67,13 +77,16 @@ _FORMER_PREFIX = re.compile("^optimiser/")
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint, also of an older version, without executing anything in it.
 
-    Raises StoreError if it is missing or not a checkpoint.
+    Raises StoreError if it is missing, of another format, or not a checkpoint.
     """
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             size, unpacked = path.stat().st_size, sum(member.file_size for member in file.zip.infolist())
             if unpacked > size:
                 raise ValueError(f"{size} bytes that would unpack to {unpacked}")
+            found = file["file_format"].item() if "file_format" in file.files else FORMAT  # 0.1.0 stored none
+            if found != FORMAT:
+                raise _OtherFormat(found)
             manifest = json.loads(file["manifest"].tobytes())
             arrays = {name.removeprefix("a/"): file[name] for name in file.files if name.startswith("a/")}
             if not isinstance(manifest, dict) or not all(isinstance(array, np.ndarray) for array in arrays.values()):
@@ -82,6 +95,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
             arrays = {_FORMER_PREFIX.sub("optimizer/", name): array for name, array in arrays.items()}
     except FileNotFoundError:
         raise StoreError(f"{path}: no such checkpoint") from None
+    except _OtherFormat as error:
+        raise StoreError(
+            f"{path}: checkpoint of file format {error}, this version of icrl-dist reads format {FORMAT}: "
+            "use the version that wrote it, or train again with this one"
+        ) from None
     except Exception as error:
         raise StoreError(f"{path}: not a checkpoint of this system ({error})") from None
     return Checkpoint(arrays, manifest)

@@ -19,14 +19,14 @@ class Dispatcher:
     """One thread that runs actions in order, now or after a delay; an action that raises is logged."""
 
     def __init__(self, name: str) -> None:
-        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._due: list[tuple[float, int, Callable[[], object]]] = []
         self._order = itertools.count()
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def post(self, action: Callable[[], None], delay_s: float = 0.0) -> None:
+    def post(self, action: Callable[[], object], delay_s: float = 0.0) -> None:
         """Run ``action`` after ``delay_s`` seconds; after ``close`` do nothing."""
         with self._changed:
             heapq.heappush(self._due, (time.monotonic() + delay_s, next(self._order), action))
@@ -47,7 +47,7 @@ class Dispatcher:
             except Exception:
                 _log.exception("a callback failed")
 
-    def _next(self) -> Callable[[], None] | None:
+    def _next(self) -> Callable[[], object] | None:
         with self._changed:
             while True:
                 wait = self._due[0][0] - time.monotonic() if self._due else None

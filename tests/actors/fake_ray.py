@@ -102,7 +102,7 @@ def new_fleet(monkeypatch):
     monkeypatch.setattr(cluster, "UNREACHED_S", 0.0)
     monkeypatch.setattr(fleet, "RECHECK_S", 0.0)
     expected = missing.ExpectedNodes()
-    monkeypatch.setattr(cluster.missing, "expected", lambda: expected)
+    monkeypatch.setattr(missing, "expected", lambda: expected)
     for name, value in (("NOTE_S", -1.0), ("REPORT_MISSING_S", 1e9), ("JOIN_S", 1e9)):
         monkeypatch.setattr(fleet, name, value)
 
@@ -110,7 +110,7 @@ def new_fleet(monkeypatch):
         nonlocal expected
         expected = missing.ExpectedNodes(*options.pop("expected", ((), 0)))
         monkeypatch.setitem(sys.modules, "ray", ray)
-        monkeypatch.setattr(cluster.node_facts, "reach", ray.reach)
+        monkeypatch.setattr(node_facts, "reach", ray.reach)
         return fleet.Fleet(actors, restarts, address, **options)
 
     return new
@@ -119,10 +119,10 @@ def new_fleet(monkeypatch):
 @pytest.fixture
 def local_name(monkeypatch):
     """The name ``localtest`` of this machine, which does not count as loopback."""
-    resolve, listen = socket.getaddrinfo, node_facts.socket.create_server
+    resolve, listen = socket.getaddrinfo, socket.create_server
     own = lambda host: "127.0.0.1" if host == "localtest" else host  # noqa: E731
     monkeypatch.setattr(socket, "getaddrinfo", lambda host, *a, **k: resolve(own(host), *a, **k))
-    monkeypatch.setattr(node_facts.socket, "create_server", lambda address, **options: listen((own(address[0]), 0), **options))
+    monkeypatch.setattr(socket, "create_server", lambda address, **options: listen((own(address[0]), 0), **options))
 
 
 def gather(fleet, notes, endpoint="tls/localtest:0", turns=None):

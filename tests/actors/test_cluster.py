@@ -14,7 +14,7 @@ __all__ = ["local_name", "new_fleet"]
 def test_a_cluster_that_stays_too_small_is_refused(new_fleet, local_name, monkeypatch):
     monkeypatch.setattr(fleet_module, "REPORT_MISSING_S", -1.0)
     monkeypatch.setattr(fleet_module, "JOIN_S", 0.01)
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     with pytest.raises(ConfigError, match=r"the cluster at auto has 1 cores for 2 workers .*--actors"):
         gather(new_fleet(ray, 2, expected=(("10.0.0.1", "10.0.0.9"), 2)), notes)
     assert not ray.placed and [n for n in notes if n.startswith("10.0.0.9 has not joined")]
@@ -57,7 +57,7 @@ def test_a_node_may_have_another_version_of_a_package_that_the_run_does_not_use(
 
 
 def test_a_later_node_that_fails_the_check_gets_no_workers(new_fleet, local_name):
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     fleet = new_fleet(ray, None)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -67,7 +67,7 @@ def test_a_later_node_that_fails_the_check_gets_no_workers(new_fleet, local_name
 
 
 def test_the_run_waits_for_running_checks_and_then_starts_without_them(new_fleet, local_name, monkeypatch):
-    ray, notes = FakeRay(0, 2, 2), []
+    ray, notes = FakeRay(0, 2, 2), list[str]()
     ray.slow.add(2)
     fleet = new_fleet(ray, 2)
     turns = iter(range(20))
@@ -84,7 +84,7 @@ def test_the_run_waits_for_running_checks_and_then_starts_without_them(new_fleet
 
 def test_a_node_that_could_not_reach_the_learner_is_checked_again(new_fleet, local_name):
     """The learner may be about to start; a lasting failure is reported once."""
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     fleet = new_fleet(ray, None)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -99,7 +99,7 @@ def test_a_node_that_could_not_reach_the_learner_is_checked_again(new_fleet, loc
 
 
 def test_a_node_that_is_lost_during_its_check_does_not_stop_the_run(new_fleet, local_name):
-    ray, notes = FakeRay(0, 2, 2), []
+    ray, notes = FakeRay(0, 2, 2), list[str]()
     ray.answers["n2"] = RuntimeError("the worker died unexpectedly")
     ray.unreachable.add(2)
     fleet = new_fleet(ray, 2)
@@ -117,7 +117,7 @@ def test_a_node_on_which_ray_fails_repeatedly_is_refused(new_fleet, local_name):
 
 
 def test_a_later_node_cannot_join_a_run_with_a_loopback_endpoint(new_fleet):
-    ray, notes = FakeRay(2), []
+    ray, notes = FakeRay(2), list[str]()
     fleet = new_fleet(ray, None)
     gather(fleet, notes, LOOPBACK)
     fleet.watch(notes.append, 0)

@@ -11,7 +11,7 @@ __all__ = ["local_name", "new_fleet"]
 
 
 def test_workers_start_when_each_has_a_core_and_are_spread(new_fleet, local_name):
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     fleet = new_fleet(ray, 2)
     gather(fleet, notes, turns=5)
     assert notes == ["the cluster at auto has 1 cores for 2 workers so far: waiting for more nodes to join"]
@@ -33,7 +33,7 @@ def test_without_a_cluster_a_spare_is_kept_from_the_first_progress_if_restarts_a
 
 
 def test_without_a_number_of_workers_there_is_one_per_core_also_of_later_nodes(new_fleet, local_name):
-    ray, notes = FakeRay(0, 2, 2), []
+    ray, notes = FakeRay(0, 2, 2), list[str]()
     fleet = new_fleet(ray, None, expected=(("10.0.0.1", "10.0.0.2"), 2))
     gather(fleet, notes)
     assert fleet.watch(notes.append, 0) == 4 and sorted(placements(ray)) == ["n1", "n1", "n2", "n2"]
@@ -43,7 +43,7 @@ def test_without_a_number_of_workers_there_is_one_per_core_also_of_later_nodes(n
 
 
 def test_workers_of_a_lost_node_move_and_no_death_is_counted(new_fleet, local_name):
-    ray, notes = FakeRay(0, 1, 1), []
+    ray, notes = FakeRay(0, 1, 1), list[str]()
     fleet = new_fleet(ray, 2)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -57,7 +57,7 @@ def test_workers_of_a_lost_node_move_and_no_death_is_counted(new_fleet, local_na
 
 
 def test_a_worker_that_dies_by_itself_is_counted_and_restarted_on_its_node(new_fleet, local_name):
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     fleet = new_fleet(ray, 1)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -71,7 +71,7 @@ def test_a_worker_that_dies_by_itself_is_counted_and_restarted_on_its_node(new_f
 
 
 def test_a_death_at_the_same_time_as_a_node_loss_is_not_counted(new_fleet, local_name, monkeypatch):
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     fleet = new_fleet(ray, 1)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -86,7 +86,7 @@ GONE = ChildProcessError("The actor is temporarily unavailable")
 
 def test_an_end_is_undecided_while_the_node_cannot_be_reached(new_fleet, local_name):
     """Ray lists a node as alive for some time after its end."""
-    ray, notes = FakeRay(0, 1, 1), []
+    ray, notes = FakeRay(0, 1, 1), list[str]()
     fleet = new_fleet(ray, 2, restarts=0)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -101,7 +101,7 @@ def test_an_end_is_undecided_while_the_node_cannot_be_reached(new_fleet, local_n
 
 
 def test_a_death_on_a_reachable_node_is_counted_until_the_node_is_lost_soon_after(new_fleet, local_name):
-    ray, notes = FakeRay(0, 1), []
+    ray, notes = FakeRay(0, 1), list[str]()
     fleet = new_fleet(ray, 1, restarts=2)
     gather(fleet, notes)
     fleet.watch(notes.append, 0)
@@ -118,7 +118,7 @@ def test_a_death_on_a_reachable_node_is_counted_until_the_node_is_lost_soon_afte
 
 
 def test_every_life_of_a_worker_has_its_own_name_when_one_death_is_detected_first(new_fleet, local_name, monkeypatch):
-    ray, notes = FakeRay(0, 2, 2), []
+    ray, notes = FakeRay(0, 2, 2), list[str]()
     fleet = new_fleet(ray, 2)
     gather(fleet, notes)
     ray.cores[2] = None
@@ -135,7 +135,7 @@ def test_every_life_of_a_worker_has_its_own_name_when_one_death_is_detected_firs
 
 def test_missing_nodes_are_reported_and_the_run_starts_with_at_least_the_minimum(new_fleet, local_name, monkeypatch):
     monkeypatch.setattr(fleet_module, "REPORT_MISSING_S", 0.01)
-    ray, notes = FakeRay(0, 2), []
+    ray, notes = FakeRay(0, 2), list[str]()
     fleet = new_fleet(ray, 6, at_least=2, expected=(("10.0.0.1", "10.0.0.7"), 2))
     gather(fleet, notes)
     assert [n for n in notes if n.startswith("10.0.0.7 has not joined")] and "starting with 2 workers" in notes[-1]

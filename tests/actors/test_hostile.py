@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -27,6 +28,7 @@ HOSTILE = Path(__file__).parent / "hostile"
 WORKER = """  # hostile-worker
 import sys
 from pathlib import Path
+from typing import Any
 import torch
 from actors.worker import Worker
 from icrl_dist.stream.zenoh_link import ZenohLink
@@ -41,7 +43,9 @@ class LearnerSide:
     """A LeaseScheduler and a WorkerAPI on a real link; received trajectories are kept by identity."""
 
     def __init__(self, run, folder, lease_s):
-        self.run, self.folder, self.stored, self.events, self.failures = run, folder, {}, [], []
+        self.run, self.folder, self.stored = run, folder, {}
+        self.events: list[dict[str, Any]] = []
+        self.failures: list[str] = []
         self.jobs = jobs_of(run, "icag")[:2]
         self.everything = {i for job in self.jobs for i in job.identities()}
         self.lock = threading.Lock()
@@ -227,7 +231,7 @@ def kill_rays_node_once():
 @LEFT_OBJECTS
 def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_others_finish(learner, hostile, fleet):
     hostile("kill")
-    learner, fleet, notes = learner(60.0), fleet(1, 3), []
+    learner, fleet, notes = learner(60.0), fleet(1, 3), list[str]()
     gc.collect()
     fleet.start(learner.endpoint, "test", learner.folder)
     wait_for(
@@ -247,7 +251,7 @@ def test_a_variation_that_kills_its_worker_three_times_is_quarantined_and_the_ot
 @LEFT_OBJECTS
 def test_a_fleet_starts_although_rays_node_died_and_fails_when_a_worker_dies_repeatedly(learner, hostile, fleet):
     hostile("exit")
-    killer, notes = threading.Thread(target=kill_rays_node_once), []
+    killer, notes = threading.Thread(target=kill_rays_node_once), list[str]()
     killer.start()
     learner, fleet = learner(60.0), fleet(1, 1, note=notes.append)
     killer.join()

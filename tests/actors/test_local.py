@@ -51,7 +51,7 @@ def failing_ray():
 
 def test_ray_is_started_again_and_only_the_processes_of_failed_starts_are_ended(failing_ray):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        ray, notes = failing_ray(2), []
+        ray, notes = failing_ray(2), list[str]()
         local.start_ray(ray, notes.append, num_cpus=2)
         assert other.poll() is None
         other.communicate(b"\n")

@@ -2,10 +2,10 @@
 
 import itertools
 import threading
+import time
 
 import pytest
 
-from actors import publisher as publisher_module
 from actors.publisher import EpisodeSampler, TrajectoryPublisher
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import StreamKeys
@@ -20,7 +20,7 @@ class RecordingLink:
 
     def __init__(self, monkeypatch):
         self.messages, self.now = [], 0.0
-        monkeypatch.setattr(publisher_module.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
 
     def publish(self, key, payload, droppable):
         assert droppable, "a viewer must not be able to block a worker"

@@ -1,6 +1,7 @@
 """A node's router: its workers reach the learner through it, and the learner's access rules apply to them."""
 
 import contextlib
+import functools
 import socket
 
 import pytest
@@ -42,7 +43,7 @@ def test_all_messages_of_a_worker_pass_the_router(connected):
     for number, worker in enumerate(workers):
         worker.announce(KEYS.alive(f"w{number}"))
         worker.subscribe(KEYS.weights, lambda _, payload: weights.append(payload))
-        eventually(lambda worker=worker: _ask(worker) == b"stored one")
+        eventually(functools.partial(_is_served, worker))
     eventually(lambda: sorted(liveliness) == [("w0", True), ("w1", True)])
     eventually(lambda: learner.publish(KEYS.weights, b"W", droppable=False) or len(weights) >= 2)
     eventually(lambda: workers[0].publish(KEYS.monitor("worker/w0"), b"beat", droppable=True) or heartbeats)
@@ -50,14 +51,14 @@ def test_all_messages_of_a_worker_pass_the_router(connected):
     eventually(lambda: liveliness[-1] == ("w1", False))
 
 
-def _ask(worker):
+def _is_served(worker):
     with contextlib.suppress(Unanswered):
-        return worker.request(KEYS.data, b"one", timeout_s=2.0)
+        return worker.request(KEYS.data, b"one", timeout_s=2.0) == b"stored one"
 
 
 def test_the_learners_access_rules_apply_behind_the_router(connected):
     learner, workers = connected
-    eventually(lambda: _ask(workers[0]) == b"stored one")
+    eventually(functools.partial(_is_served, workers[0]))
     answers, weights = [], []
     learner.subscribe(KEYS.weights, lambda _, payload: weights.append(payload))
     workers[0].publish(KEYS.weights, b"false", droppable=False)

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import threading
+import time
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,9 +18,11 @@ from actors.watchdog import Watchdog
 from actors.weight_cache import WeightCache
 from actors.worker import Worker
 from icrl_dist.collect import kinds
+from icrl_dist.collect.adapt import Rollouts
 from icrl_dist.collect.behavior import BehaviorContexts
 from icrl_dist.config import plugins
 from icrl_dist.config.run import dumps
+from icrl_dist.interfaces import Policy
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
@@ -27,6 +31,7 @@ from icrl_dist.stream import batching, monitor_messages, wire
 from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.types import Weights
+from tests.calls import keeping
 from tests.contracts.link_battery import eventually
 from tests.jobs import jobs_of
 from tests.toys.site import CORRIDOR, SLIPPERY, installed
@@ -99,6 +104,7 @@ def test_a_worker_does_its_job_under_its_name_and_stops(hub, small_run):
 
 def test_a_job_that_raises_is_reported_and_the_worker_continues(hub, small_run):
     good, other = jobs_of(small_run, "icag")[:2]
+    assert isinstance(other.payload, BehaviorContexts)
     bad = dataclasses.replace(other, payload=dataclasses.replace(other.payload, behaviors=()))
     learner = ScriptedLearner(hub(), small_run, [job_message(bad), job_message(good), STOP])
     Worker(hub(), "test", "w0").run()
@@ -129,6 +135,7 @@ def test_a_job_that_cannot_be_decoded_is_reported_and_the_worker_continues(hub, 
     monkeypatch.setattr(worker_module, "Watchdog", lambda run, name: Watchdog(None, name))  # pytest's process has one
     data, cause, answers = None, "unknown key payload.speed", [job_message(good)]
     if case == "unknown field":
+        assert isinstance(bad.payload, BehaviorContexts)
         payload = FromANewerRelease(bad.payload.behaviors, bad.payload.labelling)
         data = wire.encode_job(dataclasses.replace(bad, payload=payload))
     elif case == "not msgpack":
@@ -250,6 +257,7 @@ def always(monkeypatch):
 def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monkeypatch):
     always(monkeypatch)
     job = jobs_of(committed_run, phase=1)[0]
+    assert isinstance(job.payload, Rollouts)
     job = dataclasses.replace(job, payload=dataclasses.replace(job.payload, deploy=deploy, context_max=20))
 
     def work(topic):
@@ -259,10 +267,9 @@ def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monke
         network().serve(KEYS.weights_latest, lambda query: query.reply(latest))
         messages = []
         network().subscribe(KEYS.monitor(topic), lambda key, payload: messages.append(wire.decode_message(payload)))
-        read = []
-        real = RoomPosterior.read
+        read = list[Any]()
         with monkeypatch.context() as patched:
-            patched.setattr(RoomPosterior, "read", lambda *arguments: read.append(real(*arguments)) or read[-1])
+            patched.setattr(RoomPosterior, "read", keeping(read, RoomPosterior.read))
             Worker(network(), "test", "w0").run()
         return [wire.trajectory_digest(t) for t in learner.stored], messages, read
 
@@ -287,8 +294,8 @@ def test_viewers_receive_beliefs_and_change_no_byte(committed_run, deploy, monke
 def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
     link, watching, clock, cost = hub(), hub(), [100.0, 0.0], 0.02
     watching.subscribe(KEYS.monitor("belief/w0"), lambda key, payload: None)
-    monkeypatch.setattr(beliefs.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(beliefs.time, "thread_time", lambda: clock[1])
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "thread_time", lambda: clock[1])
     publish_belief = BeliefPublisher(link, KEYS.monitor("belief/w0"), "w0", registry.of(small_run))
     read = []
 
@@ -305,7 +312,7 @@ def test_beliefs_use_a_bounded_share_of_the_time(hub, small_run, monkeypatch):
         read.clear()
         for _ in range(seconds * 10):
             clock[0] += 0.1
-            publish_belief(None, 0, identity, job.variation(identity))
+            publish_belief(cast(Policy, None), 0, identity, job.variation(identity))
         return len(read)
 
     assert published_in(80) * cost <= 80 / 200 + cost and read[-1] - read[-2] >= 4.0

@@ -124,7 +124,7 @@ def untrained(small_run):
 
 
 def test_calibration_deploys_in_training_tasks_under_new_adversaries_and_repeats(small_run, untrained):
-    reported = []
+    reported = list[int]()
     once, again = ood_score.calibrate(untrained, reported.append), ood_score.calibrate(untrained)
     assert reported == list(range(1, 2 * ood_score.EPISODES + 1))
     for name, array in once.arrays().items():

@@ -11,6 +11,7 @@ import torch
 from icrl_dist.agent.loading import SHIPPED, load_agent, shipped, trained
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, parse
+from icrl_dist.interfaces import MakePolicy, Reference
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
@@ -28,7 +29,7 @@ def folder(small_run, tmp_path):
         torch.manual_seed(version)
         model = PretrainedTransformer(spec, small_run.model)
         opt = Optimizer(model, small_run.optim)
-        sum(p.sum() for p in model.parameters()).backward()
+        torch.stack([p.sum() for p in model.parameters()]).sum().backward()
         opt.step(1e-3)
         about = checkpoints.manifest(small_run, spec, version, 1)
         weights = checkpoints.weights(version, model)
@@ -93,7 +94,9 @@ def test_a_shipped_agent_with_shuffled_weights_is_no_better_than_a_random_policy
         for parameter in shuffled.model.parameters():
             parameter.copy_(parameter.flatten()[torch.randperm(parameter.numel())].view_as(parameter))
     models = {"trained": untouched, "shuffled": shuffled}
-    agents = {evaluate.Agent(key): evaluate.in_context(model, run.context) for key, model in models.items()}
+    agents: dict[evaluate.Agent, MakePolicy | Reference] = {
+        evaluate.Agent(key): evaluate.in_context(model, run.context) for key, model in models.items()
+    }
     agents[evaluate.Agent("random")] = registry.of(run).references(run)["random"]
     whole, mixed, random = (result.returns.mean() for result in evaluate.online(run, agents))
     assert whole > 40 and mixed < 5 and random < 5

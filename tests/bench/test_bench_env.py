@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
 from icrl_dist.bench import env
 from icrl_dist.config.run import ConfigError
+from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom.problem import DarkRoomProblem
+from icrl_dist.types import Variation
+from tests.calls import noting
 
 
 def test_it_reports_rates() -> None:
@@ -22,13 +27,13 @@ def test_it_reports_rates() -> None:
 
 
 def test_every_row_is_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    batches = []
-    real = env.registry.batch
-    monkeypatch.setattr(env.registry, "batch", lambda variations: batches.extend(variations) or real(variations))
+    batches = list[Sequence[Variation]]()
+    monkeypatch.setattr(registry, "batch", noting(batches, lambda variations: variations, registry.batch))
     env.run(batch=32, seconds=0.001)
-    assert len(batches) == 32
-    assert all(v.adversary.kind == "dirichlet" and v.adversary.number("p") > 0 for v in batches)
-    assert len({v.adversary for v in batches}) == 32
+    rows = [row for batch in batches for row in batch]
+    assert len(rows) == 32
+    assert all(v.adversary.kind == "dirichlet" and v.adversary.number("p") > 0 for v in rows)
+    assert len({v.adversary for v in rows}) == 32
 
 
 @pytest.mark.parametrize("problem", ["dmc-reacher-hard", "metaworld-pick-place"])
@@ -51,7 +56,7 @@ def test_a_simulated_problem_is_compared_with_its_library_and_with_mj_step(probl
         ({"seconds": 0.0}, r"seconds = 0\.0"),
     ],
 )
-def test_invalid_arguments_are_refused(wrong: dict[str, object], message: str) -> None:
+def test_invalid_arguments_are_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         env.run(**wrong)
 

@@ -1,6 +1,8 @@
 """The benchmark of experts: the updates of both sides, and ratios and verdicts from measured rates."""
 
 import json
+import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +13,11 @@ from icrl_dist.bench.experts import ExpertSizes
 from icrl_dist.cli import main
 from icrl_dist.config import run
 from icrl_dist.config.sac import SACConfig
+from icrl_dist.experts.sac.batched import SACBatch
+from icrl_dist.experts.sac.sb3_files import blank
 from icrl_dist.problems import registry
 from icrl_dist.types import Spec, Step
+from tests.calls import keeping, noting
 
 TINY = ExpertSizes(2, SACConfig(hidden=(8, 8), batch=4, replay=50), 3, 2)
 
@@ -32,10 +37,9 @@ def test_both_sides_are_measured_and_threads_are_restored(monkeypatch):
 
 
 def test_each_side_makes_the_timed_updates_from_the_same_replay(monkeypatch):
-    made = []
-    engine, model = experts.SACBatch, experts.blank
-    monkeypatch.setattr(experts, "SACBatch", lambda *arguments: made.append(engine(*arguments)) or made[-1])
-    monkeypatch.setattr(experts, "blank", lambda *arguments: made.append(model(*arguments)) or made[-1])
+    made = list[Any]()
+    monkeypatch.setattr(experts, "SACBatch", keeping(made, SACBatch))
+    monkeypatch.setattr(experts, "blank", keeping(made, blank))
     experts.lockstep(TINY, "float32")(3)
     experts.single(TINY.config)(2)
     ours, theirs = made
@@ -120,7 +124,7 @@ def test_hours_use_the_rate_of_the_warm_up_and_the_rate_with_updates(monkeypatch
     now = [0.0]
 
     def made(env, config, steps, seeds, progress, device):
-        trained = experts.SACBatch(seeds, env.spec, config, device)
+        trained = SACBatch(seeds, env.spec, config, device)
         for trained.steps in range(10, steps + 1, 10):
             now[0] += 1.0 if trained.steps <= 20 else 9.0 if trained.steps == 30 else 5.0
             progress(trained, np.zeros(2))
@@ -128,7 +132,7 @@ def test_hours_use_the_rate_of_the_warm_up_and_the_rate_with_updates(monkeypatch
 
     monkeypatch.setattr(experts_gpu, "train", made)
     monkeypatch.setattr(experts_gpu, "_parts", lambda *_: {"environment": 0.3, "update": 0.2})
-    monkeypatch.setattr(experts_gpu.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     found = experts_gpu.expert_set(Still(), STILL, 1, torch.device("cpu"))
     assert found["steps"] == 50, "at least three episodes"
     assert found["hours"] == pytest.approx((20 * 0.1 + 980 * 0.5) / 3600, abs=1e-3)
@@ -136,7 +140,7 @@ def test_hours_use_the_rate_of_the_warm_up_and_the_rate_with_updates(monkeypatch
 
 
 def test_a_part_that_cannot_be_measured_is_reported_and_the_others_are_measured(monkeypatch):
-    real = experts_gpu.lockstep
+    real = experts.lockstep
 
     def lockstep(sizes, matmul_dtype, device, graph):
         if graph:
@@ -173,9 +177,9 @@ def test_the_expert_set_is_that_of_the_paper():
 
 
 def test_the_device_selects_the_benchmark(monkeypatch, capsys):
-    calls = []
+    calls = list[Any]()
     monkeypatch.setattr(experts, "compare", rates(2.0, 3.0, 5.0))
-    monkeypatch.setattr(experts_gpu, "run", lambda *arguments: calls.append(arguments) or {"ok": True})
+    monkeypatch.setattr(experts_gpu, "run", noting(calls, lambda *arguments: arguments, lambda *arguments: {"ok": True}))
     monkeypatch.setattr(experts_gpu, "describe", lambda result: "a table")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert main.main(["bench", "experts", "--device", "auto", "--steps", "7", "--quick"]) == 0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.bench import fuzz
+from icrl_dist.bench.mutations import mutate
 from icrl_dist.cli.main import main
 from icrl_dist.config.run import ConfigError
 
@@ -44,14 +45,16 @@ def test_an_input_on_which_a_reader_fails_is_written(
     result = fuzz.run(inputs=3, seed=7, folder=tmp_path)
     assert not result["ok"] and result["crashes"] == crashes
     assert [Path(f).name for f in result["kept"]] == [f"fuzz-broken-7-{n}.bin" for n in range(3)]
-    again = fuzz.mutate(np.random.default_rng([7, 2]), [b"valid"])
+    again = mutate(np.random.default_rng([7, 2]), [b"valid"])
     assert Path(result["kept"][2]).read_bytes() == again
     assert "failing input: " in fuzz.describe(result)
 
 
 def test_a_failure_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = fuzz.run
-    monkeypatch.setattr(fuzz, "targets", lambda: {"broken": fuzz.Target(lambda data: {}[data], ValueError, [b"valid"])})
+    monkeypatch.setattr(
+        fuzz, "targets", lambda: {"broken": fuzz.Target(dict[bytes, bytes]().__getitem__, ValueError, [b"valid"])}
+    )
     monkeypatch.setattr(fuzz, "run", lambda folder: real(inputs=2, folder=folder))
     assert main(["bench", "fuzz", "--folder", str(tmp_path)]) == 1
     assert main(["bench", "fuzz", "--seconds", "1"]) == 2

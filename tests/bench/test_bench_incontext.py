@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -17,13 +17,16 @@ from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.cli import main
 from icrl_dist.config.sections import OptimConfig
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
+from icrl_dist.problems.darkroom.bench import DPTContexts, DPTData
 from icrl_dist.problems.darkroom.room import MOVES, cells
 
 SPEC = quality.pretraining_data(0).spec
+AnyModule = TypeVar("AnyModule", bound=torch.nn.Module)
 
 
 def test_a_draw_follows_dpts_distribution_and_equal_arguments_give_equal_draws() -> None:
     data = quality.pretraining_data(3)
+    assert isinstance(data, DPTData)
     drawn, again, other = (data.draw(0, step, 64, 5) for step in (7, 7, 8))
     for name, column in vars(drawn).items():
         if name == "coordinates":  # of the cells, equal in all draws
@@ -46,6 +49,7 @@ def test_a_draw_follows_dpts_distribution_and_equal_arguments_give_equal_draws()
 
 def test_the_floor_equals_a_count_over_the_goals_consistent_with_the_context() -> None:
     data = quality.pretraining_data(0)
+    assert isinstance(data, DPTData)
     drawn = data.draw(1, 0, 6, 1)
     total = 0.0
     for b in range(6):
@@ -58,7 +62,7 @@ def test_the_floor_equals_a_count_over_the_goals_consistent_with_the_context() -
     assert data.floor(drawn) == pytest.approx(total / (6 * quality.LENGTH), rel=1e-9)
 
 
-def randomized(module: torch.nn.Module) -> torch.nn.Module:
+def randomized(module: AnyModule) -> AnyModule:
     """The module with random parameters, none of them zero."""
     torch.manual_seed(0)
     with torch.no_grad():
@@ -228,6 +232,7 @@ def test_finished_trainings_are_reused_for_the_same_settings_only(
 
 def test_cells_become_coordinates() -> None:
     drawn = quality.pretraining_data(0).draw(0, 0, 2, 1)
+    assert isinstance(drawn, DPTContexts)
     data = drawn.batch(np.ones((2, 1), np.int64))
     assert (data.observations == cells(10)[drawn.cell]).all() and (data.next_observations == cells(10)[drawn.arrived]).all()
 

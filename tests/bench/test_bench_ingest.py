@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from collections import namedtuple
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 
 from icrl_dist.bench import ingest
 from icrl_dist.config.run import ConfigError
+from icrl_dist.storage.dataset import Dataset
+from tests.calls import noting
 
 
 @pytest.fixture
@@ -20,9 +24,8 @@ def on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_measures_with_and_without_fsync_and_removes_its_files(
     on_disk: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened = []
-    real = ingest.Dataset
-    monkeypatch.setattr(ingest, "Dataset", lambda folder, durable: opened.append(durable) or real(folder, durable=durable))
+    opened = list[bool]()
+    monkeypatch.setattr(ingest, "Dataset", noting(opened, lambda folder, durable: durable, Dataset))
     result = ingest.run(tmp_path / "here", seconds=0.4, pairs=2)
     assert opened == [True, False, True, True, False]  # the warm-up, then alternating
     assert result["durable_per_s"] > 0 and result["ratio"] > 0 and result["fsync_p50_ms"] > 0
@@ -40,7 +43,7 @@ def test_a_file_system_in_memory_is_refused(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(("wrong", "message"), [({"seconds": 0.0}, r"seconds = 0\.0"), ({"pairs": 0}, "pairs = 0")])
-def test_invalid_arguments_are_refused(on_disk: None, tmp_path: Path, wrong: dict[str, float], message: str) -> None:
+def test_invalid_arguments_are_refused(on_disk: None, tmp_path: Path, wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         ingest.run(tmp_path, **wrong)
 
@@ -53,6 +56,6 @@ def test_the_file_system_is_that_of_the_nearest_mount(tmp_path: Path, monkeypatc
         mount(str(tmp_path), "tmpfs"),
         mount(str(tmp_path / "a"), "btrfs"),
     ]
-    monkeypatch.setattr(ingest.psutil, "disk_partitions", lambda all: mounts)
+    monkeypatch.setattr(psutil, "disk_partitions", lambda all: mounts)
     found = [ingest.file_system(Path(p)) for p in ("/", tmp_path, tmp_path / "ab" / "c", tmp_path / "a" / "missing")]
     assert found == ["ext4", "tmpfs", "tmpfs", "btrfs"]

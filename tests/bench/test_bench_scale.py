@@ -5,6 +5,7 @@ import json
 import pytest
 
 from icrl_dist.bench import ingest, scale
+from icrl_dist.bench.stream import LIMIT
 from icrl_dist.config.run import ConfigError
 from icrl_dist.stream import wire
 
@@ -16,7 +17,7 @@ def on_disk(monkeypatch):
 
 def test_replayed_trajectories_differ_only_in_their_trial():
     recorded = scale.Recorded(7)
-    first, second = (wire.decode_trajectory(recorded.next(), scale.LIMIT) for _ in range(2))
+    first, second = (wire.decode_trajectory(recorded.next(), LIMIT) for _ in range(2))
     assert second.identity == first.identity._replace(trial=first.identity.trial + 1) and first.identity.task == 7
     assert {name: array.tobytes() for name, array in first.arrays().items()} == {
         name: array.tobytes() for name, array in second.arrays().items()
@@ -35,7 +36,7 @@ def test_it_measures_every_number_of_workers_and_removes_its_files(on_disk, tmp_
             take(group)
             stored.append({row.identity.task for row in store.index})
 
-        made.take = counted
+        monkeypatch.setattr(made, "take", counted)
         return made
 
     monkeypatch.setattr(scale, "_ingest", counting_ingest)

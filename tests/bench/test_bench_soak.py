@@ -30,8 +30,9 @@ input()
 
 
 def test_the_memory_of_a_process_is_measured_and_grows_with_its_allocations():
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, "-c", HOLDER], text=True, bufsize=1, **pipes) as holder:
+    command, pipe = [sys.executable, "-c", HOLDER], subprocess.PIPE
+    with subprocess.Popen(command, text=True, bufsize=1, stdin=pipe, stdout=pipe) as holder:
+        assert holder.stdin is not None and holder.stdout is not None
         before = dict(soak._memory(holder.pid))
         holder.stdin.write("\n")
         assert holder.stdout.readline() == "held\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import pytest
 
@@ -33,7 +34,7 @@ def test_a_renamed_key_is_refused_with_its_new_name(old: str, new: str) -> None:
 
 @pytest.mark.parametrize(("old", "new"), former_names.RENAMED.items())
 def test_the_new_name_of_a_renamed_key_exists(old: str, new: str) -> None:
-    sections = {item.name: item.default_factory for item in dataclasses.fields(run_type(None))}
+    sections: dict[str, Any] = {item.name: item.default_factory for item in dataclasses.fields(run_type(None))}
     section, _, key = new.partition(".")
     assert section in sections
     if key:

@@ -77,3 +77,10 @@ def test_a_package_whose_module_is_missing_has_no_code(tmp_path: Path) -> None:
 
 def test_the_problems_of_the_tests_have_a_source(tmp_path: Path) -> None:
     assert len(source(tmp_path, {}, "tests.toys.corridor").code) == 64
+
+
+def test_runs_stay_equal_after_a_package_was_installed_for_a_while(tmp_path: Path) -> None:
+    before = load("smoke")
+    with installed(tmp_path, {"toy_problem.py": CORRIDOR}):
+        assert run.run_type(None) is not run.run_type("darkroom")
+    assert load("smoke") == before and run.run_type(None) is run.run_type(None)

@@ -74,9 +74,9 @@ def _outside(one: Range) -> list[Any]:
         match bound:
             case at.Gt(limit) | at.Lt(limit):
                 values.append(limit)
-            case at.Ge(limit):
+            case at.Ge(int() | float() as limit):
                 values.append(limit - step)
-            case at.Le(limit):
+            case at.Le(int() | float() as limit):
                 values.append(limit + step)
             case at.MinLen(length):
                 values.append((0.1,) * (length - 1))
@@ -89,9 +89,9 @@ def _inside(one: Range) -> list[Any]:
     values: list[Any] = []
     for bound in one.bounds:
         match bound:
-            case at.Gt(limit):
+            case at.Gt(int() | float() as limit):
                 values.append(limit + step)
-            case at.Lt(limit):
+            case at.Lt(int() | float() as limit):
                 values.append(limit - step)
             case at.Ge(limit) | at.Le(limit):
                 values.append(limit)
@@ -127,7 +127,7 @@ def test_a_value_outside_its_range_is_refused_by_name_with_the_remedy(one: Range
     with pytest.raises(ConfigError) as caught:
         override(run, [f"{one.where}={written}"], "x")
     assert str(caught.value) == expected
-    changed = {one.field: setting}
+    changed: dict[str, Any] = {one.field: setting}
     if one.section:
         changed = {one.section: dataclasses.replace(run.section(one.section), **changed)}
     with pytest.raises(ConfigError) as caught:

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,7 +44,7 @@ def test_dumps_is_read_back(small_run: Run) -> None:
 
 def test_every_number_has_a_docstring() -> None:
     """A docstring stands under each field, for ``--help`` and the docs."""
-    sections = [
+    sections: list[Any] = [
         item.default_factory for item in dataclasses.fields(run_type(None)) if dataclasses.is_dataclass(item.default_factory)
     ]
     assert {"AdversaryConfig", "SACConfig", "AlertsConfig", "DarkRoomConfig", "ControlConfig"} <= {s.__name__ for s in sections}
@@ -56,10 +57,11 @@ def test_every_number_has_a_docstring() -> None:
 
 def test_values_are_read_into_their_fields() -> None:
     run = config.parse('seed = 3\nmethod = "dpt"\n[darkroom]\nsize = 4\ngamma = 1\n[evaluate]\np = [0, 0.5]', "mine")
-    assert (run.seed, run.method, run.darkroom.size, run.evaluate.p) == (3, "dpt", 4, (0.0, 0.5))
-    assert isinstance(run.darkroom.gamma, float), "a whole number is read as a float where one is expected"
+    room = run.section("darkroom")
+    assert (run.seed, run.method, room.size, run.evaluate.p) == (3, "dpt", 4, (0.0, 0.5))
+    assert isinstance(room.gamma, float), "a whole number is read as a float where one is expected"
     assert isinstance(run.evaluate.p[0], float)
-    assert run.darkroom.horizon == make_run().darkroom.horizon
+    assert room.horizon == make_run().section("darkroom").horizon
 
 
 @pytest.mark.parametrize(

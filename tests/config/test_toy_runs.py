@@ -12,7 +12,7 @@ import pytest
 from icrl_dist.config.run import ConfigError, Run, load, override
 from icrl_dist.problems import registry
 from icrl_dist.types import Split
-from tests.toys.corridor import CorridorProblem
+from tests.toys.corridor import CorridorConfig, CorridorProblem
 from tests.toys.return_to_go import ReturnToGo
 
 Make = Callable[..., Run]
@@ -45,6 +45,25 @@ def test_a_problem_without_training_tasks_is_refused(toy_run: Make) -> None:
 
     with pytest.raises(ConfigError, match="problem = 'toy-corridor': its split has no training tasks"):
         toy_run(problem=Empty)
+
+
+def test_a_problem_without_tasks_to_evaluate_on_is_refused_before_a_training(toy_run: Make) -> None:
+    class Untested(CorridorProblem):
+        def make_split(self) -> Split:
+            return Split(super().make_split().train, ())
+
+    with pytest.raises(ConfigError, match="problem = 'toy-corridor': it has no tasks to evaluate on"):
+        toy_run(problem=Untested)
+
+
+def test_a_section_may_have_class_variables_of_any_type(toy_run: Make) -> None:
+    @dataclass(frozen=True)
+    class WithTable(CorridorConfig):
+        """A section with a table that all of its instances share."""
+
+        TABLE: ClassVar[dict[str, int]] = {"one": 1}
+
+    assert toy_run(problem=type("Tabled", (CorridorProblem,), {"Config": WithTable})).problem == "toy-corridor"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections import Counter
@@ -65,9 +66,16 @@ class CreditBattery:
         sender = CreditSender(worker, KEYS.data, credits=3, timeout_s=10.0)
         feeder = threading.Thread(target=lambda: list(map(sender.send, [b"%d" % i for i in range(10)])))
         feeder.start()
+
+        def arrived(answered: int) -> bool:
+            return len(held) > answered
+
+        def replaced(answered: int) -> bool:
+            return sender.sent == min(10, sender.acknowledged + 3) or len(held) > answered + 1
+
         for answered in range(10):
-            eventually(lambda n=answered: len(held) > n)
-            eventually(lambda n=answered: sender.sent == min(10, sender.acknowledged + 3) or len(held) > n + 1)
+            eventually(functools.partial(arrived, answered))
+            eventually(functools.partial(replaced, answered))
             time.sleep(0.02)
             assert len(held) <= answered + 3 and sender.outstanding <= 3
             held[answered].reply(b"stored")

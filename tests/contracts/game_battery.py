@@ -49,8 +49,8 @@ def spec_agrees_with_spaces(make_variation: MakeVariation) -> None:
     box = env.observation_space
     assert isinstance(box, spaces.Box)
     assert box.dtype == np.float32
-    np.testing.assert_array_equal(box.low, np.float32(spec.low))
-    np.testing.assert_array_equal(box.high, np.float32(spec.high))
+    np.testing.assert_array_equal(box.low, np.array(spec.low, np.float32))
+    np.testing.assert_array_equal(box.high, np.array(spec.high, np.float32))
     assert spec.observation == len(spec.high) == box.shape[0]
     if spec.discrete:
         assert isinstance(env.action_space, spaces.Discrete)

@@ -175,7 +175,12 @@ class LinkBattery:
 
     def test_a_blocked_monitor_queues_a_bounded_number_of_messages(self, links: Links) -> None:
         tap, other, released, received = links.worker(), links.worker(), threading.Event(), list[int]()
-        tap.subscribe(KEYS.monitor_all, lambda key, payload: released.wait(60) and received.append(len(payload)))
+
+        def receive(key: str, payload: bytes) -> None:
+            if released.wait(60):
+                received.append(len(payload))
+
+        tap.subscribe(KEYS.monitor_all, receive)
         arrived = threading.Event()
         tap.subscribe(KEYS.weights, lambda key, payload: arrived.set())
         links.settle()
@@ -190,8 +195,12 @@ class LinkBattery:
 
     def test_a_blocked_monitor_delays_no_other_link(self, links: Links) -> None:
         tap, worker, released = links.worker(), links.worker(), threading.Event()
-        tap.subscribe(KEYS.monitor_all, lambda key, payload: released.wait(60) and None)
-        links.learner.subscribe(KEYS.monitor_all, lambda key, payload: released.wait(60) and None)
+
+        def block(key: str, payload: bytes) -> None:
+            released.wait(60)
+
+        tap.subscribe(KEYS.monitor_all, block)
+        links.learner.subscribe(KEYS.monitor_all, block)
         links.learner.serve(KEYS.data, lambda query: query.reply(b"stored"))
         links.settle()
         start, slowest = time.monotonic(), 0.0

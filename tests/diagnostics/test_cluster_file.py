@@ -1,18 +1,22 @@
 """Cluster files before `ray up`: the shipped files pass, and each mistake is refused by name with a remedy."""
 
 import copy
+import json
 import re
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
-from icrl_dist import version
+from icrl_dist import __version__, version
 from icrl_dist.cli import main
+from icrl_dist.cli.exit_codes import FAILED, OK, USAGE
 from icrl_dist.diagnostics import cluster_file
 from icrl_dist.diagnostics.checks import table
 from icrl_dist.diagnostics.doctor import diagnose_file
+from tests.optional import known
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = ("onprem", "aws", "gcp")
@@ -29,7 +33,7 @@ def checkout(tmp_path, monkeypatch):
     (root / "dist").mkdir(parents=True)
     for name in ("pyproject.toml", "constraints.txt", "README.md", *version.PACKAGES):
         (root / name).symlink_to(ROOT / name)
-    with zipfile.ZipFile(root / "dist" / "icrl_dist-0.1.0-py3-none-any.whl", "w") as wheel:
+    with zipfile.ZipFile(root / "dist" / f"icrl_dist-{__version__}-py3-none-any.whl", "w") as wheel:
         for package in version.PACKAGES:
             for file in (ROOT / package).rglob("*"):
                 if file.suffix in (".py", ".toml", ".npz"):
@@ -93,7 +97,7 @@ def test_only_two_sections_need_edits(name, user):
 @pytest.mark.parametrize("name", ("aws", "gcp"))
 def test_the_commented_container_section_passes_too(diagnosed, name):
     text = (ROOT / "deploy" / "clusters" / f"{name}.yaml").read_text()
-    container = re.search(r"^# docker:\n(#   .*\n)+", text, re.MULTILINE)[0]
+    container = known(re.search(r"^# docker:\n(#   .*\n)+", text, re.MULTILINE))[0]
     config = filled_in(yaml.safe_load(text.replace(container, re.sub(r"^# ", "", container, flags=re.MULTILINE))))
     assert config["docker"]["image"]
     stops, warns = diagnosed(config)
@@ -195,26 +199,29 @@ def test_a_file_that_is_no_cluster_file_is_bad_usage(tmp_path, capsys, text, mes
     file = tmp_path / "file.yaml"
     if text is not None:
         file.write_text(text)
-    assert main.main(["doctor", "--cluster", str(file)]) == main.USAGE
+    assert main.main(["doctor", "--cluster", str(file)]) == USAGE
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line and str(file) in line
 
 
 def test_the_exit_code_shows_whether_a_run_could_start(checkout, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(checkout)
-    assert main.main(["doctor", "--cluster", str(ROOT / "deploy/clusters/gcp.yaml")]) == main.FAILED
+    assert main.main(["doctor", "--cluster", str(ROOT / "deploy/clusters/gcp.yaml")]) == FAILED
     file = tmp_path / "mine.yaml"
     file.write_text(yaml.safe_dump(filled_in(shipped("gcp"))))
-    assert main.main(["doctor", "--cluster", str(file)]) == main.OK
+    assert main.main(["doctor", "--cluster", str(file)]) == OK
     assert "n2-highcpu-16" in capsys.readouterr().out
     file = tmp_path / "mistake.yaml"
     file.write_text(yaml.safe_dump(with_value(shipped("gcp"), (*WORKER, "machineType"), 16)))
-    assert main.main(["doctor", "--cluster", str(file)]) == main.FAILED
+    assert main.main(["doctor", "--cluster", str(file)]) == FAILED
 
 
 def test_schemas_accept_the_keys_of_rays_example_files():
     """A schema that refused these keys would be out of date."""
-    schema = cluster_file.json.loads((ROOT / "icrl_dist/diagnostics/clouds/aws.json").read_text())
-    node = {"InstanceType": "m5.large", "BlockDeviceMappings": [{"DeviceName": "/dev/sda1", "Ebs": {"VolumeSize": 256}}]}
+    schema = json.loads((ROOT / "icrl_dist/diagnostics/clouds/aws.json").read_text())
+    node: dict[str, Any] = {
+        "InstanceType": "m5.large",
+        "BlockDeviceMappings": [{"DeviceName": "/dev/sda1", "Ebs": {"VolumeSize": 256}}],
+    }
     node |= {"InstanceMarketOptions": {"MarketType": "spot", "SpotOptions": {"MaxPrice": "0.1"}}, "SubnetIds": ["subnet-1"]}
     assert list(cluster_file._violations(node, schema, "")) == []

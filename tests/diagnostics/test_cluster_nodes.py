@@ -3,6 +3,7 @@
 import re
 import socket
 import sys
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -54,7 +55,7 @@ class FakeRay:
         changed = self.answer if node == "b" else {}
         if isinstance(changed, Exception):
             raise changed
-        now = cluster_nodes.time.time() + changed.get("ahead_s", 0.0)
+        now = time.time() + changed.get("ahead_s", 0.0)
         return {**HERE, "time": now, "host": node, "unreached": (), "certificates": "", **changed}
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import resource
+import shutil
 import socket
-from collections import namedtuple
+import sys
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -82,7 +86,7 @@ def test_a_library_too_old_and_one_missing(monkeypatch: pytest.MonkeyPatch) -> N
         return "1.0.9" if name == "eclipse-zenoh" else real(name)
 
     real = metadata.version
-    monkeypatch.setattr(doctor.metadata, "version", version)
+    monkeypatch.setattr(metadata, "version", version)
     old, missing, good = check_named("eclipse-zenoh"), check_named("msgpack"), check_named("torch")
     assert (old.ok, missing.ok, good.ok) == (False, False, True)
     assert "1.0.9 (needs >=" in old.value
@@ -91,7 +95,7 @@ def test_a_library_too_old_and_one_missing(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_python_outside_the_declared_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 4))
+    monkeypatch.setattr(sys, "version_info", (3, 10, 4))
     check = check_named("Python")
     assert check.ok is False
     assert check.value.startswith("3.10.4 (needs >=3.11)")
@@ -100,8 +104,8 @@ def test_a_python_outside_the_declared_range(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize(("gib", "ok"), [(8, True), (1.5, None), (0.5, False)])
 def test_memory_and_disk_depend_on_the_free_bytes(gib: float, ok: bool | None, monkeypatch: pytest.MonkeyPatch) -> None:
     free = int(gib * doctor.GIB)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: namedtuple("Memory", "available")(free))
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: namedtuple("Usage", "free")(free))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=free))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=free))
     assert check_named("memory").ok is ok
     assert check_named("disk").ok is ok
     assert f"{gib:.1f} GiB" in check_named("disk").value
@@ -109,15 +113,15 @@ def test_memory_and_disk_depend_on_the_free_bytes(gib: float, ok: bool | None, m
 
 def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor._shared_memory(tmp_path / "none").ok is None
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: namedtuple("Usage", "free")(64 << 20))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=64 << 20))
     check = doctor._shared_memory(tmp_path)
     assert check.ok is None
     assert "--shm-size" in check.remedy
 
 
 def test_few_cores_and_few_files_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda pid: {0})
-    monkeypatch.setattr(doctor.resource, "getrlimit", lambda which: (256, 1024))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (256, 1024))
     assert check_named("cores").ok is None
     files = check_named("open files")
     assert files.ok is None

@@ -6,10 +6,12 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from icrl_dist.bench import rates as measuring
 from icrl_dist.cli import main
+from icrl_dist.cli.exit_codes import OK, USAGE
 from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics.estimate import PhaseRates, Rates, describe, estimate
 
@@ -62,16 +64,16 @@ def test_rates_of_another_machine_are_read(tmp_path, capsys):
     demo = dataclasses.replace(RATES, run="demo")
     file.write_text("words\n" + json.dumps({"rates": demo.as_dict()}) + "\n")
     assert Rates.read(file, "demo") == demo
-    assert main.main(["plan", "demo", "--nodes", "4", "--gbit", "10", "--rates", str(file), "--json"]) == main.OK
+    assert main.main(["plan", "demo", "--nodes", "4", "--gbit", "10", "--rates", str(file), "--json"]) == OK
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["bottleneck"] == "fit"
-    assert main.main(["plan", "smoke", "--rates", str(file)]) == main.USAGE
+    assert main.main(["plan", "smoke", "--rates", str(file)]) == USAGE
     assert "rates of 'demo', not of 'smoke'" in capsys.readouterr().err
     file.write_text("{}")
-    assert main.main(["plan", "demo", "--rates", str(file)]) == main.USAGE
+    assert main.main(["plan", "demo", "--rates", str(file)]) == USAGE
 
 
 def test_the_time_of_trials_that_were_not_measured_is_extrapolated():
-    spent = measuring.np.array([1.0, 2.0, 3.0, 4.0])
+    spent = np.array([1.0, 2.0, 3.0, 4.0])
     assert measuring._extrapolated(spent, 4, 100) == 10
     assert measuring._extrapolated(spent, 6, 100) == pytest.approx(10 + 5 + 6)
     assert measuring._extrapolated(spent[:1], 3, 100) == pytest.approx(3)  # one was all that there was time for

@@ -17,8 +17,10 @@ from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.monitor.page import serving_run
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
+from icrl_dist.stream.validation import from_array
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
 from tests.monitor.test_page import CountingFeed
+from tests.optional import known
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -52,7 +54,12 @@ def page(browser):
     errors, page.allowed_errors = [], r"(?!)"
     page.on("console", lambda message: errors.append(message.text) if message.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("dialog", lambda dialog: (errors.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+
+    def dismiss(dialog):
+        errors.append(f"dialog: {dialog.message}")
+        dialog.dismiss()
+
+    page.on("dialog", dismiss)
     yield page
     assert page.evaluate("window.__pwned") is None
     page.close()
@@ -134,7 +141,7 @@ def test_sorting_filters_and_the_dialog_of_a_variation(page):
         run.send("event", what="quarantine", text="variation 2/1 ended three workers", identity="adapt/0/2/1")
         states = np.array([[0, 0], [0, 1], [1, 1]], np.float32)
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
-        drawn = {"every": 1, "observations": wire.from_array(states), "adversary": wire.from_array(np.array([-1, 2], "<f4"))}
+        drawn = {"every": 1, "observations": from_array(states), "adversary": from_array(np.array([-1, 2], "<f4"))}
         run.send("episode", identity="adapt/0/1/1/1", problem="darkroom", task=room, episode_return=5.0, **drawn)
         probs = np.eye(9)[4].tolist()
         run.send("belief", identity="adapt/0/1/1/1", size=3, goal=[1, 1], implied=[1 / 9] * 9, exact=probs)
@@ -237,7 +244,7 @@ def test_every_round_is_divided_by_its_own_optimum_and_many_alerts_leave_room(pa
     with plane() as run, shown(page, run.feed) as url:
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
         strengths = {0: 0.1, 1: 0.7}
-        best = {n: optimum("darkroom", room, {"kind": "uniform", "p": p}) for n, p in strengths.items()}
+        best = {n: known(optimum("darkroom", room, {"kind": "uniform", "p": p})) for n, p in strengths.items()}
         for number, p in strengths.items():
             run.send_return("0/0", 0, 0.5 * best[number], round=number, p=p)
         probs = np.eye(9)[4].tolist()

@@ -17,13 +17,16 @@ import pytest
 from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.serve import application, serving
 from tests.e2e.training import wait_for
+from tests.optional import known
 from tests.problems.darkroom.fixed_agent import game
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 
 CHROMIUM = Path("/usr/bin/chromium")
-QUIET = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync")
-QUIET += ("--disable-background-networking", "--disable-component-update")
+QUIET = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update"),
+)
 TIMEOUT_MS = 60_000
 
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}")
@@ -34,7 +37,7 @@ def served():
     command = [sys.executable, "-m", "icrl_dist.cli", "play", "--pretrained", "darkroom", "--web", "0", "--paused"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-    url = process.stdout.readline().partition(": ")[0]
+    url = known(process.stdout).readline().partition(": ")[0]
     yield process, url
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
@@ -197,6 +200,26 @@ def test_a_command_is_sent_after_the_answer_to_the_one_before_it(browser, small_
         page.click("#one")
         wait_for(second.is_set, "the second command")
     assert arrived == ["p", "step"] and overlapped == [False]
+
+
+def test_values_of_a_slider_replace_each_other_while_they_wait(browser):
+    arrived, moved = [], threading.Event()
+
+    def command(fields):
+        arrived.append((fields["do"], fields.get("value")))
+        moved.wait(TIMEOUT_MS / 1000)
+
+    stream = EventStream()
+    with serving(application("play.html", stream, command), stream, "127.0.0.1", 0) as url, opened(browser, url) as page:
+        page.locator("#p").fill("0.1")
+        wait_for(lambda: arrived, "the first command")
+        for p in ("0.2", "0.3", "0.4"):
+            page.locator("#p").fill(p)
+        page.click("#one")
+        page.locator("#p").fill("0.5")
+        moved.set()
+        wait_for(lambda: len(arrived) == 4, "all commands")
+    assert arrived == [("p", 0.1), ("p", 0.4), ("step", None), ("p", 0.5)]
 
 
 def test_hostile_commands_are_refused_and_the_game_continues(served):

@@ -47,7 +47,7 @@ def kill_when(process, folder, reached):
 
 def collecting(phase, count):
     """A condition that holds once ``count`` trajectories of a phase were sent."""
-    seen = set()
+    seen = set[str]()
 
     def reached(kind, fields):
         if kind == "trajectories":
@@ -71,7 +71,7 @@ def test_killing_all_processes_twice_and_then_the_command_changes_nothing(refere
         kill_when(process, folder, reached)
         assert not (folder / "result.json").exists()
     process = start(*run, "--resume", start_new_session=True)
-    ours = []
+    ours = list[psutil.Process]()
 
     def kill_the_command():
         wait_for(lambda: len(workers_of(process)) == 2, "both workers")

@@ -1,6 +1,7 @@
 """TLS streams: which clients are accepted, what each role may do, and that a whole run gives the same digests."""
 
 import contextlib
+import functools
 import json
 import shutil
 
@@ -101,7 +102,7 @@ def test_each_role_may_do_what_it_needs(certified):
         monitor = stack.enter_context(ZenohLink.connect(*connect, security.client(certified, "monitor")))
         monitor.subscribe("icrl/*/mon/trajectories/**", lambda key, payload: received.append((key, payload)))
         for link, topic in ((worker, "trajectories/w0"), (learner, "trajectories/learner")):
-            eventually(lambda link=link, topic=topic: published(link, KEYS.monitor(topic), b"look", received), OPEN_S)
+            eventually(functools.partial(published, link, KEYS.monitor(topic), b"look", received), OPEN_S)
         assert worker.has_subscribers(KEYS.monitor("trajectories/w0")) and not worker.has_subscribers(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
         eventually(lambda: worker.has_subscribers(KEYS.monitor("belief/w0")), OPEN_S)

@@ -37,6 +37,7 @@ from tests.e2e.training import (
     wait_for,
     workers_of,
 )
+from tests.optional import known
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,8 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "smoke"
     process = start("train", *SMALLER, *NO_RESTARTS, "--out", folder, "--json")
     endpoint = endpoint_of(folder)
-    script = re.search(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs" / "tap.md").read_text(), re.DOTALL)
+    page = (Path(__file__).parents[2] / "docs" / "tap.md").read_text()
+    script = known(re.search(r"```python\n(.*?)```", page, re.DOTALL))
     commands = {
         "tap": [*CLI, "tap", "--connect", endpoint],
         "documented": [sys.executable, "-c", script.group(1), endpoint, folder.name],

@@ -50,10 +50,16 @@ def endpoint_of(folder):
     return wait_for(lambda: file.exists() and file.read_text().strip(), "the start of the learner")
 
 
+class Acted(threading.Event):
+    """Set once something was done; ``link`` is the connection on which it was awaited."""
+
+    link: ZenohLink
+
+
 @contextlib.contextmanager
 def on_first_adapt_trajectory(folder, act, round_=0):
     """Call ``act`` once, when a trajectory of the round appears on the monitor plane; the yielded event is set after it."""
-    acted = threading.Event()
+    acted = Acted()
 
     def receive(key, payload):
         _, fields = wire.decode_message(payload)

@@ -10,6 +10,7 @@ from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts.sac import batched
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.stream import wire
+from tests.calls import noting
 from tests.jobs import in_problem
 
 HORIZON, EPISODES = 20, 10
@@ -33,8 +34,8 @@ def run(small_run, tmp_path):
 @pytest.fixture
 def trained(monkeypatch):
     """How many experts were trained each time."""
-    batches, real = [], batched.train
-    monkeypatch.setattr(batched, "train", lambda env, *rest, **more: batches.append(env.batch) or real(env, *rest, **more))
+    batches = list[int]()
+    monkeypatch.setattr(batched, "train", noting(batches, lambda env, *rest, **more: env.batch, batched.train))
     return batches
 
 

@@ -4,6 +4,7 @@ Prints every 1,000 steps the mean return of its mean action over ten evaluation 
 """
 
 import sys
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ def main():
     torch.set_num_threads(1)
     pole = [Variation(domains.task("dmc-cartpole-balance"))]
     env = registry.batch(pole)
-    rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
+    rates: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
     config = SACConfig(hidden=(64, 64), batch=64, gamma=0.99, random_steps=1000, warmup=1000, update_every=1, **rates)
 
     def evaluate(experts, _):

@@ -29,7 +29,7 @@ from tests.jobs import do, jobs_of
 FILE = Path(__file__).with_suffix(".json")
 LOCKSTEP, SINGLE = 2, 1
 """Experts of a job: an undisturbed and a disturbed one in lockstep, or one that stable-baselines3 trains."""
-CASES = {
+CASES: dict[str, tuple[str, int, dict[str, Any]]] = {
     **{name: (name, LOCKSTEP, {}) for name in domains.PROBLEMS},
     **{
         f"{name}, qarl": (name, LOCKSTEP, {"forces": "qarl"})
@@ -47,7 +47,7 @@ _LIBRARIES = ("dm-control", "metaworld", "mujoco", "numpy", "stable-baselines3",
 def histories(case: str) -> list[cache.History]:
     """The histories of a case, trained now on the CPU."""
     problem, experts, settings = CASES[case]
-    rates = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
+    rates: dict[str, Any] = dict.fromkeys(("actor_rate", "critic_rate", "temperature_rate"), 1e-3)
     with tempfile.TemporaryDirectory() as folder, mock.patch.object(torch.cuda, "is_available", lambda: False):
         sac = SACConfig((8, 8), batch=16, random_steps=20, warmup=20, update_every=2, steps=_HORIZON * _EPISODES, **rates)
         run = make_run(

@@ -4,8 +4,8 @@ import gymnasium
 import numpy as np
 import stable_baselines3
 import torch
-from stable_baselines3.common.buffers import ReplayBufferSamples
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.replay import ReplayBatch

@@ -3,9 +3,12 @@
 import dataclasses
 import hashlib
 import math
+from importlib import metadata
+from typing import Any
 
 import pytest
 
+from icrl_dist.config import plugins
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts import cache
 from icrl_dist.problems.continuous import network_adversary
@@ -13,6 +16,7 @@ from icrl_dist.problems.dmc import domains
 from icrl_dist.types import NULL, Adversary, Task, Variation
 from tests.experts.histories import HORIZON, run
 from tests.jobs import do, jobs_of
+from tests.optional import known
 from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 __all__ = ["run"]
@@ -64,7 +68,7 @@ def fixed_versions(monkeypatch):
     """Every library has version 1.0, and ``fixed_versions(name)`` gives one of them version 2.0."""
 
     def newer(*names):
-        monkeypatch.setattr(cache.metadata, "version", lambda name: "2.0" if name in names else "1.0")
+        monkeypatch.setattr(metadata, "version", lambda name: "2.0" if name in names else "1.0")
 
     newer()
     return newer
@@ -119,7 +123,7 @@ def digest(run, sac):
     changed = dataclasses.replace(run, sac=sac, stream=dataclasses.replace(run.stream, job_tasks=1))
     job = jobs_of(changed)[0]
     do(changed, job)
-    found = [cache.load_any(variation, HORIZON, sac, run.seed) for variation in job.variations]
+    found = [known(cache.load_any(variation, HORIZON, sac, run.seed)) for variation in job.variations]
     return hashlib.sha256(b"".join(array.tobytes() for one in found for array in one.arrays().values())).hexdigest()
 
 
@@ -134,7 +138,8 @@ def test_a_setting_is_in_the_key_if_and_only_if_it_changes_the_history(run, unch
     sac = dataclasses.replace(SAC, cache=str(tmp_path / "a"))
     unchanged[:] = unchanged or [digest(run, sac)]
     value = str(tmp_path / "b") if name == "cache" else CHANGED[name]
-    other = dataclasses.replace(sac, **{name: value})
+    change: dict[str, Any] = {name: value}
+    other = dataclasses.replace(sac, **change)
     changes = digest(run, other) != unchanged[0]
     assert (key(sac=other) != key(sac=sac)) == changes
     assert changes == (name != "cache"), "another value would show it"
@@ -195,6 +200,6 @@ def test_an_expert_of_another_package_has_the_version_of_its_distribution(tmp_pa
 
 
 def test_the_problems_of_this_package_name_their_simulators():
-    assert cache.plugins.find("problems", "darkroom").libraries == ()
+    assert plugins.find("problems", "darkroom").libraries == ()
     for name in domains.PROBLEMS:
-        assert cache.plugins.find("problems", name).libraries == ("dm-control", "mujoco")
+        assert plugins.find("problems", name).libraries == ("dm-control", "mujoco")

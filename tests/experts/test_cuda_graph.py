@@ -7,6 +7,7 @@ import torch
 from icrl_dist.experts.sac import cuda_graph
 from icrl_dist.experts.sac.batched import SACBatch, train
 from icrl_dist.experts.sac.cuda_graph import GraphedCallable
+from icrl_dist.experts.sac.lockstep import Lockstep
 from icrl_dist.experts.sac.replay import ReplayBatch
 from tests.experts.sac_cases import LINE, PAPER, SMALL, SPEC, Line, N, random_updates
 
@@ -15,20 +16,30 @@ def as_graph(engine, monkeypatch, warm_up=lambda work, times: [work() for _ in r
     """Replace the engine's update by a fake graph, which calls the update with the graph's fixed tensors."""
     monkeypatch.setattr(cuda_graph, "warm_up", warm_up)
     monkeypatch.setattr(cuda_graph, "record", lambda work: work)
-    engine._step = GraphedCallable(engine._step, engine._updater.changed())
+    engine._step = GraphedCallable(engine._step, lockstep(engine).changed())
     return engine
+
+
+def lockstep(engine):
+    assert isinstance(engine._updater, Lockstep)
+    return engine._updater
+
+
+def updates_of(engine):
+    """The number of updates that the tensors of the engine count."""
+    return lockstep(engine)._counts[0].item()
 
 
 @pytest.mark.parametrize("matmul_dtype", ["float32", "bfloat16"])
 def test_warm_up_calls_are_undone_and_every_update_is_made(matmul_dtype, monkeypatch):
     """Also when parameters were loaded after the recording."""
-    warmed = []
+    warmed = list[float]()
 
     def warm(work, times):
-        before = graphed._updater._counts[0].item()
+        before = updates_of(graphed)
         for _ in range(times):
             work()
-        warmed.append(graphed._updater._counts[0].item() - before)
+        warmed.append(updates_of(graphed) - before)
 
     direct = SACBatch(range(N), SPEC, SMALL, "cpu", matmul_dtype)
     graphed = as_graph(SACBatch(range(N), SPEC, SMALL, "cpu", matmul_dtype), monkeypatch, warm)
@@ -40,20 +51,25 @@ def test_warm_up_calls_are_undone_and_every_update_is_made(matmul_dtype, monkeyp
     for batch, noise in random_updates(SMALL, 2, seed=9):
         other.update(batch, noise)
     for engine in (direct, graphed):
-        assert engine._updater._counts[0] == engine.updates == 3
+        assert updates_of(engine) == engine.updates == 3
         engine.load(other.state())
         for batch, noise in random_updates(SMALL, 3, seed=1):
             engine.update(batch, noise)
-        assert engine._updater._counts[0] == engine.updates == 5
+        assert updates_of(engine) == engine.updates == 5
     for name, array in direct.arrays.items():
         assert torch.equal(graphed.arrays[name], array), name
 
 
 def test_a_graph_refuses_other_shapes_and_does_not_change_its_inputs(monkeypatch):
-    seen = []
+
+    def add_one(one):
+        seen.append(one.clone())
+        return one.add_(1)
+
+    seen = list[torch.Tensor]()
     monkeypatch.setattr(cuda_graph, "warm_up", lambda work, times: None)
     monkeypatch.setattr(cuda_graph, "record", lambda work: work)
-    graph = GraphedCallable(lambda one: seen.append(one.clone()) or one.add_(1), [])
+    graph = GraphedCallable(add_one, [])
     for number in (1.0, 2.0):
         given = torch.full((2,), number)
         graph(given)
@@ -65,12 +81,12 @@ def test_a_graph_refuses_other_shapes_and_does_not_change_its_inputs(monkeypatch
 def test_an_update_keeps_the_memory_of_every_tensor():
     """A graph writes to the addresses that it was recorded with."""
     engine = SACBatch(range(N), SPEC, SMALL, "cpu", "bfloat16")
-    before = [one.data_ptr() for one in engine._updater.changed()]
+    before = [one.data_ptr() for one in lockstep(engine).changed()]
     assert len(before) == 10 + 3 + 3 and len(set(before)) == len(before)  # arrays, counts, copies in bfloat16
     for batch, noise in random_updates(SMALL, 2):
         engine.update(batch, noise)
     engine.load(engine.state())
-    assert [one.data_ptr() for one in engine._updater.changed()] == before
+    assert [one.data_ptr() for one in lockstep(engine).changed()] == before
 
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -97,7 +113,7 @@ def test_updates_with_and_without_a_graph_agree(matmul_dtype):
     for batch, noise in updates_on_gpu(PAPER, 10):
         graphed.update(batch, noise)
         direct.update(batch, noise)
-    assert graphed._updater._counts[0].item() == direct._updater._counts[0].item() == 10
+    assert updates_of(graphed) == updates_of(direct) == 10
     assert_close(graphed, direct)
 
 
@@ -124,7 +140,7 @@ def test_a_graph_uses_parameters_loaded_after_its_recording():
         for engine in (first, other, later):
             engine.update(batch, noise)
     for engine in (other, later):
-        assert engine.updates == 8 and engine._updater._counts[0].item() == 8
+        assert engine.updates == 8 and updates_of(engine) == 8
         assert_close(engine, first)
     assert float((first.arrays["actor"].cpu() - torch.from_numpy(state["actor"])).abs().max()) > 1e-4
 

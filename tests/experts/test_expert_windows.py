@@ -15,6 +15,7 @@ from icrl_dist.experts.sac import batched
 from icrl_dist.experts.train import ExpertPolicy, ScriptedPolicy
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.dpt_loss import batch_loss
+from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.metaworld import environment, pick_place
@@ -24,6 +25,7 @@ from icrl_dist.training import fit
 from icrl_dist.types import NULL, Variation
 from tests.experts.histories import EPISODES, HORIZON, run
 from tests.jobs import InMemoryDataset, do, in_problem, jobs_of
+from tests.optional import known
 
 __all__ = ["run"]
 
@@ -57,7 +59,9 @@ def test_each_expert_acts_in_its_own_row(run):
     torch.manual_seed(0)
     spec = registry.of(run).spec
     batch = batched.SACBatch(range(3), spec, run.sac, "cpu")
-    shapes = dict.fromkeys(("actions", "adversary", "labels", "window_actions", "window_labels"), (0, 1, 2))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("actions", "adversary", "labels", "window_actions", "window_labels"), (0, 1, 2)
+    )
     shapes |= {"rewards": (0, 1), "window_rewards": (0, 1), "observations": (0, 2, 6), "window_observations": (0, 2, 6)}
     empty = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     actors = batch.arrays["actor"].numpy()
@@ -95,7 +99,7 @@ def windowed(run):
 def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_another_task(windowed):
     job = jobs_of(windowed)[0]
     sent = do(windowed, job)
-    found = [cache.load_any(v, HORIZON, windowed.sac, windowed.seed) for v in job.variations]
+    found = [known(cache.load_any(v, HORIZON, windowed.sac, windowed.seed)) for v in job.variations]
     policies = [ExpertPolicy([history] * 4, windowed.sac) for history in found]
     unused, counts = np.zeros((4, 2)), {False: 0, True: 0}
     for t in sent:
@@ -126,7 +130,7 @@ def test_windows_are_cut_from_episodes_of_experts_and_decoys_from_those_of_anoth
 
 def test_a_job_of_one_task_has_no_decoys(windowed):
     one_task_jobs = dataclasses.replace(windowed, stream=dataclasses.replace(windowed.stream, job_tasks=1))
-    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or a stream\.job_tasks with at least two"):
+    with pytest.raises(ConfigError, match=r"pretrain\.decoy_fraction = 0\.5: use 0, or stream\.job_tasks = 2"):
         validate(one_task_jobs, "x")
     validate(dataclasses.replace(one_task_jobs, pretrain=dataclasses.replace(one_task_jobs.pretrain, decoy_fraction=0.0)), "x")
 
@@ -138,6 +142,7 @@ def test_a_model_with_vector_actions_trains_on_windows_and_is_deployed_committed
     draw = method.data(run, method.phases(run)[0], data)
     torch.manual_seed(0)
     model = method.build(registry.of(run).spec, run)
+    assert isinstance(model, PretrainedTransformer)
     prev_actions = draw(np.random.default_rng(0)).windows.prev_actions
     assert prev_actions.shape == (8, 2, 4, 2) and prev_actions.dtype == np.float32
 

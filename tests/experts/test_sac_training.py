@@ -10,6 +10,7 @@ import torch
 from icrl_dist.experts.sac.batched import SACBatch, train
 from icrl_dist.experts.sac.replay import Replay, ReplayBatch
 from icrl_dist.experts.sac.stacked import outputs
+from tests.calls import noting
 from tests.experts.sac_cases import LINE, DivergingLine, Line
 
 
@@ -48,8 +49,8 @@ def test_the_target_bootstraps_through_the_time_limit():
 
 
 def test_actions_are_uniform_during_the_random_steps_then_the_experts(monkeypatch):
-    steps, act = [], SACBatch.act
-    monkeypatch.setattr(SACBatch, "act", lambda self, *arguments: steps.append(self.steps) or act(self, *arguments))
+    steps = list[int]()
+    monkeypatch.setattr(SACBatch, "act", noting(steps, lambda self, *arguments: self.steps, SACBatch.act))
     line = Line(400)
     train(line, LINE, 14, range(400), device="cpu")
     assert steps == list(range(5, 14))

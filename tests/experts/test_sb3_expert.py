@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 import stable_baselines3
 import torch
+from stable_baselines3.common.type_aliases import TrainFreq
 
 from icrl_dist.config.run import ConfigError, make_run, validate
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.sb3_expert import Expert, expert
+from tests.calls import noting
+from tests.optional import known
 
 CONFIG = SACConfig(hidden=(8, 4), batch=6, random_steps=10, warmup=20, replay=100, update_every=3)
 
@@ -38,10 +41,12 @@ def test_an_expert_has_the_papers_settings():
     model = expert(Corridor(), SACConfig(replay=100), 0, "cpu")
     assert [m.out_features for m in model.actor.latent_pi if isinstance(m, torch.nn.Linear)] == [256] * 3
     for critic in model.critic.q_networks:
-        assert [m.out_features for m in critic if isinstance(m, torch.nn.Linear)] == [256, 256, 256, 1]
-    assert (model.actor.mu.out_features, model.actor.log_std.out_features) == (1, 1)
+        assert [m.out_features for m in critic.children() if isinstance(m, torch.nn.Linear)] == [256, 256, 256, 1]
+    for last in (model.actor.mu, model.actor.log_std):
+        assert isinstance(last, torch.nn.Linear) and last.out_features == 1
     assert (model.tau, model.gamma, model.batch_size, model.learning_starts) == (0.005, 0.9, 256, 5000)
-    assert model.log_ent_coef.exp().item() == pytest.approx(5e-3) and model.target_entropy == -1.0
+    assert known(model.log_ent_coef).exp().item() == pytest.approx(5e-3) and model.target_entropy == -1.0
+    assert isinstance(model.train_freq, TrainFreq)
     assert (model.train_freq.frequency, model.gradient_steps, SACConfig().replay) == (3, 1, 1_000_000)
 
 
@@ -62,11 +67,8 @@ def test_each_part_keeps_its_own_learning_rate_through_training_and_a_file(tmp_p
 
 def test_first_actions_are_uniform_and_updates_begin_after_the_warm_up(monkeypatch):
     model = expert(Corridor(), CONFIG, 0, "cpu")
-    steps = []
-    predict = type(model).predict
-    monkeypatch.setattr(
-        type(model), "predict", lambda self, *a, **k: steps.append(self.num_timesteps) or predict(self, *a, **k)
-    )
+    steps = list[int]()
+    monkeypatch.setattr(Expert, "predict", noting(steps, lambda self, *a, **k: self.num_timesteps, Expert.predict))
     model.learn(30)
     assert steps == list(range(10, 30))
     assert model._n_updates == 4  # after the steps 21, 24, 27 and 30
@@ -75,7 +77,7 @@ def test_first_actions_are_uniform_and_updates_begin_after_the_warm_up(monkeypat
 def test_the_time_limit_is_stored_as_not_terminal_with_the_observation_at_it():
     model = expert(Corridor(), CONFIG, 0, "cpu")
     model.learn(9)
-    buffer = model.replay_buffer
+    buffer = known(model.replay_buffer)
     assert buffer.dones[:9, 0].tolist() == [0, 0, 1] * 3
     assert buffer.next_observations[:9, 0, 0].tolist() == [1, 2, 3] * 3
     assert not buffer._get_samples(np.arange(9)).dones.any()

@@ -1,6 +1,7 @@
 """A single expert is trained by stable-baselines3, with the engine's parameters, batches and noise."""
 
 import dataclasses
+from typing import Final
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ from icrl_dist.experts import train as experts
 from icrl_dist.experts.sac.batched import SACBatch, train
 from icrl_dist.experts.sac.sb3_expert import Expert
 from icrl_dist.experts.sac.sb3_files import load
+from icrl_dist.storage.checkpoint import save_checkpoint
+from tests.calls import noting
 from tests.experts.histories import KilledError, digests, run  # noqa: F401
 from tests.experts.sac_cases import LINE, SMALL, SPEC, Line, random_updates, updated_by_sb3
 from tests.jobs import do, jobs_of
 
-BACKEND = "stable-baselines3"
+BACKEND: Final = "stable-baselines3"
 
 
 def test_updates_are_those_of_stable_baselines3_and_those_of_the_engine_up_to_rounding(tmp_path, monkeypatch):
@@ -39,9 +42,12 @@ def test_updates_are_those_of_stable_baselines3_and_those_of_the_engine_up_to_ro
 def test_training_continues_from_a_state_and_does_not_change_the_global_generators():
     states = {}
     torch.manual_seed(3)
-    before = torch.get_rng_state(), np.random.get_state()[1].tolist()
+    before = torch.get_rng_state(), np.random.get_state(legacy=False)["state"]["key"].tolist()
     whole = train(Line(1), LINE, 35, [5], lambda e, _: states.update({e.steps: e.state()}), "cpu", backend=BACKEND).state()
-    assert torch.equal(before[0], torch.get_rng_state()) and before[1] == np.random.get_state()[1].tolist()
+    assert (
+        torch.equal(before[0], torch.get_rng_state())
+        and before[1] == np.random.get_state(legacy=False)["state"]["key"].tolist()
+    )
     again = train(Line(1), LINE, 35, [5], device="cpu", state=states[21], backend=BACKEND).state()
     assert whole["updates"] == 8 and not np.array_equal(states[21]["actor"], whole["actor"])
     for name, array in whole.items():
@@ -55,8 +61,8 @@ def test_settings_that_stable_baselines3_does_not_support_are_refused(more):
 
 
 def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_bytes(run, monkeypatch):  # noqa: F811
-    trained, real = [], stable_baselines3.SAC.train
-    monkeypatch.setattr(stable_baselines3.SAC, "train", lambda self, *given: trained.append(type(self)) or real(self, *given))
+    trained, sac = list[type](), stable_baselines3.SAC
+    monkeypatch.setattr(sac, "train", noting(trained, lambda self, *given: type(self), sac.train))
     whole = jobs_of(run)[0]
     none = dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=""))
     pair = dataclasses.replace(jobs_of(none)[0], variations=whole.variations[:2], tasks=1)
@@ -66,7 +72,7 @@ def test_a_job_of_one_expert_uses_stable_baselines3_and_resumes_to_the_same_byte
     updates = len(trained)
     assert updates == (run.sac.steps - run.sac.warmup) // run.sac.update_every and set(trained) == {Expert}
     one, begun = dataclasses.replace(whole, variations=whole.variations[:1], tasks=1), []
-    save = experts.save_checkpoint
+    save = save_checkpoint
 
     def killed(path, checkpoint):
         save(path, checkpoint)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from icrl_dist.experts import cache, train
+from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.experts.train import ExpertPolicy
 from icrl_dist.methods.examples import self_labelled
 from icrl_dist.problems import registry
@@ -13,10 +14,12 @@ from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.continuous.problem import EXPERT
 from icrl_dist.problems.dmc.problem import DMCProblem
 from icrl_dist.results import evaluate, summaries
+from icrl_dist.storage.checkpoint import save_checkpoint
 from icrl_dist.stream import wire
 from icrl_dist.types import NULL
 from tests.experts.histories import EPISODES, HORIZON, Breaking, KilledError, digests, run, trained
 from tests.jobs import FixedWeights, decoded, do, jobs_of
+from tests.optional import known
 from tests.results.row_blocks import frame
 
 __all__ = ["run", "trained"]
@@ -26,6 +29,7 @@ def test_a_job_has_all_variations_of_a_few_tasks_and_the_section_sac(run):
     first, second = jobs_of(run)
     assert first.kind == "train_expert" and (first.trials, first.tasks, second.task) == (3, 2, 2)
     assert [v.adversary == NULL for v in first.variations] == [True, False] * 2
+    assert isinstance(first.payload, ExpertHistories)
     assert first.payload.sac == run.sac and decoded(run, wire.encode_job(first)) == first
     assert {v.adversary for job in jobs_of(run, "dpt") for v in job.variations} == {NULL}
 
@@ -34,7 +38,7 @@ def test_contexts_are_episodes_of_the_training_and_labels_are_actions_of_its_exp
     job = jobs_of(run)[0]
     sent = do(run, job)
     assert [t.identity for t in sent] == list(job.identities())
-    found = [cache.load_any(v, HORIZON, run.sac, run.seed) for v in job.variations]
+    found = [known(cache.load_any(v, HORIZON, run.sac, run.seed)) for v in job.variations]
     for t in sent:
         row = job.variations.index(t.variation)
         history = found[row]
@@ -96,17 +100,17 @@ def test_a_history_delivers_at_most_the_episodes_of_its_training_and_keeps_all_o
     few = jobs_of(run)[0]
     assert few.trials == 3
     do(run, few)
-    assert len(cache.load(few.variations[0], HORIZON, run.sac, run.seed, "lockstep").rewards) == 6
+    assert len(known(cache.load(few.variations[0], HORIZON, run.sac, run.seed, "lockstep")).rewards) == 6
 
 
 def test_a_killed_training_continues_from_its_checkpoint_to_the_same_bytes(run, monkeypatch):
     job = jobs_of(run)[0]
     undisturbed = digests(do(run, jobs_of(dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache="")))[0]))
     monkeypatch.setattr(train, "CHECKPOINT_S", 0.0)
-    real, begun = train.save_checkpoint, []
+    begun = list[str]()
 
     def killed(path, checkpoint):
-        real(path, checkpoint)
+        save_checkpoint(path, checkpoint)
         begun.append(path.name)
         if len(begun) in (4, 7):
             raise KilledError
@@ -131,7 +135,7 @@ def test_episodes_that_diverged_are_left_out(run, monkeypatch, always):
             do(run, job)
         return
     do(run, job)
-    lengths = [len(cache.load_any(v, HORIZON, run.sac, run.seed).rewards) for v in job.variations]
+    lengths = [len(known(cache.load_any(v, HORIZON, run.sac, run.seed)).rewards) for v in job.variations]
     assert lengths == [EPISODES, EPISODES - 2, EPISODES, EPISODES - 2]
 
 
@@ -173,7 +177,7 @@ def test_the_actions_of_the_model_become_labels(run):
     icaa = dataclasses.replace(run, method="icaa")
     trials = do(icaa, jobs_of(icaa, phase=1)[0], FixedWeights(icaa))
     own = [t for t in trials if t.identity[:4] == trials[0].identity[:4]]
-    examples = self_labelled(icaa, own)
+    examples = known(self_labelled(icaa, own))
     later = own[icaa.icaa.context_trials + 1 :]
     np.testing.assert_array_equal(examples.labels, np.concatenate([t.actions for t in later]))
     np.testing.assert_array_equal(examples.queries, np.concatenate([t.observations[:-1] for t in later]))

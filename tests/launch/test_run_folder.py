@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -18,6 +19,7 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.launch import run_folder
 from icrl_dist.launch import train as launch
 from icrl_dist.storage.files import hold
+from tests.optional import known
 
 OURS = (
     *("run.toml", "env.json", "fork.json", "result.json", "metrics.jsonl", "agent.npz", "learner.log", "learner.err"),
@@ -145,9 +147,9 @@ def test_folders_that_cannot_be_run_folders_are_refused(tmp_path, module_run, mo
         str(tmp_path / "dangling"): "is a symbolic link",
     }
     for out, why in refused.items():
-        for options in ({"overwrite": True, "resume": False}, {"overwrite": False, "resume": False}):
+        for overwrite in (True, False):
             with pytest.raises(ConfigError) as error:
-                launch.prepare(module_run, Path(out), **options)
+                launch.prepare(module_run, Path(out), resume=False, overwrite=overwrite)
             assert f"--out {out}: " in str(error.value) and why in str(error.value)
     assert files(tmp_path) == before
 
@@ -190,7 +192,7 @@ def test_the_folder_of_an_active_run_is_not_changed(tmp_path, module_run, option
 
 def test_the_old_run_is_removed_at_the_first_checkpoint_and_not_before(tmp_path, module_run):
     folder, before = started(tmp_path, module_run)
-    events = []
+    events = list[dict[str, Any]]()
     with launch.prepare(module_run, folder, resume=False, overwrite=True) as transaction:
         report, aside = transaction.commit_at_checkpoint(events.append), run_folder.aside_of(folder)
         report({"event": "progress", "version": -1})
@@ -230,7 +232,7 @@ def test_the_new_run_stays_after_its_first_checkpoint_or_a_successful_end(tmp_pa
 
 def test_no_run_is_removed_if_the_new_folder_contains_a_user_file(tmp_path, module_run):
     folder, before = started(tmp_path, module_run)
-    events = []
+    events = list[dict[str, Any]]()
     with pytest.raises(ConfigError), launch.prepare(module_run, folder, resume=False, overwrite=True) as transaction:
         transaction.commit_at_checkpoint(events.append)
         write(folder, ["notes.md"])
@@ -242,7 +244,7 @@ def test_no_run_is_removed_if_the_new_folder_contains_a_user_file(tmp_path, modu
 def killed(tmp_path, run):
     """The folders that a command leaves if it is killed while it replaces a run."""
     folder, before = started(tmp_path, run)
-    launch.prepare(run, folder, resume=False, overwrite=True)._lock.close()
+    known(launch.prepare(run, folder, resume=False, overwrite=True)._lock).close()
     return folder, run_folder.aside_of(folder), before
 
 
@@ -274,15 +276,17 @@ def test_after_a_kill_during_the_removal_the_old_run_is_not_restored(tmp_path, m
     assert not aside.exists() and sorted(path.name for path in folder.iterdir()) == ["env.json", "run.toml"]
 
 
-def test_after_a_kill_before_the_new_run_wrote_anything_the_old_run_is_restored(tmp_path, module_run):
-    for missing in (True, False):
-        folder, aside, old = killed(tmp_path / str(missing), module_run)
-        for path in folder.iterdir():
+@pytest.mark.parametrize("left", [None, (), (".replacement",), (".replacement", ".lock")])
+def test_after_a_kill_before_the_new_run_wrote_anything_the_old_run_is_restored(tmp_path, module_run, left):
+    folder, aside, old = killed(tmp_path, module_run)
+    (folder / ".lock").touch()
+    for path in folder.iterdir():
+        if path.name not in (left or ()):
             path.unlink()
-        if missing:
-            folder.rmdir()
-        launch.prepare(module_run, folder, resume=True, overwrite=False)
-        assert files(folder) == old and not aside.exists()
+    if left is None:
+        folder.rmdir()
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(folder) == old and not aside.exists()
 
 
 @pytest.mark.parametrize("options", [(False, False), (True, False), (False, True)])
@@ -373,12 +377,12 @@ def forked(folder, version):
 def test_the_versions_that_a_fork_starts_from_are_no_checkpoint_of_its_own(tmp_path, module_run, monkeypatch):
     folder, before = started(tmp_path, module_run)
     monkeypatch.setattr(launch, "fork", lambda source, version, run, folder: forked(folder, version))
-    given = {"resume": False, "overwrite": True, "source": (tmp_path / "parent", 1)}
+    given: dict[str, Any] = {"resume": False, "overwrite": True, "source": (tmp_path / "parent", 1)}
     with pytest.raises(KeyboardInterrupt), launch.prepare(module_run, folder, **given) as transaction:
         transaction.commit_at_checkpoint(lambda event: None)({"event": "progress", "version": 1})
         raise KeyboardInterrupt
     assert transaction.rolled_back and files(folder) == before
-    launch.prepare(module_run, folder, **given)._lock.close()  # killed
+    known(launch.prepare(module_run, folder, **given)._lock).close()  # killed
     with pytest.raises(ConfigError, match="was killed"):
         launch.prepare(module_run, folder, resume=True, overwrite=False)
     assert replaced(folder) == before
@@ -430,7 +434,7 @@ def test_a_kill_while_a_fork_is_made_keeps_the_old_run(tmp_path, module_run, mon
 
 def test_an_interrupted_removal_leaves_no_run(tmp_path, monkeypatch):
     folder = write(tmp_path / "run", OURS)
-    unlink, removed = Path.unlink, []
+    unlink, removed = Path.unlink, list[Path]()
 
     def once(path, missing_ok=False):
         if removed:
@@ -447,7 +451,7 @@ def test_an_interrupted_removal_leaves_no_run(tmp_path, monkeypatch):
 def test_the_lock_is_taken_on_the_file_that_is_in_the_folder_now(tmp_path, monkeypatch):
     """Another process may replace the folder between opening and locking its lock file."""
     folder = write(tmp_path / "run", ["run.toml"])
-    flock, replaced = fcntl.flock, []
+    flock, replaced = fcntl.flock, list[Path]()
 
     def late(file, how):
         if not replaced:

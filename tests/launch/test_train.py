@@ -1,8 +1,10 @@
 """Run folders that are resumed or refused, and the learner as a child process: messages to it, and a restart."""
 
 import os
+import sys
 import time
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -10,6 +12,7 @@ from actors import fleet
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.launch import learner_process, train
 from learner.__main__ import _read_lost_workers
+from learner.service import Service
 
 
 @pytest.fixture
@@ -18,7 +21,7 @@ def learner(tmp_path, monkeypatch):
     program = tmp_path / "program"
     program.write_text('#!/bin/sh\nwhile read line; do echo "$line" >> "$3/received"; done\n')
     program.chmod(0o755)
-    monkeypatch.setattr(learner_process.sys, "executable", str(program))
+    monkeypatch.setattr(sys, "executable", str(program))
     process = learner_process.LearnerProcess(tmp_path, "tcp/127.0.0.1:0", 1)
     yield process
     process.end()
@@ -44,10 +47,11 @@ def test_a_learner_receives_the_workers_lost_with_a_node_and_a_restarted_one_rec
 
 
 def test_workers_lost_with_nodes_reach_the_worker_api():
-    received, (read, write) = [], os.pipe()
+    received, (read, write) = list[list[str]](), os.pipe()
     os.write(write, b'["w0"]\n["w1", "w2"]\n')
     os.close(write)
-    _read_lost_workers(SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=received.append)), read)
+    service = SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=received.append))
+    _read_lost_workers(cast(Service, service), read)
     os.close(read)
     assert received == [["w0"], ["w1", "w2"]]
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from types import SimpleNamespace
+from typing import Any
 
 import matplotlib
 import pytest
@@ -36,7 +37,7 @@ def state():
         "random": torch.get_rng_state().tolist(),
         "deterministic": torch.get_deterministic_debug_mode(),
         "threads": torch.get_num_threads(),
-        "backend": matplotlib.rcParams._get_backend_or_none(),
+        "backend": matplotlib.get_backend(auto_select=False),
         "variables": dict(os.environ),
     }
 
@@ -73,7 +74,8 @@ def test_a_run_from_python_prints_nothing_and_leaves_its_process_as_it_was(made)
 
 
 def test_a_run_in_another_thread_and_its_events(module_run, tmp_path, no_tensorboard):
-    events, made = [], []
+    events: list[dict[str, Any]] = []
+    made: list[Any] = []
     run = dataclasses.replace(module_run, method="icag")
     thread = threading.Thread(
         target=lambda: made.append(icrl_dist.train(run, tmp_path / "run", engine="inline", progress=events.append))
@@ -156,7 +158,7 @@ def test_the_learner_process_has_the_waiting_policy_also_without_the_command_lin
     program = tmp_path / "program"
     program.write_text('#!/bin/sh\necho "$OMP_WAIT_POLICY" > "$3/policy"\n')
     program.chmod(0o755)
-    monkeypatch.setattr(learner_process.sys, "executable", str(program))
+    monkeypatch.setattr(sys, "executable", str(program))
     process = learner_process.LearnerProcess(tmp_path, "tcp/127.0.0.1:0", 0)
     process._process.wait()
     process.end()

@@ -9,6 +9,7 @@ from icrl_dist.diagnostics import explain
 from icrl_dist.launch.train import TrainInterrupted
 from icrl_dist.types import Identity
 from learner import checkpoints, reporter, service
+from tests.calls import noting
 from tests.learner.test_service import no_tensorboard, run_inline, same
 
 __all__ = ["no_tensorboard"]
@@ -34,9 +35,9 @@ def test_an_interrupted_dagger_round_continues_to_the_same_bytes(run, tmp_path, 
         if event["event"] == "progress" and (event["stage"], event["version"]) == ("fit", 1) and event["step"] >= 3:
             services[0].stop()
 
-    services = []
+    services = list[service.Service]()
     real = service.Service.run
-    monkeypatch.setattr(service.Service, "run", lambda self: services.append(self) or real(self))
+    monkeypatch.setattr(service.Service, "run", noting(services, lambda self: self, real))
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     with pytest.raises(TrainInterrupted):
         run_inline(run, tmp_path / "stopped", stop)

@@ -8,21 +8,18 @@ from actors.weight_cache import WeightCache
 from icrl_dist.launch import train
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from icrl_dist.stream import wire
+from icrl_dist.telemetry.metrics import Metrics
 from learner import fitting, service
+from tests.calls import keeping
 
 
 @pytest.fixture
 def hashed(monkeypatch):
     """The digest of every call of ``wire.weights_digest`` in this process, which has no worker that receives weights."""
-    digests, digest_of, metrics = [], wire.weights_digest, service.Metrics
-
-    def counted(arrays):
-        digests.append(digest_of(arrays))
-        return digests[-1]
-
-    monkeypatch.setattr(wire, "weights_digest", counted)
+    digests = list[str]()
+    monkeypatch.setattr(wire, "weights_digest", keeping(digests, wire.weights_digest))
     monkeypatch.setattr(WeightCache, "_on_broadcast", lambda self, key, payload: None)
-    monkeypatch.setattr(service, "Metrics", lambda folder, **options: metrics(folder, tensorboard=False, **options))
+    monkeypatch.setattr(service, "Metrics", lambda folder, **options: Metrics(folder, tensorboard=False, **options))
     return digests
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -13,6 +14,7 @@ from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import batching, wire
 from icrl_dist.types import Identity, Spec
 from learner.ingest import REASONS, Ingest, Rejected, check
+from tests.calls import noting
 from tests.jobs import do, jobs_of
 
 
@@ -23,7 +25,7 @@ class FakeQuery:
 
     def __init__(self, payload):
         self.payload = payload
-        self.answer = None
+        self.answer: Any = None
         self.answered = threading.Event()
 
     def reply(self, payload):
@@ -47,12 +49,19 @@ def trajectories(small_run, job):
     return do(small_run, job)
 
 
+class ObservedIngest(Ingest):
+    """An Ingest with its dataset and the failures that it reported."""
+
+    store: Dataset
+    failures: list[BaseException]
+
+
 @pytest.fixture
 def ingest(tmp_path, small_run, job):
     store = Dataset(tmp_path)
     wanted = set(job.identities())
-    failures = []
-    opened = Ingest(
+    failures = list[BaseException]()
+    opened = ObservedIngest(
         store,
         registry.spec(job.variations[0].task),
         1 << 20,
@@ -77,11 +86,15 @@ def put(ingest, *payloads):
 
 
 def test_a_trajectory_is_stored_before_the_answer(ingest, trajectories, monkeypatch):
-    order = []
+    order = list[str]()
     append = ingest.store.append
-    monkeypatch.setattr(ingest.store, "append", lambda items: (append(items), order.append("stored")))
-    reply = FakeQuery.reply
-    monkeypatch.setattr(FakeQuery, "reply", lambda self, payload: (order.append("answered"), reply(self, payload)))
+
+    def stored(items):
+        append(items)
+        order.append("stored")
+
+    monkeypatch.setattr(ingest.store, "append", stored)
+    monkeypatch.setattr(FakeQuery, "reply", noting(order, lambda self, payload: "answered", FakeQuery.reply))
     put(ingest, wire.encode_trajectory(trajectories[0]))
     assert order == ["stored", "answered"]
     assert trajectories[0].identity in ingest.store
@@ -190,6 +203,16 @@ def test_a_request_that_is_not_a_batch_is_refused(ingest, reason, payload):
     assert query.answer.startswith(reason) and ingest.drops == {reason: 1}
 
 
+def behind(gate, job):
+    """An answer to which job wants a trajectory, given once the gate is open."""
+
+    def wanted_by(identity):
+        gate.wait()
+        return job
+
+    return wanted_by
+
+
 def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, trajectories):
     gate = threading.Event()
     store = Dataset(tmp_path / "gated")
@@ -197,7 +220,7 @@ def test_a_full_queue_answers_busy_and_never_blocks(tmp_path, small_run, job, tr
         store,
         registry.spec(job.variations[0].task),
         1 << 20,
-        lambda i: gate.wait() and job,
+        behind(gate, job),
         lambda v: "",
         lambda t: None,
         print,
@@ -223,9 +246,7 @@ def test_the_queue_is_bounded_in_bytes_and_accepts_one_message_of_any_size(tmp_p
     size = len(payloads[0])
     for capacity, expected in ((2 * size + size // 2, 2), (size // 2, 1)):
         gate.clear()
-        ingest = Ingest(
-            store, spec, 1 << 20, lambda i: gate.wait() and job, lambda v: "", lambda t: None, print, capacity_bytes=capacity
-        )
+        ingest = Ingest(store, spec, 1 << 20, behind(gate, job), lambda v: "", lambda t: None, print, capacity_bytes=capacity)
         query = FakeQuery(batching.join(payloads))
         ingest.put(query)
         assert ingest.drops == {"busy": 4 - expected}
@@ -263,7 +284,7 @@ def test_on_a_full_disk_nothing_is_acknowledged_and_the_error_is_reported(ingest
 
 
 def test_a_failed_ingest_can_be_closed_with_a_full_queue(tmp_path, small_run, job, trajectories):
-    failures = []
+    failures = list[BaseException]()
 
     def bug(identity):
         raise ZeroDivisionError("a bug")

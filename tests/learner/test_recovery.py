@@ -3,22 +3,28 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from icrl_dist.collect import kinds
+from icrl_dist.collect.adapt import rollouts
 from icrl_dist.config.run import ConfigError, override
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch import train
 from icrl_dist.methods import examples
 from icrl_dist.methods.icaa import ICAA
+from icrl_dist.storage import files
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError, hold
 from icrl_dist.storage.fork import parse_source
-from icrl_dist.types import Identity
+from icrl_dist.types import Identity, Variation
 from learner import reporter, service
+from tests.calls import noting
 from tests.learner.test_service import no_tensorboard, parent, run_inline, same
+from tests.optional import known
 
 __all__ = ["no_tensorboard", "parent"]
 
@@ -36,7 +42,7 @@ def flip(path, at):
 
 @pytest.mark.parametrize("segment", [0, 1])
 def test_data_with_a_changed_byte_is_reported_and_collected_again(parent, tmp_path, segment):
-    folder, events = tmp_path / "run", []
+    folder, events = tmp_path / "run", list[dict[str, Any]]()
     segments = copy_of(parent, folder)
     flip(segments[segment], segments[segment].stat().st_size // 2)
     result = run_inline(parent[2], folder, events.append, resume=True)
@@ -55,7 +61,7 @@ def test_a_missing_segment_is_collected_again_with_the_policy_version_of_its_rou
 
 def damaging(folder):
     """A report that damages the pretraining data in the first round of ICAA; returns it and the list of what happened."""
-    happened = []
+    happened = list[Any]()
 
     def damage(event):
         if event.get("stage") == "collect" and event.get("phase") == "adapt" and not happened:
@@ -85,8 +91,8 @@ def test_damage_of_data_in_memory_changes_no_result_and_is_found_when_the_run_is
 
 def test_examples_of_removed_trajectories_are_made_anew_from_those_that_replace_them(parent, tmp_path, monkeypatch):
     """Round 1 finds damage; the repair also removes a trajectory of round 0, whose examples are in memory."""
-    folder, flipped, replaced = tmp_path / "run", [], []
-    work, draw, data = kinds.do, examples.draw, ICAA.data
+    folder, flipped, replaced = tmp_path / "run", list[Path](), []
+    work, data = kinds.do, ICAA.data
 
     def damage(event):
         if event.get("phase") == "adapt" and event.get("round") == 1 and event["step"] == event["steps"] and not flipped:
@@ -101,27 +107,27 @@ def test_examples_of_removed_trajectories_are_made_anew_from_those_that_replace_
                 trajectory = dataclasses.replace(trajectory, actions=(trajectory.actions + 1) % 5)
             yield trajectory
 
-    pools = []
+    pools = list[Any]()
 
     def compare(method, run, phase, dataset):
         drawn = data(method, run, phase, dataset)
         if phase.round == 1:
             keys = [key for j in (0, 1) for key in dataset.variations("adapt", j)]
             for key, found in zip(keys, pools[-1][1].examples, strict=True):
-                made = examples.self_labelled(run, dataset.trials(key))
+                made = known(examples.self_labelled(run, dataset.trials(key)))
                 np.testing.assert_array_equal(found.actions, made.actions, str(key))
                 np.testing.assert_array_equal(found.labels, made.labels, str(key))
         return drawn
 
     monkeypatch.setattr(kinds, "do", do)
-    monkeypatch.setattr(examples, "draw", lambda run, chosen: pools.append(chosen) or draw(run, chosen))
+    monkeypatch.setattr(examples, "draw", noting(pools, lambda run, chosen: chosen, examples.draw))
     monkeypatch.setattr(ICAA, "data", compare)
     result = run_inline(parent[2], folder, damage)
     assert result["repaired"] == len(flipped) == 2 and replaced and len(pools) == 3
 
 
 def test_a_folder_has_at_most_one_learner(parent, monkeypatch):
-    monkeypatch.setattr(service.files, "hold", lambda folder: hold(folder, timeout_s=0.1))
+    monkeypatch.setattr(files, "hold", lambda folder: hold(folder, timeout_s=0.1))
     with hold(parent[0]), pytest.raises(StoreError, match="another learner uses this folder"):
         train.train_inline(parent[2], parent[0], print)
 
@@ -197,8 +203,8 @@ def test_overlapping_rounds_use_policy_versions_at_most_one_old(parent, tmp_path
 
 def test_a_stopped_asynchronous_run_continues_its_jobs_with_the_same_policy_versions(parent, tmp_path, monkeypatch):
     run = override(parent[2], ["stream.staleness=1", "icaa.rounds=2"], "--set")
-    services, real = [], service.Service.run
-    monkeypatch.setattr(service.Service, "run", lambda self: services.append(self) or real(self))
+    services = list[service.Service]()
+    monkeypatch.setattr(service.Service, "run", noting(services, lambda self: self, service.Service.run))
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
 
     def stop(event):
@@ -231,10 +237,8 @@ def test_explain_checks_every_file_of_a_trajectory(parent):
 
 
 def test_a_rerun_with_other_bytes_is_reported(parent, monkeypatch):
-    real = kinds.rollouts
-
     def other(*given):
-        for trajectory in real(*given):
+        for trajectory in rollouts(*given):
             yield dataclasses.replace(trajectory, rewards=trajectory.rewards + 1)
 
     monkeypatch.setattr(kinds, "rollouts", other)
@@ -243,18 +247,18 @@ def test_a_rerun_with_other_bytes_is_reported(parent, monkeypatch):
 
 
 def test_a_variation_that_always_fails_is_quarantined_and_listed(parent, tmp_path, monkeypatch):
-    run, real, broken = parent[2], kinds.rollouts, []
+    run, broken = parent[2], list[Variation]()
 
     def failing(job, *rest):
         if not broken:
             broken.append(job.variations[4])  # in the first job: the second variation of the second task
-        for trajectory in real(job, *rest):
+        for trajectory in rollouts(job, *rest):
             if broken[0] in job.variations and trajectory.identity.trial == 1:
                 raise ZeroDivisionError("this variation fails")
             yield trajectory
 
     monkeypatch.setattr(kinds, "rollouts", failing)
-    folder, events = tmp_path / "run", []
+    folder, events = tmp_path / "run", list[dict[str, Any]]()
     result = run_inline(run, folder, events.append)
     ((quarantined,)) = result["quarantined"]
     assert quarantined["variation"] == "adapt/0/1/1" and "ZeroDivisionError: this variation fails" in quarantined["cause"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,9 @@ from icrl_dist.interfaces import LabelQuality, RatedVariation
 from icrl_dist.launch import train as launch
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.memory_link import MemoryLink
-from icrl_dist.telemetry.metrics import NAMES, TEXTS
+from icrl_dist.telemetry.metrics import NAMES, TEXTS, Metrics
 from learner import reporter, service
 from tests.toys.return_to_go import ReturnToGo
-
-METRICS = service.Metrics
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def train(small_run, tmp_path, monkeypatch):
     """
 
     def run_with(run=None, **thresholds):
-        messages, events, publish = [], [], MemoryLink.publish
+        messages, events, publish = [], list[dict[str, Any]](), MemoryLink.publish
 
         def record(link, key, payload, droppable):
             if "/mon/" in key:
@@ -36,7 +35,7 @@ def train(small_run, tmp_path, monkeypatch):
         monkeypatch.setattr(MemoryLink, "publish", record)
         monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
         monkeypatch.setattr(reporter, "_DESCRIPTION_S", 0.0)
-        monkeypatch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        monkeypatch.setattr(service, "Metrics", lambda folder, **options: Metrics(folder, tensorboard=False, **options))
         run = dataclasses.replace(run or small_run, alerts=AlertsConfig(**thresholds))
         launch.prepare(run, tmp_path / "run", resume=False, overwrite=False)
         launch.train_inline(run, tmp_path / "run", events.append)

@@ -5,6 +5,7 @@ import pytest
 from icrl_dist.types import Identity
 from learner.scheduler import LeaseScheduler
 from tests.learner.scheduling import LEASE, PHASE, finish, jobs, kill, later, leased, nothing_stored, scheduler
+from tests.optional import known
 
 __all__ = ["jobs", "later", "scheduler"]
 
@@ -180,7 +181,7 @@ def test_the_deadline_stays_within_its_bounds(jobs):
         scheduler.open(jobs, nothing_stored)
         scheduler.lease("a", 0.0)
         scheduler.received(next(iter(jobs[0].identities())), gap)
-        assert scheduler.lease("b", gap).deadline_s == expected
+        assert known(scheduler.lease("b", gap)).deadline_s == expected
 
 
 def test_a_trajectory_of_a_free_job_is_not_measured(scheduler, jobs):

@@ -5,8 +5,11 @@ import collections
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from icrl_dist.interfaces import VariationKey
+from icrl_dist.types import Identity, Job
 from learner.scheduler import LeaseScheduler
 from tests.learner.scheduling import LEASE, PHASE, jobs, nothing_stored
+from tests.optional import known
 
 __all__ = ["jobs"]
 
@@ -35,9 +38,9 @@ def test_no_sequence_of_events_loses_a_trajectory_or_quarantines_before_three_fa
     scheduler = LeaseScheduler(LEASE, floor_s=1.0, factor=4.0)
     scheduler.open(jobs, nothing_stored)
     everything = [i for job in jobs for i in job.identities()]
-    stored, held, lost, lost_nodes, now = set(), {}, {}, set(), 0.0
-    failures = collections.Counter()
-    ends = {}
+    stored, held, lost, lost_nodes, now = set[Identity](), dict[str, Job](), dict[str, Job](), set[str](), 0.0
+    failures = collections.Counter[VariationKey]()
+    ends = dict[str, float]()
 
     def count_failure(job, by):
         failures.update({i[:4]: by for i in job.identities()})
@@ -51,7 +54,7 @@ def test_no_sequence_of_events_loses_a_trajectory_or_quarantines_before_three_fa
         assert scheduler.done(*PHASE) == (not wanted)
         assert all(failures[key] >= 3 for key in quarantined)
         assert all(
-            scheduler.pending_job(i).variation(i) == next(j for j in jobs if i in set(j.identities())).variation(i)
+            known(scheduler.pending_job(i)).variation(i) == next(j for j in jobs if i in set(j.identities())).variation(i)
             for i in wanted[:3]
         )
 

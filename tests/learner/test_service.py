@@ -4,17 +4,21 @@ import dataclasses
 import json
 import shutil
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
 
 from icrl_dist.agent.loading import load_agent
-from icrl_dist.config.run import ConfigError
+from icrl_dist.config.run import ConfigError, dumps
 from icrl_dist.launch import train
+from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.problems.darkroom.problem import DarkRoomProblem
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
+from icrl_dist.telemetry.metrics import Metrics
 from learner import checkpoints, reporter, service
+from tests.calls import noting
 
 
 def run_inline(run, folder, report=lambda event: None, **options):
@@ -22,13 +26,10 @@ def run_inline(run, folder, report=lambda event: None, **options):
     return train.train_inline(run, folder, report)
 
 
-METRICS = service.Metrics
-
-
 @pytest.fixture(autouse=True, scope="module")
 def no_tensorboard():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        patch.setattr(service, "Metrics", lambda folder, **options: Metrics(folder, tensorboard=False, **options))
         yield
 
 
@@ -78,7 +79,7 @@ def test_a_repeated_run_gives_the_same_bytes_and_another_seed_other_bytes(small_
 @pytest.mark.parametrize("when", [("collect", 0, 20), ("fit", 0, 4), ("collect", 2, 40), ("fit", 2, 3)])
 def test_a_run_stopped_at_any_step_resumes_to_the_same_bytes(small_run, tmp_path, undisturbed, when, monkeypatch):
     what, next_version, step = when
-    stopped = []
+    stopped = list[dict[str, Any]]()
 
     def stop_at(event):
         at = event.get("stage"), event.get("version", -2) + 1
@@ -86,9 +87,8 @@ def test_a_run_stopped_at_any_step_resumes_to_the_same_bytes(small_run, tmp_path
             stopped.append(event)
             services[0].stop()
 
-    services = []
-    real = service.Service.run
-    monkeypatch.setattr(service.Service, "run", lambda self: services.append(self) or real(self))
+    services = list[service.Service]()
+    monkeypatch.setattr(service.Service, "run", noting(services, lambda self: self, service.Service.run))
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     folder = tmp_path / "stopped"
     with pytest.raises(train.TrainInterrupted):
@@ -121,11 +121,11 @@ def test_an_existing_folder_and_changed_settings_are_refused(small_run, tmp_path
     with pytest.raises(ConfigError, match="holds no run"):
         train.prepare(small_run, tmp_path / "nothing", resume=True, overwrite=False)
     wide = dataclasses.replace(small_run, model=dataclasses.replace(small_run.model, width=32))
-    (folder / "run.toml").write_text(train.dumps(wide))
+    (folder / "run.toml").write_text(dumps(wide))
     with pytest.raises(ConfigError, match="a checkpoint of another model"):
         run_inline(wide, folder, resume=True)
     large = dataclasses.replace(small_run, darkroom=dataclasses.replace(small_run.darkroom, horizon=9))
-    (folder / "run.toml").write_text(train.dumps(large))
+    (folder / "run.toml").write_text(dumps(large))
     with pytest.raises(ConfigError, match="a checkpoint of another spec"):
         run_inline(large, folder, resume=True)
 
@@ -135,5 +135,5 @@ def test_a_job_that_always_fails_ends_the_run_with_the_cause(small_run, tmp_path
         raise ZeroDivisionError("the environment broke")
 
     monkeypatch.setattr(DarkRoomProblem, "batch", broken)
-    with pytest.raises(train.TrainFailed, match=r"no trajectory was stored, and .* ZeroDivisionError: the environment broke"):
+    with pytest.raises(TrainFailed, match=r"no trajectory was stored, and .* ZeroDivisionError: the environment broke"):
         run_inline(small_run, tmp_path / "broken")

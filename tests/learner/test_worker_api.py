@@ -4,6 +4,7 @@ import dataclasses
 import json
 import threading
 import time
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,9 @@ class Server:
 
     def __init__(self, run, folder, hub, monkeypatch):
         monkeypatch.setattr(worker_api_module, "_STACKS_DELAY_S", 0.0)
-        self.run, self.folder, self.events, self.failures = run, folder, [], []
+        self.run, self.folder = run, folder
+        self.events: list[dict[str, Any]] = []
+        self.failures: list[str] = []
         self.jobs = jobs_of(run, "icag")[:3]
         self.scheduler = LeaseScheduler(60.0)
         self.scheduler.open(self.jobs, lambda job: ())
@@ -112,7 +115,8 @@ def test_a_worker_with_another_source_of_the_runs_problem_is_refused(server, tmp
     same = sources(tmp_path / "same", CORRIDOR)
     other, newer = sources(tmp_path / "other", SLIPPERY), sources(tmp_path / "newer", CORRIDOR, "1.1")
     with installed(tmp_path / "learner", {"toy_problem.py": CORRIDOR}):
-        for plugins_there in (same, other, {}):
+        without_plugins = dict[str, Any]()
+        for plugins_there in (same, other, without_plugins):
             server.hello("w0", plugins=plugins_there)  # the run has another problem
         monkeypatch.setattr(server.worker_api, "_run", make_run("toy"))
         server.hello("w0", plugins=same)

@@ -9,7 +9,7 @@ import numpy as np
 from icrl_dist.config.run import Run
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels
-from tests.jobs import collect
+from tests.jobs import collect, in_problem
 from tests.methods.conftest import Collected
 
 
@@ -29,7 +29,7 @@ def test_d0_labels_are_those_of_the_optimal_policy_of_each_variation(small_run: 
 
 def test_sampled_labels_are_single_optimal_actions(small_run: Run) -> None:
     room = dataclasses.replace(small_run.section("darkroom"), labels="sampled")
-    run = dataclasses.replace(dpt(small_run), darkroom=room)  # type: ignore[call-arg]
+    run = in_problem(dpt(small_run), "darkroom", darkroom=room)
     made = collect(run, methods.of(run).phases(run)[0])
     assert made
     for t in made:

@@ -7,19 +7,20 @@ import math
 import pytest
 import torch
 
-from icrl_dist.models.gpt import GPT
+from icrl_dist.models.gpt import GPT, Block
 from tests.models.networks import build
 
 
 def slow_linear(x: list[float], layer: torch.nn.Module) -> list[float]:
-    weight, bias = layer.weight.tolist(), layer.bias.tolist()  # type: ignore[operator, union-attr]
+    assert isinstance(layer, torch.nn.Linear)
+    weight, bias = layer.weight.tolist(), layer.bias.tolist()
     return [sum(w * v for w, v in zip(row, x, strict=True)) + b for row, b in zip(weight, bias, strict=True)]
 
 
-def slow_norm(x: list[float], layer: torch.nn.Module) -> list[float]:
+def slow_norm(x: list[float], layer: torch.nn.LayerNorm) -> list[float]:
     mean = sum(x) / len(x)
     deviation = math.sqrt(sum((v - mean) ** 2 for v in x) / len(x) + 1e-5)
-    weight, bias = layer.weight.tolist(), layer.bias.tolist()  # type: ignore[operator, union-attr]
+    weight, bias = layer.weight.tolist(), layer.bias.tolist()
     return [(v - mean) / deviation * w + b for v, w, b in zip(x, weight, bias, strict=True)]
 
 
@@ -27,6 +28,7 @@ def slow_trunk(trunk: GPT, tokens: list[list[float]], query: list[float]) -> lis
     """The state of a query that sees every context token and itself; context tokens are causal."""
     xs = [*tokens, query]
     for block in trunk.blocks:
+        assert isinstance(block, Block)
         width = len(query)
         projected = [slow_linear(slow_norm(x, block.norm_attention), block.qkv) for x in xs]
         d = width // block.heads

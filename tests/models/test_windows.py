@@ -68,9 +68,8 @@ def test_every_label_has_the_same_weight_in_the_loss():
     prefix, window_prefix = rng.integers(0, T + 1, size=(B, 6)), rng.integers(0, T + 1, size=(B, R))
     queries = rng.integers(0, 5, size=(B, 6, 2)).astype(np.float32)
     s, a, n, r = (column.numpy() for column in whole)
-    batch = TrainingBatch(
-        s, a, n, r, queries, labels, prefix, LabelledWindows(*(c.numpy() for c in of), followed_labels), window_prefix
-    )
+    labelled = LabelledWindows(of.states.numpy(), of.prev_actions.numpy(), of.prev_rewards.numpy(), followed_labels)
+    batch = TrainingBatch(s, a, n, r, queries, labels, prefix, labelled, window_prefix)
     cache, total = model.encode(whole), 0.0
     with torch.no_grad():
         logs = model.decide(torch.tensor(queries), cache, torch.tensor(prefix)).log_softmax(-1).numpy()

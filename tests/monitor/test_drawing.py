@@ -11,6 +11,7 @@ from icrl_dist.problems.dmc import domains, picture
 from icrl_dist.problems.dmc.simulation import DMC
 from icrl_dist.stream import validation
 from icrl_dist.types import Variation
+from tests.optional import known
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_invalid_episodes_are_refused(changes):
 
 def test_the_optimum_is_computed_for_small_valid_rooms_only():
     task, adversary = {"goal": [1, 1], "size": 4, "horizon": 9}, {"kind": "null"}
-    assert drawing.optimum("darkroom", task, adversary) > 0
+    assert known(drawing.optimum("darkroom", task, adversary)) > 0
     for invalid in (
         {"size": 1000},
         {"horizon": 10**9},

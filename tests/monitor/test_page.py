@@ -5,17 +5,33 @@ import contextlib
 import json
 import re
 from importlib import resources
+from typing import Any
 
 import pytest
+from starlette.routing import Route
 
-from icrl_dist.monitor import event_stream, serve
+from icrl_dist.monitor import event_stream
 from icrl_dist.monitor import page as page_module
 from icrl_dist.monitor.page import EVENT, SnapshotPublisher, serving_run
+from icrl_dist.monitor.run_state import RunState
 from icrl_dist.monitor.serve import application, serving
 from tests.monitor.fake_feed import FakeFeed
 from tests.monitor.test_serve import PageClient, wait_for
+from tests.optional import known
 
 ASSETS = resources.files("icrl_dist.monitor") / "assets"
+
+
+class CountingState(RunState):
+    """A run state that records the `since` of every snapshot."""
+
+    def __init__(self, snapshots):
+        super().__init__("demo")
+        self._snapshots = snapshots
+
+    def snapshot(self, now, since=-1):
+        self._snapshots.append(since)
+        return super().snapshot(now, since)
 
 
 class CountingFeed(FakeFeed):
@@ -23,9 +39,8 @@ class CountingFeed(FakeFeed):
 
     def __init__(self):
         super().__init__()
-        self.snapshots = []
-        snapshot = self.state.snapshot
-        self.state.snapshot = lambda now, since=-1: self.snapshots.append(since) or snapshot(now, since)
+        self.snapshots: list[int] = []
+        self.state = CountingState(self.snapshots)
 
     def send_return(self, variation, trial, total):
         variation_info = {"task": {"size": 3, "horizon": 8, "goal": [1, 1]}, "adversary": {"kind": "uniform", "p": 0.5}}
@@ -41,7 +56,8 @@ class View:
     """A viewer that applies the events as docs/monitor.md describes."""
 
     def __init__(self, page):
-        self.viewer, self.state, self.snapshots = page.connect(), None, []
+        self.viewer, self.snapshots = page.connect(), []
+        self.state: dict[str, Any] = {}
 
     def next(self):
         event, snapshot = self.viewer.next()
@@ -66,25 +82,29 @@ def run():
     return CountingFeed()
 
 
+class Page(PageClient):
+    """The page of a feed, which publishes when a test calls ``publish``."""
+
+    def __init__(self, url, publisher, stack):
+        super().__init__(url, publisher.stream, None)
+        self.publish, self._stack = publisher.publish, stack
+
+    def view(self):
+        """A new viewer, which the page knows."""
+        views = self.stream.viewers
+        one = View(self)
+        self._stack.callback(one.close)
+        wait_for(lambda: self.stream.viewers == views + 1)
+        return one
+
+
 @pytest.fixture
 def page(run):
     publisher = SnapshotPublisher(run)
-    routes = [serve.Route("/variation/{task}/{variation}", publisher.variation)]
+    routes = [Route("/variation/{task}/{variation}", publisher.variation)]
     app = application("monitor.html", publisher.stream, publisher.command, routes)
     with contextlib.ExitStack() as stack:
-        url = stack.enter_context(serving(app, publisher.stream, "127.0.0.1", 0))
-        page = PageClient(url, publisher.stream, None)
-        page.publish = publisher.publish
-
-        def view():
-            views = page.stream.viewers
-            one = View(page)
-            stack.callback(one.close)
-            wait_for(lambda: page.stream.viewers == views + 1)
-            return one
-
-        page.view = view
-        yield page
+        yield Page(stack.enter_context(serving(app, publisher.stream, "127.0.0.1", 0)), publisher, stack)
 
 
 def test_a_viewer_receives_a_full_snapshot_and_then_only_changes(run, page):
@@ -170,8 +190,12 @@ def test_a_snapshot_that_fails_is_logged_once_and_the_next_one_is_sent(run, monk
     with serving_run(run, "127.0.0.1", 0) as url:
         view = View(PageClient(url, None, None))
         view.next()
-        full, calls = run.state.snapshot, []
-        broken = lambda now, since=-1: calls.append(since) or {**full(now, since), "time": float("nan")}  # noqa: E731
+        full, calls = run.state.snapshot, list[int]()
+
+        def broken(now, since=-1):
+            calls.append(since)
+            return {**full(now, since), "time": float("nan")}
+
         monkeypatch.setattr(run.state, "snapshot", broken)
         run.send("event", what="note", text="sent in the end")
         run.tick()
@@ -211,7 +235,7 @@ def test_a_viewer_that_fell_behind_restarts_from_a_full_snapshot():
         received.append(await viewer.next())
         put(event_stream.MAX_BEHIND + 3)
         received += [await viewer.next(), await viewer.next()]
-        return [[line[6:] for line in chunk.decode().splitlines() if line.startswith("data: ")] for chunk in received]
+        return [[line[6:] for line in known(chunk).decode().splitlines() if line.startswith("data: ")] for chunk in received]
 
     changes = [f"change {number}" for number in range(event_stream.MAX_BEHIND)]
     # A change may be in the full snapshot and be sent after it later: applying it twice has no effect.

@@ -8,8 +8,8 @@ import pytest
 from icrl_dist.cli.main import main
 from icrl_dist.config.run import dumps, load
 from icrl_dist.monitor import player
+from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.player import Player
-from icrl_dist.monitor.serve import EventStream
 from tests.problems.darkroom.fixed_agent import Agent, game
 
 

@@ -18,11 +18,12 @@ from icrl_dist.storage import files
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream.memory_link import MemoryLink
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry.metrics import Metrics
 from learner import service
+from tests.calls import noting
 from tests.monitor.fake_feed import BEGAN, run_folder
 from tests.monitor.messages import progress
-
-METRICS = service.Metrics
+from tests.optional import known
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def finished(module_run, tmp_path_factory):
         publish(link, key, payload, droppable)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        patch.setattr(service, "Metrics", lambda folder, **options: Metrics(folder, tensorboard=False, **options))
         patch.setattr(MemoryLink, "publish", listen)
         train.prepare(module_run, folder, resume=False, overwrite=False)
         train.train_inline(module_run, folder, lambda event: None)
@@ -99,16 +100,17 @@ def test_speed_pause_and_seek_of_a_recording(finished):
 
     with ReplayFeed(folder, speed=1e4) as feed:
         until(lambda: feed.state.snapshot(0.0)["run"]["state"] == "finished")
-        where, epoch = feed.replay(), feed.state.epoch
+        where, epoch = known(feed.replay()), feed.state.epoch
         assert where["at"] == where["end"] and feed.now() == where["end"]
         feed.control(paused=True)
         feed.control(at=where["begin"])
         until(lambda: feed.state.epoch != epoch)
         until(lambda: feed.state.snapshot(0.0)["run"]["state"] != "finished")
-        assert feed.replay()["at"] == where["begin"] and feed.replay()["paused"]
+        there = known(feed.replay())
+        assert there["at"] == where["begin"] and there["paused"]
         feed.control(speed=1e9, paused=False)
         until(lambda: feed.state.snapshot(0.0)["run"]["state"] == "finished")
-        assert feed.replay()["speed"] == 1e4
+        assert known(feed.replay())["speed"] == 1e4
 
 
 def test_a_crashed_run_with_a_torn_last_line_is_played_to_its_end(finished, tmp_path):
@@ -161,9 +163,12 @@ def test_a_folder_is_live_while_its_learner_holds_its_lock_and_a_recording_after
     if endpoint:
         (folder / "endpoint").write_text("tcp/127.0.0.1:1\n")
     monkeypatch.setattr(ZenohLink, "connect", lambda *_: hub())
-    monkeypatch.setattr(
-        page, "serve", lambda feed, *_: feeds.append((type(feed), feed.state.snapshot(0.0)["run"]["name"])) or 0
-    )
+
+    def serve(feed, *_):
+        feeds.append((type(feed), feed.state.snapshot(0.0)["run"]["name"]))
+        return 0
+
+    monkeypatch.setattr(page, "serve", serve)
     with files.hold(folder) if held else contextlib.nullcontext():
         assert main(["monitor", str(tmp_path / ("latest" if link else "night")), "--web", "0"]) == 0
     ((kind, name),) = feeds
@@ -173,14 +178,14 @@ def test_a_folder_is_live_while_its_learner_holds_its_lock_and_a_recording_after
 
 
 def test_without_a_folder_the_newest_run_with_a_live_learner_is_shown(hub, tmp_path, monkeypatch):
-    found = []
+    found = list[str]()
     for number, name in enumerate(("older", "crashed")):
         folder = run_folder(tmp_path / "runs" / name)
         (folder / "endpoint").write_text(f"tcp/127.0.0.1:{number}\n")
         os.utime(folder / "endpoint", (1000.0 + number, 1000.0 + number))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(ZenohLink, "connect", lambda endpoint, *_: found.append(endpoint) or hub())
-    monkeypatch.setattr(page, "serve", lambda feed, *_: found.append(run_name(feed.state)) or 0)
+    monkeypatch.setattr(ZenohLink, "connect", noting(found, lambda endpoint, *_: endpoint, lambda *_: hub()))
+    monkeypatch.setattr(page, "serve", noting(found, lambda feed, *_: run_name(feed.state), lambda *_: 0))
     with files.hold(tmp_path / "runs" / "older"):
         assert main(["monitor", "--web", "0"]) == 0
     assert main(["monitor", "--web", "0"]) == 0

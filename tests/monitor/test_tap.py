@@ -21,7 +21,8 @@ from tests.monitor.messages import progress, trajectory
 
 class Out(io.TextIOWrapper):
     def __init__(self):
-        super().__init__(io.BytesIO(), "utf-8", write_through=True)
+        self.bytes = io.BytesIO()
+        super().__init__(self.bytes, "utf-8", write_through=True)
 
 
 def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0):
@@ -39,7 +40,7 @@ def tapped(monkeypatch, tasks=(), adversaries=(), every=1, form="json", count=0)
     broken = [{"identity": "x"}, {"identity": "adapt/0/0/0", "trials": [1], "returns": [], "steps": []}, 7]
     for invalid in (progress(), b"garbage", *(wire.encode_message("trajectories", variations=[one]) for one in broken)):
         tap("key", invalid)
-    return out.buffer.getvalue(), len(ended)
+    return out.bytes.getvalue(), len(ended)
 
 
 def identities(written):
@@ -83,7 +84,7 @@ def test_a_field_that_json_cannot_represent_loses_no_trajectory(monkeypatch, for
         {"identity": "adapt/0/0/1", "adversary": {}, **columns},
     ]
     TapWriter((), (), 1, form, 0, lambda: None)("key", wire.encode_message("trajectories", worker="w0", variations=entries))
-    written = out.buffer.getvalue()
+    written = out.bytes.getvalue()
     found = [*msgpack.Unpacker(io.BytesIO(written))] if form == "msgpack" else [*map(json.loads, written.decode().splitlines())]
     assert [one["identity"] for one in found] == ["adapt/0/0/0/0", "adapt/0/0/1/0"]
     assert found[0]["adversary"]["more"] == ("ff01" if form == "json" else b"\xff\x01")

@@ -47,7 +47,7 @@ MESSAGES = {
 }
 
 
-INVALID_VALUES = [
+INVALID_VALUES: list[object] = [
     None,
     -1,
     2**70,

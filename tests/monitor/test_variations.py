@@ -9,6 +9,7 @@ from icrl_dist.monitor import variations
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from tests.monitor.messages import DIRICHLET, ROOM, event, send, send_trajectories, trajectory
+from tests.optional import known
 
 
 def test_a_variation_row_has_adversary_returns_by_trial_and_exact_optimum():
@@ -29,7 +30,7 @@ def test_every_round_has_its_own_adversary_and_optimum_and_phases_are_in_order()
     rounds = {f"adapt/{n}": DIRICHLET.replace(p=p) for n, p in ((1, 0.6), (0, 0.1))}  # an earlier round may arrive later
     for name, adversary in rounds.items():
         send_trajectories(state, trajectory(f"{name}/3/1/0", adversary=adversary))
-    row = state.variation("3/1")
+    row = known(state.variation("3/1"))
     assert (row["optimum"], [phase["optimum"] for phase in row["phases"]]) == (None, [None, None]), "not computed yet"
     state.tick(1.0)
     (row,) = state.snapshot(1.0)["variations"]
@@ -40,7 +41,7 @@ def test_every_round_has_its_own_adversary_and_optimum_and_phases_are_in_order()
         assert phase["adversary"]["p"] == dict(rounds[phase["name"]].params)["p"]
     assert (row["optimum"], row["adversary"]["p"]) == (pytest.approx(best["adapt/1"]), 0.6)
     send_trajectories(state, trajectory("adapt/2/3/1/0", adversary=DIRICHLET))
-    row = state.variation("3/1")
+    row = known(state.variation("3/1"))
     assert (row["optimum"], row["adversary"]["p"]) == (None, 0.2), "not the optimum of the round before"
 
 
@@ -56,10 +57,11 @@ def test_a_quarantine_belongs_to_its_phase_and_needs_no_episode():
     assert {name: row["quarantine"] for name, row in rows.items()} == {"3/1": "it crashes", "4/0": "stuck", "5/0": ""}
     assert rows["3/1"]["phases"][0]["returns"] == [] and rows["3/1"]["adversary"] == {}
     send_trajectories(state, trajectory("adapt/0/3/1/0"))
-    assert state.variation("3/1")["adversary"]["kind"] == "dirichlet" and state.variation("3/1")["quarantine"]
+    row = known(state.variation("3/1"))
+    assert row["adversary"]["kind"] == "dirichlet" and row["quarantine"]
     for name in ("3/1", "4/0"):
         send_trajectories(state, trajectory(f"adapt/2/{name}/0"))
-        assert state.variation(name)["quarantine"] == "", "a new round has another adversary"
+        assert known(state.variation(name))["quarantine"] == "", "a new round has another adversary"
 
 
 def test_with_random_starts_the_optimum_is_the_mean_over_cells():
@@ -76,7 +78,7 @@ def test_with_random_starts_the_optimum_is_the_mean_over_cells():
 def test_the_detail_of_a_variation_has_its_lineage_and_newest_episode():
     state = RunState("demo")
     send_trajectories(state, trajectory("adapt/0/3/1/0"), trajectory("adapt/0/3/1/1", total=3.0, worker="w1"), now=5.0)
-    found = state.variation("3/1")
+    found = known(state.variation("3/1"))
     assert [line["identity"] for line in found["lineage"]] == ["adapt/0/3/1/0", "adapt/0/3/1/1"]
     expected = {"episode_return": 3.0, "policy_version": 0, "weights_digest": "d" * 64, "worker": "w1", "time": 5.0}
     assert found["lineage"][-1] == {"identity": "adapt/0/3/1/1", **expected}

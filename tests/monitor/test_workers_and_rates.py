@@ -1,5 +1,7 @@
 """States of workers, rates, and estimates of the remaining time."""
 
+from typing import Any
+
 import pytest
 
 from icrl_dist.monitor import workers
@@ -58,12 +60,13 @@ def test_a_restarted_worker_takes_the_row_of_its_predecessor():
 def test_the_lag_of_a_worker_is_that_of_the_weights_in_its_job():
     state = RunState("demo")
     send(state, "learner", progress(version=3))
-    for worker, fields in {
+    jobs: dict[str, dict[str, Any]] = {
         "w0": {"policy_version": 1},
         "w1": {"policy_version": 3},
         "w2": {"policy_version": -1},
         "w3": {"policy_version": 1, "job": ""},
-    }.items():
+    }
+    for worker, fields in jobs.items():
         send(state, f"worker/{worker}", heartbeat(worker, **fields))
     assert [row["lag"] for row in state.snapshot(0.0)["workers"]] == [2, 0, 0, 0]
 

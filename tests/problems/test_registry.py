@@ -13,10 +13,11 @@ from icrl_dist.problems.continuous.problem import ContinuousProblem
 from icrl_dist.problems.dmc import domains
 from icrl_dist.problems.metaworld.environment import ml1_tasks
 from icrl_dist.types import NULL, Split, Variation
+from tests.jobs import in_problem
 
 
 def with_room(run: Run, **values: object) -> Run:
-    return dataclasses.replace(run, darkroom=dataclasses.replace(run.section("darkroom"), **values))
+    return in_problem(run, "darkroom", darkroom=dataclasses.replace(run.section("darkroom"), **values))
 
 
 def split(run: Run) -> Split:
@@ -41,7 +42,7 @@ def test_split_is_computed_once_and_follows_its_own_seed_alone(small_run: Run) -
     held_out = [frozenset(split(with_room(big, split_seed=seed)).test) for seed in range(5)]
     assert len(set(held_out)) == 5
     # Shuffled, not the last rows of the room.
-    assert {t["goal"][0] for t in held_out[0]} != {8, 9}  # type: ignore[index]
+    assert {t.vector("goal")[0] for t in held_out[0]} != {8, 9}
 
 
 def test_train_fraction_decides_the_cut(small_run: Run) -> None:

@@ -1,11 +1,15 @@
 """The corridor of ``tests/toys`` and variants of it: what a problem of another package may lack or do otherwise."""
 
+from typing import Any
+
 import pytest
 import torch
 
 from icrl_dist.agent import ood_score
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.collect import kinds
+from icrl_dist.collect.adapt import LabelledRollouts
+from icrl_dist.collect.behavior import BehaviorContexts
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from tests.jobs import NoWeights
@@ -44,9 +48,13 @@ def test_the_ood_score_is_calibrated_in_environments_of_the_runs_own_section(toy
 )
 def test_the_labelling_of_a_payload_is_decoded_strictly(toy_run, labelling, message):
     problem = registry.of(toy_run())
-    rest = {"behavior_context": {"behaviors": ["random"]}, "adapt_labelled": {"context_max": 9, "deploy": "paper"}}
+    rest: dict[str, dict[str, Any]] = {
+        "behavior_context": {"behaviors": ["random"]},
+        "adapt_labelled": {"context_max": 9, "deploy": "paper"},
+    }
     for kind, fields in rest.items():
-        assert kinds.read_payload(kind, problem, {**fields, "labelling": {"cells": 5}}).labelling == CorridorConfig(cells=5)
+        payload = kinds.read_payload(kind, problem, {**fields, "labelling": {"cells": 5}})
+        assert isinstance(payload, BehaviorContexts | LabelledRollouts) and payload.labelling == CorridorConfig(cells=5)
         with pytest.raises(ValueError, match=message):
             kinds.read_payload(kind, problem, {**fields, "labelling": labelling})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def block(returns: Any, agent: str = "t0", p: float = 0.0, seed: int = 0, **othe
     }
 
 
-def frame(*blocks: dict[str, Any], suite: str = "online") -> Any:
+def frame(*blocks: Mapping[str, Any], suite: str = "online") -> Any:
     """The blocks, written to a file and read again."""
     with tempfile.TemporaryDirectory() as folder:
         return rows.read([rows.append(Path(folder), suite, {}, blocks)])

@@ -32,6 +32,7 @@ from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_fi
 from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Variation
 from learner import checkpoints
+from tests.optional import known
 from tests.results.row_blocks import block, frame
 
 
@@ -56,6 +57,7 @@ def test_the_oracle_reaches_the_exact_optimum_and_other_agents_stay_below_it(sma
         assert result.ceiling == (result.agent == Agent(ORACLE))
         assert result.returns.shape == (len(registry.of(run).split.test), 60, 3)
         error = result.returns.mean(axis=(0, 2)).std() / np.sqrt(60)
+        assert result.optimum is not None
         if result.agent.key == ORACLE:
             assert abs(result.returns.mean() - result.optimum.mean()) < 4 * error + 0.05
         else:
@@ -128,7 +130,7 @@ def test_offline_rows_have_random_and_expert_data(small_run, untrained):
     for names, source in ((named[:count], "random data"), (named[count : 2 * count], "expert data")):
         assert names == [source, *(f"{agent}, {source}" for agent in agents)]
     expert = next(r for r in rows if r.agent.key == ORACLE and r.p == 0)
-    np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), expert.optimum)
+    np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), known(expert.optimum))
     informed = next(r for r in rows if (r.agent.key, r.data, r.p) == (KEYS["paper"], "expert", 0))
     np.testing.assert_array_equal(informed.returns, expert.returns)
 
@@ -150,7 +152,8 @@ def test_exact_agents_find_the_goal_and_know_the_adversary_of_their_row(small_ru
     labels = [soft_labels(h, run.section("darkroom").gamma, run.section("darkroom").label_slack) for h in families]
     assert not np.array_equal(labels[0], labels[1])
     own = ExactAgent(families, labels, np.arange(2), "every step")
-    made = registry.of(run).exact.agent(run, "every step")(rows, registry.batch(rows))
+    made = known(registry.of(run).exact).agent(run, "every step")(rows, registry.batch(rows))
+    assert isinstance(made, ExactAgent)
     for cell in range(9):
         observation = np.array([divmod(cell, 3)] * 2, np.float32)
         np.testing.assert_array_equal(made.probabilities(observation), own.probabilities(observation))
@@ -208,7 +211,7 @@ def test_a_missing_or_damaged_checkpoint_is_refused_in_one_line(tmp_path):
 
 def test_a_result_has_the_exact_optimum_of_its_variations(small_run):
     (result, *_) = evaluate.online(small_run, {Agent("random"): references(small_run)["random"]})
-    np.testing.assert_allclose(result.optimum, optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
+    np.testing.assert_allclose(known(result.optimum), optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
 
 
 @pytest.fixture
@@ -249,7 +252,7 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
 
 
 def test_evaluations_add_rows_and_replace_no_report_of_other_settings(folder, capsys):
-    reports = {}
+    reports = dict[Path, bytes]()
     for words in (["--p", "0", "0.2"], ["--p", "0.2"], ["--p", "0.2", "--seeds", "1"], ["--suite", "offline"]):
         assert main.main(["evaluate", str(folder), "--episodes", "2", *words]) == 0
         for name, content in reports.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -54,6 +55,7 @@ def test_the_rows_of_an_evaluation_are_its_returns(small_run, tmp_path):
     key = ["agent", "p", "task_index", "evaluation_seed", "episode"]
     by_key = {tuple(row[name] for name in key): row for row in frame.to_dict("records")}
     for one in found:
+        assert one.optimum is not None
         for (task, seed, episode), value in np.ndenumerate(one.returns):
             row, variation = by_key[one.agent.key, one.p, task, seed, episode], one.variations[task]
             assert row["return"] == value and row["optimum"] == one.optimum[task]
@@ -110,7 +112,7 @@ def test_the_rows_of_several_runs_are_read_together(folder, tmp_path):
     assert frame.groupby("training_seed").size().to_dict() == {0: 24, 1: 12}
 
 
-def rewritten(folder: Path, change) -> None:
+def rewritten(folder: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     """Replace the folder's file by a changed table, as another version or another program would write it."""
     (file,) = (folder / "results").iterdir()
     table = change(pq.read_table(file))

@@ -65,8 +65,10 @@ def test_each_statistic_equals_a_loop_for_every_element_of_a_batch(shape):
     x, y = rng.integers(0, 9, size=(2, 6, *shape)).astype(float)
     for fast, slow in ((statistics.mean, slow_mean), (statistics.iqm, slow_iqm), (statistics.minimum, slow_minimum)):
         np.testing.assert_allclose(fast(x), [slow(one) for one in x.tolist()])
-    for fast, slow in ((statistics.probability_of_improvement, slow_improvement), (statistics.ratio, slow_ratio)):
-        np.testing.assert_allclose(fast(x, y), [slow(*pair) for pair in zip(x.tolist(), y.tolist(), strict=True)])
+    pairs = list(zip(x.tolist(), y.tolist(), strict=True))
+    improvement, ratio = statistics.probability_of_improvement(x, y), statistics.ratio(x, y)
+    np.testing.assert_allclose(improvement, [slow_improvement(*pair) for pair in pairs])
+    np.testing.assert_allclose(ratio, [slow_ratio(*pair) for pair in pairs])
 
 
 def test_a_ratio_to_nothing_is_not_a_number():

@@ -3,6 +3,7 @@
 import inspect
 import io
 import json
+from typing import Any
 
 import pytest
 import torch
@@ -34,7 +35,7 @@ def test_an_evaluation_from_python_is_that_of_the_command(folder, suite, monkeyp
 
 
 def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(folder, capsys):
-    events = []
+    events: list[dict[str, Any]] = []
     (folder / "run.toml").touch()
     icrl_dist.evaluate(folder, episodes=1, seeds=1, p=[0.0], progress=events.append)
     assert "this run is not finished" in events[0]["text"] and events[-1]["step"] == events[-1]["steps"]

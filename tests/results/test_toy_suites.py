@@ -14,7 +14,7 @@ from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_file
-from icrl_dist.types import Split, Step
+from icrl_dist.types import Step
 from learner import checkpoints
 from tests.toys.corridor import Corridor, CorridorProblem
 
@@ -142,13 +142,3 @@ def test_the_posterior_suite_is_refused_without_the_parts_that_it_needs(suite, i
     code, answer, line = suite("posterior", corridor(**parts), method)
     assert code == 2 and answer is None and len(line.splitlines()) == 1
     assert f"--suite posterior: {reason}" in line and line.rstrip().endswith("use --suite online")
-
-
-@pytest.mark.parametrize("name", ["online", "offline"])
-def test_a_problem_without_held_out_tasks_is_refused(suite, name):
-    def all_for_training(self):
-        split = CorridorProblem.make_split(self)
-        return Split(split.train + split.test, ())
-
-    code, _, line = suite(name, corridor(make_split=all_for_training))
-    assert code == 2 and f"--suite {name}: toy-corridor has no tasks to evaluate on: change [corridor]" in line

@@ -1,6 +1,7 @@
 """The committed deployment (zeta of eq. 6) against a slow loop."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,10 +42,10 @@ def outputs_of(model, history, zeta, state):
 
 def slow(model, variation, row, trials, most):
     """The committed deployment in one environment, one step at a time."""
-    env, kept, acted = registry.batch([variation]), [], []
+    env, kept, acted = registry.batch([variation]), list[list[Any]](), []
     for trial in range(trials):
         rng = np.random.default_rng((trial, row))
-        state, u, this = env.reset([rng])[0], rng.random(HORIZON), []
+        state, u, this = env.reset([rng])[0], rng.random(HORIZON), list[Any]()
         for h in range(HORIZON):
             zeta = [(s, a, r) for s, a, _, r in this][-(LENGTH - 1) :]
             p = outputs_of(model, [*itertools.chain(*kept), *this], zeta, state)

@@ -1,5 +1,7 @@
 """Algorithm 1 against a slow loop, and when transitions enter the context."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -54,7 +56,7 @@ def logits_of(model, history, state):
 def algorithm_1(model, variation, row, trials, keep, most):
     """Lines 9 to 17 in one environment, step by step; ``keep`` and ``most`` as in the section ``[context]``."""
     env = registry.batch([variation])
-    kept, returns = [], []
+    kept, returns = list[list[Any]](), []
     for trial in range(trials):
         rng = np.random.default_rng((trial, row))
         state = env.reset([rng])[0]
@@ -87,7 +89,7 @@ def test_online_deployment_equals_algorithm_1(model, variations, keep, most):
 
 def test_a_kept_cache_equals_a_fresh_one_also_after_an_episode_was_dropped(model, variations):
     policy = InContextPolicy(model, 3, ContextConfig(max=2 * HORIZON))
-    history = [[] for _ in variations]
+    history: list[list[Any]] = [[] for _ in variations]
     for n in range(4):
         ran = episode(registry.batch(variations), policy, rngs(n))
         for row in range(3):

@@ -58,13 +58,15 @@ def examples(goal, rng, episodes):
     walks, states = [], rng.uniform(-1, 1, size=(64, 2)).astype(np.float32)
     for _ in range(episodes):
         env = Valley([goal])
-        observations, actions, rewards = [env.reset(None)], [], []
+        observations, actions, rewards = [env.reset(None)], list[np.ndarray](), []
         while len(actions) < 12:
             if len(actions) % 4 == 0:
                 leads = rng.integers(0, 4, size=1)
             way = np.clip(Valley.optimal(observations[-1], leads) + rng.normal(size=(1, 2)) / 5, -1, 1).astype(np.float32)
             step = env.step(way)
-            observations.append(step.observation), actions.append(way), rewards.append(step.reward)
+            observations.append(step.observation)
+            actions.append(way)
+            rewards.append(step.reward)
         walks.append([np.concatenate(column) for column in (observations, actions, rewards)])
     at = rng.uniform(-1, 1, size=(32, 2)).astype(np.float32)
     guess = np.where(rng.random(32) < 0.3, rng.integers(0, 4, size=32), goal)
@@ -76,8 +78,8 @@ def examples(goal, rng, episodes):
     of = batches.LabelledWindows(
         along[:, :-1], Valley.optimal(along[:, :-1], guess[:, None]), near, Valley.optimal(along[:, :-1], np.array(goal))
     )
-    observations, actions, rewards = (np.stack(column) for column in zip(*walks, strict=True))
-    return Examples(actions, observations, rewards, states, Valley.optimal(states, np.array(goal)), False, of)
+    seen, acted, paid = (np.stack(column) for column in zip(*walks, strict=True))
+    return Examples(acted, seen, paid, states, Valley.optimal(states, np.array(goal)), False, of)
 
 
 def test_the_same_code_learns_and_deploys_vector_actions():

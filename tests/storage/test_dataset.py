@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import os
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -309,7 +310,7 @@ def test_a_dataset_of_another_format_is_refused_in_one_line_and_not_repaired(
 def test_whoever_changes_the_digest_of_a_trajectory_raises_the_numbers_of_segments_and_messages():
     """A reader of the former numbers would give the same bytes another digest, so these three change together."""
     t = examples.trajectory()
-    zeros = {name: np.zeros_like(array) for name, array in t.arrays().items()}
+    zeros: dict[str, Any] = {name: np.zeros_like(array) for name, array in t.arrays().items()}
     digest = wire.trajectory_digest(dataclasses.replace(t, **zeros))
     assert (FORMAT, wire.VERSION, digest[:16]) == (2, 2, "c8a38d1bb2bebbc2")
 

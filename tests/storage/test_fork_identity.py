@@ -109,7 +109,9 @@ def test_a_fork_has_the_problem_of_its_parent(parent: Run, problem: str) -> None
         return
     run = make_run(problem, method=parent.method)
     if hasattr(run, "control"):
-        run = dataclasses.replace(run, control=SMALL)  # the problem's name is the only difference within DeepMind Control
+        run = make_run(
+            problem, method=parent.method, control=SMALL
+        )  # the problem's name is the only difference within DeepMind Control
     with pytest.raises(ConfigError) as caught:
         _check_same(parent, run, "--from parent@0")
     assert str(caught.value) == f"--from parent@0: problem = {problem!r} (parent: {parent.problem!r}){REMEDY}"

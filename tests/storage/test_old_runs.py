@@ -21,11 +21,11 @@ from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_fo
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream.validation import VERSION
+from icrl_dist.telemetry.metrics import Metrics
 from learner import checkpoints, service
 
 OLD = Path(__file__).parents[1] / "config" / "written_by_0_1_0"
 TEXT = (OLD / "icag.toml").read_text()
-METRICS = service.Metrics
 
 
 def rewrite(path: Path, change: Callable[[dict[str, np.ndarray], dict[str, Any]], None]) -> None:
@@ -42,6 +42,9 @@ def as_before(arrays: dict[str, np.ndarray], manifest: dict[str, Any]) -> None:
         arrays[name.replace("optimizer/", "optimiser/")] = arrays.pop(name)
     manifest["run"] = TEXT
     manifest["stretch"] = manifest.pop("window")
+    made_by = manifest.pop("made_by")
+    manifest["threads"] = made_by["threads"]
+    manifest["versions"] = {"icrl-dist": "0.1.0", **{name: made_by["libraries"][name] for name in ("numpy", "torch")}}
     if "next_version" in manifest:
         manifest["produces"] = manifest.pop("next_version")
 
@@ -52,7 +55,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     folder = tmp_path_factory.mktemp("runs") / "old"
     run = parse_written(TEXT, "x")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service, "Metrics", lambda folder, **options: METRICS(folder, tensorboard=False, **options))
+        patch.setattr(service, "Metrics", lambda folder, **options: Metrics(folder, tensorboard=False, **options))
         train.prepare(run, folder, resume=False, overwrite=False)
         result = train.train_inline(run, folder, lambda event: None)
     (folder / "run.toml").write_text(TEXT)

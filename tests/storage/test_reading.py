@@ -41,9 +41,13 @@ def data(trajectories, tmp_path):
 def test_iteration_gives_every_trajectory_in_canonical_order(data, trajectories, monkeypatch):
     assert len(data) == len(trajectories) and list(data.identities()) == [t.identity for t in trajectories]
     assert [wire.trajectory_digest(t) for t in data] == [wire.trajectory_digest(t) for t in trajectories]
-    read = []
-    real = data._store.read
-    monkeypatch.setattr(data._store, "read", lambda identity: read.append(identity) or real(identity))
+    read, real = [], data._store.read
+
+    def recorded(identity):
+        read.append(identity)
+        return real(identity)
+
+    monkeypatch.setattr(data._store, "read", recorded)
     next(iter(data))
     assert read == [trajectories[0].identity], "one at a time"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -44,13 +45,13 @@ def vectors(steps: int = 5, queries: int = 3) -> Trajectory:
     """A trajectory with actions of four components and an adversary of three."""
     rng = np.random.default_rng(steps)
     shapes = {"actions": (steps, 4), "adversary": (steps, 3), "prev_actions": (queries // 2, 4), "labels": (queries, 4)}
-    arrays = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
+    arrays: dict[str, Any] = {name: rng.uniform(-1, 1, shape).astype(np.float32) for name, shape in shapes.items()}
     return dataclasses.replace(trajectory(steps, queries), origin="expert", **arrays)
 
 
 def weights() -> Weights:
     rng = np.random.default_rng(0)
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "embed.weight": rng.normal(size=(4, 3)).astype(np.float32),
         "scale": np.array(2.0, np.float64),
         "half": np.ones((2, 1, 2), np.float16),

@@ -15,6 +15,9 @@ class RecordedQuery:
     def reply(self, payload):
         self.answers.append(payload)
 
+    def refuse(self, reason):
+        raise AssertionError(f"the request was refused: {reason}")
+
 
 def test_items_are_split_and_their_answers_come_back_in_order():
     items = [b"one", b"", b"\xc1" * 1000]

@@ -52,7 +52,7 @@ def test_the_stages_of_the_annotation_are_those_of_the_types() -> None:
 @pytest.mark.parametrize("kind", VALID)
 def test_a_request_is_decoded_from_what_the_wire_carries(kind: str) -> None:
     found_kind, fields = wire.decode_message(wire.encode_message(kind, **VALID[kind]))
-    request = read(messages.REQUESTS[kind], fields, found_kind)
+    request: Any = read(messages.REQUESTS[kind], fields, found_kind)
     assert as_data(request) | VALID[kind] == as_data(request)
 
 

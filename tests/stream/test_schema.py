@@ -144,12 +144,13 @@ def test_check_repeats_the_ranges_on_an_existing_instance() -> None:
     valid = Outer(seed=1)
     check(valid)
     check(dataclasses.replace(valid, share=0, p=(1,)))
-    for change, message in [
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"seed": -1}, "run.seed = -1: must be at least 0"),
         ({"inner": Inner(size=0)}, "run.inner.size = 0: a room has"),
         ({"p": ()}, "run.p = (): must have a length of at least 1"),
         ({"share": "a"}, "run.share = 'a': expected float, got str"),
-    ]:
+    ]
+    for change, message in cases:
         with pytest.raises(Invalid, match=re.escape(message)):
             check(dataclasses.replace(valid, **change), "run")
 

@@ -4,13 +4,14 @@ import json
 import os
 import stat
 import subprocess
+from pathlib import Path
 
 import pytest
 import zenoh
 
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.launch.train import check_security
-from icrl_dist.stream import security, zenoh_link
+from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
@@ -116,7 +117,7 @@ def configured(made, monkeypatch):
                 ZenohLink.connect("tls/HOST:7447", 1.0, security.client(made, role))
         return caught.value.args[0]
 
-    monkeypatch.setattr(zenoh_link.zenoh, "open", capture)
+    monkeypatch.setattr(zenoh, "open", capture)
     return configuration
 
 
@@ -179,7 +180,7 @@ def test_a_cluster_of_several_nodes_needs_rays_token(made, tmp_path, monkeypatch
 def test_certificates_are_checked_before_anything_starts(made, tmp_path):
     (tmp_path / "half").mkdir()
     for name in ("ca.pem", "learner.pem", "learner.key"):
-        (tmp_path / "half" / name).write_bytes((certificates.Path(made) / name).read_bytes())
+        (tmp_path / "half" / name).write_bytes((Path(made) / name).read_bytes())
     run = on_another_node(certificates=str(tmp_path / "half"))
     with pytest.raises(LinkError, match=r"half/worker\.pem: cannot be read"):
         check_security(run, None)

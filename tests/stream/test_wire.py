@@ -71,7 +71,7 @@ def test_decoded_weights_equal_the_encoded_ones() -> None:
     sent = weights()
     got = wire.decode_weights(wire.encode_weights(sent), LIMIT)
     assert (got.version, got.digest) == (sent.version, sent.digest)
-    assert wire.weights_digest(dict(reversed(got.arrays.items()))) == sent.digest
+    assert wire.weights_digest(dict(reversed(list(got.arrays.items())))) == sent.digest
     for name, array in sent.arrays.items():
         assert got.arrays[name].dtype == array.dtype and np.array_equal(got.arrays[name], array)
 
@@ -85,7 +85,16 @@ def test_a_decoded_job_equals_the_encoded_one_with_its_types() -> None:
 
 
 def test_a_decoded_message_equals_the_encoded_one() -> None:
-    fields = {"a": None, "b": True, "c": -(2**63), "d": 1.5, "e": "é", "f": b"\xff", "g": [1, [2.0, {"h": []}]], "i": {}}
+    fields: dict[str, Any] = {
+        "a": None,
+        "b": True,
+        "c": -(2**63),
+        "d": 1.5,
+        "e": "é",
+        "f": b"\xff",
+        "g": [1, [2.0, {"h": []}]],
+        "i": {},
+    }
     assert wire.decode_message(wire.encode_message("hello", **fields)) == ("hello", fields)
 
 

@@ -1,7 +1,6 @@
 """A problem and a method of another package, 60 lines each: all that a newcomer would write."""
 
 import contextlib
-import functools
 from importlib import metadata
 from types import SimpleNamespace
 
@@ -28,8 +27,6 @@ def installed(patch, **groups):
 
     with patch.context() as during:
         during.setattr(plugins, "_entries", with_toys)
-        # With a cache of its own: runs of other tests must stay equal to what is read from their files.
-        during.setattr(run, "run_type", functools.cache(run.run_type.__wrapped__))
         for cache in caches:
             cache.cache_clear()
         yield

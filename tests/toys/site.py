@@ -15,7 +15,7 @@ CORRIDOR = (Path(__file__).parent / "corridor.py").read_text()
 """Source of a problem."""
 SLIPPERY = CORRIDOR.replace("slipped = self.noise[self.h] < self.slip", "slipped = self.noise[self.h] < 2 * self.slip")
 """Another source of it, in which environments differ."""
-_CACHES = (version.digest_of, plugins._entries, plugins.find, plugins.sections, plugins.sources, run.run_type, run._packaged)
+_CACHES = (version.digest_of, plugins._entries, plugins.find, plugins.sections, plugins.sources, run._packaged)
 
 
 @contextlib.contextmanager

@@ -156,7 +156,7 @@ def trajectory(trial: int) -> Trajectory:
 def test_examples_keep_the_episodes_order() -> None:
     made = Examples.of([trajectory(n) for n in (2, 0, 1)], np.ones((2, 2), np.float32), np.ones((2, ACTIONS), np.float32), True)
     assert made.actions[:, 0].tolist() == made.rewards[:, 0].tolist() == made.observations[:, 0, 0].tolist() == [2, 0, 1]
-    assert (made.actions.dtype, made.history) == (np.int64, True)
+    assert made.actions.dtype == np.int64 and made.history is True
 
 
 def test_examples_need_an_episode_and_a_label() -> None:

@@ -14,6 +14,7 @@ from icrl_dist.training import batches
 from icrl_dist.training.batches import Examples, Pool
 from tests.jobs import FixedWeights, do
 from tests.models.windowed import HORIZON, LENGTH
+from tests.optional import known
 
 
 @pytest.fixture
@@ -101,6 +102,7 @@ def test_training_draws_windows_of_the_contexts_variation():
     chosen, prefixes = set(), set()
     for _ in range(30):
         batch = batches.draw(rng, [pool], 8, 2, windows=3)
+        assert batch.windows is not None and batch.window_prefix is not None
         assert batch.windows.states.shape == (8, 3, LENGTH, 2)
         for row in range(8):
             mark = batch.actions[row, 0]
@@ -120,7 +122,7 @@ def test_own_trials_are_cut_into_windows_that_do_not_cross_episodes(run):
     job = method.ask(run, method.phases(run)[1])[0]
     assert isinstance(job.payload, Rollouts) and job.payload.deploy == "committed"
     made = [t for t in do(run, job, weights) if t.identity[2:4] == (job.task, 0)]
-    of = self_labelled(run, made).windows
+    of = known(known(self_labelled(run, made)).windows)
     later = made[run.icaa.context_trials + 1 :]
     expected = [(t, h) for t in later for h in range(0, run.section("darkroom").horizon // LENGTH * LENGTH, LENGTH)]
     assert len(of.states) == len(expected)

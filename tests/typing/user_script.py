@@ -70,7 +70,7 @@ def act() -> float:
     obs, _ = env.reset(seed=0)
     (action,) = agent.act([obs])
     following, reward, _, done, _ = env.step(action)
-    agent.observe([obs], [action], [reward], [following], [done])
+    agent.observe([obs], [action], [float(reward)], [following], [done])
     return float(np.asarray(agent.surprise)[0])
 
 

@@ -104,12 +104,27 @@ export function listen(handlers, status) {
   return source;
 }
 
+const ANSWER_MS = 15000;
+let waiting = []; // commands that have not been sent
 let answered = Promise.resolve();
 
-/** Send a command after the answer to the one before it, so that they arrive in order; resolves to "" or to the error, one line. */
-export function command(fields) {
-  answered = answered.then(() => post(fields));
-  return answered;
+/**
+ * Send a command after the answer to the one before it, so that they arrive in order; resolves to "" or to the error, one line.
+ * With `replaces`, it takes the place of the last waiting command if that does the same: a slider sends many.
+ */
+export function command(fields, replaces = false) {
+  const last = waiting.at(-1);
+  if (replaces && last?.fields.do === fields.do) {
+    last.fields = fields;
+    return last.result;
+  }
+  const one = { fields };
+  waiting.push(one);
+  one.result = answered = answered.then(() => {
+    waiting = waiting.filter((other) => other !== one);
+    return post(one.fields);
+  });
+  return one.result;
 }
 
 async function post(fields) {
@@ -118,6 +133,7 @@ async function post(fields) {
       method: "POST",
       headers: { "content-type": "application/json" },
       body: JSON.stringify(fields),
+      signal: AbortSignal.timeout(ANSWER_MS),
     });
     if (answer.ok) return "";
     const text = await answer.text();

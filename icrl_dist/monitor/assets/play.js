@@ -9,8 +9,8 @@ let room = null;
 let belief = null;
 let episodes = null;
 
-async function send(fields) {
-  $("error").textContent = await command(fields);
+async function send(fields, replaces = false) {
+  $("error").textContent = await command(fields, replaces);
 }
 
 // The room and the controls.
@@ -109,8 +109,8 @@ $("pause").addEventListener("click", () => send({ do: "pause", value: !room?.pau
 $("one").addEventListener("click", () => send({ do: "step" }));
 $("through").addEventListener("click", () => send({ do: "episode" }));
 $("new").addEventListener("click", () => send({ do: "new" }));
-$("speed").addEventListener("input", () => send({ do: "speed", value: Math.min(FASTEST, Number(toSpeed($("speed").value).toFixed(2))) }));
-$("p").addEventListener("input", () => send({ do: "p", value: Number($("p").value) }));
+$("speed").addEventListener("input", () => send({ do: "speed", value: Math.min(FASTEST, Number(toSpeed($("speed").value).toFixed(2))) }, true));
+$("p").addEventListener("input", () => send({ do: "p", value: Number($("p").value) }, true));
 $("distribution").addEventListener("change", ({ target }) =>
   send({ do: "distribution", value: target.value === "" ? null : Number(target.value) }),
 );
@@ -132,7 +132,7 @@ function hold(action) {
   clearInterval(renewal);
   renewal = null;
   send({ do: "hold", value: action });
-  if (action !== null) renewal = setInterval(() => send({ do: "hold", value: action }), 500);
+  if (action !== null) renewal = setInterval(() => send({ do: "hold", value: action }, true), 500);
 }
 
 const release = () => {

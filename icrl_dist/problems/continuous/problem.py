@@ -49,6 +49,10 @@ class ContinuousProblem(Problem):
     def train_count(self) -> int:
         return self.config.train_tasks
 
+    @property
+    def evaluated_count(self) -> int:
+        return self.config.test_tasks
+
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
         return networks(rng, config.count, self.spec, self.disturbances, self.strength)
 

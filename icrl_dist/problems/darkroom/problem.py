@@ -107,6 +107,10 @@ class DarkRoomProblem(Problem):
     def train_count(self) -> int:
         return round(self.config.train_fraction * self.config.size**2)
 
+    @property
+    def evaluated_count(self) -> int:
+        return self.config.size**2 - self.train_count
+
     def make_split(self) -> Split:
         """All goals, shuffled with ``split_seed``; the first ``train_fraction`` of them are training tasks."""
         of = self.config

@@ -56,6 +56,10 @@ class DMCProblem(ContinuousProblem):
         """The training tasks, as in the paper (appendix D.4)."""
         return self.split.train
 
+    @property
+    def evaluated_count(self) -> int:
+        return self.train_count
+
     def batch(self, variations: Sequence[Variation]) -> Batch:
         from icrl_dist.problems.dmc.simulation import DMCVariations  # imported here because MuJoCo is slow to import
 

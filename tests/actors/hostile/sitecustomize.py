@@ -56,4 +56,4 @@ if "HOSTILE" in os.environ and any(name in " ".join(sys.orig_argv) for name in (
         made = real(problem, variations)
         return Hostile(made) if any(repr(v) == os.environ["HOSTILE_VARIATION"] for v in variations) else made
 
-    DarkRoomProblem.batch = batch
+    DarkRoomProblem.batch = batch  # type: ignore[method-assign]  # this process ends with it

@@ -58,9 +58,10 @@ class ShippedCluster:
                 assert process.poll() is None, "`ray dashboard` ended"
                 yield
             finally:
-                for one in [*psutil.Process(process.pid).children(recursive=True), process]:
+                for one in psutil.Process(process.pid).children(recursive=True):
                     with contextlib.suppress(psutil.NoSuchProcess):
                         one.kill()
+                process.kill()
 
     def status_without_token(self):
         """HTTP status of the job server for a request without a token; None without an answer."""

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from icrl_dist.bench import disturbance, drop
-from icrl_dist.bench.disturbance import DisturbanceSizes, Setting
+from icrl_dist.bench.disturbance import DisturbanceSizes
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps, load, override, parse
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import calibrated_strength
+from icrl_dist.problems.continuous.disturbance import Setting
 from icrl_dist.problems.dmc import domains
+from icrl_dist.types import Variation
 from tests.bench.test_bench_disturbance import Balances
 
 KIND = "dmc-cartpole-balance"
@@ -67,25 +69,25 @@ def test_a_drop_that_no_strength_reaches_is_reported_at_the_largest_strength():
 def test_a_run_has_the_measured_strength_and_keeps_it_when_the_table_changes(own):
     own(row(7.5), row(9.0, forces=("qarl",)), row(1.0, share=0.25), row(2.0, problem="dmc-cheetah-run"))
     run = parse(RUN, "file")
-    assert run.control.strength == "drop:0.3" and calibrated_strength.strength(run.control, run.problem) == 7.5
+    control = run.section("control")
+    assert control.strength == "drop:0.3" and calibrated_strength.strength(control, run.problem) == 7.5
     pushes = {v.adversary["strength"] for v in registry.training_variations(run, 0, registry.of(run).split.train[0])[1:]}
     assert pushes == {7.5} and registry.test_adversary(run, 0, 2.0, "unseen")["strength"] == 15.0
     own(row(8.0), row(9.0, forces=("qarl",)))
     again = parse(dumps(run), "run.toml")
     assert again == run and 'strength = "drop:0.3"' in dumps(run) and "=7.5" in dumps(run)
-    assert override(run, ["control.forces=qarl"], "--set").control.solved.endswith("qarl/drop:0.3=9.0")
-    plain = override(run, ["control.strength=2"], "--set")
-    assert (plain.control.strength, plain.control.solved) == (2.0, "")
-    assert parse(RUN, "file").control.solved.endswith("=8.0")
+    assert override(run, ["control.forces=qarl"], "--set").section("control").solved.endswith("qarl/drop:0.3=9.0")
+    plain = override(run, ["control.strength=2"], "--set").section("control")
+    assert (plain.strength, plain.solved) == (2.0, "")
+    assert parse(RUN, "file").section("control").solved.endswith("=8.0")
 
 
 def test_a_drop_in_meta_world_is_measured_in_meters(own):
     own(row(0.6, problem="metaworld-pick-place", forces=(), meters=0.01))
     text = 'problem = "metaworld-pick-place"\n[control]\nstrength = "drop:0.3"\ndisturbance = {}\n'
-    assert calibrated_strength.strength(parse(text.format("0.01"), "file").control, "metaworld-pick-place") == 0.6
-    assert calibrated_strength.strength(parse(text.format("0.02"), "file").control, "metaworld-pick-place") == pytest.approx(
-        0.3
-    )
+    small, large = (parse(text.format(meters), "file").section("control") for meters in ("0.01", "0.02"))
+    assert calibrated_strength.strength(small, "metaworld-pick-place") == 0.6
+    assert calibrated_strength.strength(large, "metaworld-pick-place") == pytest.approx(0.3)
     with pytest.raises(ConfigError, match=r"control\.disturbance = 0"):
         parse(text.format("0.0"), "file")
 
@@ -139,7 +141,7 @@ def test_a_solved_strength_is_stored_for_later_runs(own, monkeypatch, capsys):
     kept = calibrated_strength.own()
     assert kept == [solved]
     slow = disturbance.adversaries(settings[0], 1, solved["strength"])
-    measured = disturbance.measure([drop.Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
+    measured = disturbance.measure([Variation(settings[0].task, push) for push in slow], Balances, 1, 1)
     assert disturbance.lost(measured.returns)["lost_mean"] == pytest.approx(solved["lost_mean"])
     drop._store(solved)
     assert calibrated_strength.own() == kept, "it replaces its own row"

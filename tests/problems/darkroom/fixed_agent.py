@@ -22,7 +22,7 @@ class Agent(InContextAgent):
         self.outcomes, self.action, self.deploy = None, action, deploy
         self.manifest, self.observed, self.resets = {"test_goals": [[2, 1]]}, [], 0
 
-    def reset_context(self):
+    def reset_context(self, batch=1):
         self.observed.clear()
         self.resets += 1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -28,7 +28,11 @@ Family = tuple[Variation, ...]
 @pytest.fixture
 def families(room: Room) -> tuple[Family, Family]:
     """Every goal of a 3x3 room under two adversaries; and under two others."""
-    return tuple(tuple(Variation(t, a) for t in room(SIZE, HORIZON) for a in two) for two in (ADVERSARIES, OTHERS))
+
+    def under(two: Sequence[Adversary]) -> Family:
+        return tuple(Variation(t, a) for t in room(SIZE, HORIZON) for a in two)
+
+    return under(ADVERSARIES), under(OTHERS)
 
 
 def labels_of(family: Family) -> np.ndarray:
@@ -70,7 +74,8 @@ def slow_distribution(rule: Rule, family: Family, labels: np.ndarray, history: l
             return np.zeros(ACTIONS)
         if not drops(t, m):
             return probability * from_here(t + 1, m)
-        return probability * sum(w * from_here(t + 1, other) for other, w in enumerate(draws(t + 1)))
+        following = (w * from_here(t + 1, other) for other, w in enumerate(draws(t + 1)))
+        return probability * sum(following, np.zeros(ACTIONS))
 
     if rule == "zeta":
         return given_zeta(posterior(len(history)), labels, history, query)
@@ -117,7 +122,7 @@ def test_the_distribution_of_every_rule_is_that_of_drawn_hypotheses(
             step = env.step(action)
             agent.observe(observation, action, step.reward, step.observation, step.done)
             for row, history in enumerate(histories):
-                here, there = (tuple(int(c) for c in o[row]) for o in (observation, step.observation))
+                here, there = ((int(o[row, 0]), int(o[row, 1])) for o in (observation, step.observation))
                 history.append((here, int(action[row]), float(step.reward[row]), there))
             observation = step.observation
     assert moved > 0.3, "the distribution hardly changed, so the test would pass for an agent that ignores its observations"

@@ -1,6 +1,7 @@
 """The game of ``icrl-dist play`` without a server: the commands of a viewer, and what the page receives."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,9 @@ from icrl_dist.problems.darkroom.game import HELD_S, PlayGame
 from icrl_dist.problems.darkroom.room import MOVES, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from tests.problems.darkroom.fixed_agent import LEFT, RIGHT, STAY, UP, Agent, Clock, game
+
+NO_GOALS: tuple[Any, ...] = ([3, 0], [0, -1], [0], "00", [0, 1.0], [True, 0], {})
+"""Values that are no goal of a 3x3 room."""
 
 
 @pytest.fixture
@@ -170,10 +174,7 @@ def test_snapshots_and_histories_are_json_of_bounded_size(run):
         ({"do": "step", "value": 1}, "step: expected the fields do"),
         ({"do": "p", "value": 0.5, "more": 1}, "p: expected the fields"),
         *(({"do": "p", "value": v}, "a number from 0 to 1") for v in (-0.1, 1.1, "0.5", True, None, [0.5], 10**400)),
-        *(
-            ({"do": "goal", "value": v}, "expected [x, y], each 0 to 2")
-            for v in ([3, 0], [0, -1], [0], "00", [0, 1.0], [True, 0], {})
-        ),
+        *(({"do": "goal", "value": v}, "expected [x, y], each 0 to 2") for v in NO_GOALS),
         *(({"do": "push", "value": v}, "expected 0 to 4") for v in (-1, 5, 1.0, True, None, "up")),
         *(({"do": "hold", "value": v}, "expected 0 to 4") for v in (-1, 5, False)),
         *(({"do": "distribution", "value": v}, "expected 0 to 4") for v in (7, "uniform")),

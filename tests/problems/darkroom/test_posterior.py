@@ -1,6 +1,7 @@
 """The posterior that a model's distributions imply, against a slow search; reading it changes nothing."""
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -182,7 +183,7 @@ def deployed(deploy, ask, keep="all", length=3):
 @pytest.mark.parametrize("deploy", ["paper", "committed"])
 @pytest.mark.parametrize("keep", ["all", "last"])
 def test_the_distribution_at_any_state_is_the_models_given_the_context_and_reading_it_changes_nothing(deploy, keep):
-    asked, lengths = [], []
+    asked, lengths = list[Any](), []
     grid = cells(5)
 
     @torch.inference_mode()

@@ -107,7 +107,7 @@ def slow_likelihood(variation: Variation, seen: Sequence[Trajectory], steps: int
     total = 1.0
     for one in seen:
         for h in range(len(one.actions) if steps is None else steps):
-            cell, arrived = (tuple(int(c) for c in one.observations[i]) for i in (h, h + 1))
+            cell, arrived = ((int(one.observations[i, 0]), int(one.observations[i, 1])) for i in (h, h + 1))
             probability = sum(p for p, there in outcomes(variation, cell, int(one.actions[h])) if there == arrived)
             right = float(one.rewards[h]) == (1.0 if arrived == variation.task["goal"] else 0.0)
             total *= probability * right

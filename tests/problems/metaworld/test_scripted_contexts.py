@@ -15,6 +15,7 @@ from icrl_dist.problems.metaworld import environment, pick_place, scripted_conte
 from icrl_dist.problems.metaworld.scripted_contexts import EpisodePlan
 from icrl_dist.stream import wire
 from icrl_dist.training.batches import TrainingBatch
+from tests.calls import keeping
 from tests.jobs import InMemoryDataset, decoded, do, in_problem, jobs_of
 
 HORIZON, TRIALS = 10, 2
@@ -60,16 +61,15 @@ def test_half_of_the_episodes_lead_to_the_goal_and_the_rest_to_other_places_in_i
 
 def test_actions_are_the_scripted_ones_with_noise_and_labels_those_of_the_true_goal(run, monkeypatch):
     monkeypatch.setattr(scripted_contexts, "LAPSE_PROBABILITY", 0.2)
-    job, given = job_of(run), []
+    job, given = job_of(run), list[EpisodePlan]()
     assert job.kind == "scripted_context" and decoded(run, wire.encode_job(job)) == job
-    drawn = EpisodePlan.drawn.__func__
-    keep = lambda cls, *args: given.append(drawn(cls, *args)) or given[-1]  # noqa: E731
-    monkeypatch.setattr(EpisodePlan, "drawn", classmethod(keep))
+    monkeypatch.setattr(EpisodePlan, "drawn", staticmethod(keeping(given, EpisodePlan.drawn)))
     sent = do(run, job)
     assert [t.identity for t in sent] == list(job.identities()) and {t.origin for t in sent} == {"expert"}
     states = {}
     for trial in range(TRIALS):
         env = registry.batch(job.variations)  # once more, one step after the other, from the actions that were sent
+        assert isinstance(env, environment.PickPlace)
         seen = env.reset([np.random.default_rng(0)] * 4)
         rows = [next(t for t in sent if t.variation == v and t.identity.trial == trial) for v in job.variations]
         leads = given[4 * trial : 4 * trial + 4]
@@ -111,4 +111,4 @@ def test_scripted_histories_are_refused_where_there_is_no_scripted_policy():
         override(load("dmc-reacher-easy"), ["control.histories=scripted"], "--set")
     with pytest.raises(ConfigError, match=r"control\.histories = 'scripted': use sac: the method experts"):
         override(load("experts-metaworld-laptop"), [], "--set")
-    assert load("metaworld").control.histories == "sac", "the paper's"
+    assert load("metaworld").section("control").histories == "sac", "the paper's"
