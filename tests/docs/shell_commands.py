@@ -24,6 +24,7 @@ PLACEHOLDERS = {
     "KEY": "key",
     "FILE": "rates.json",
     "RUN_DIR": "runs/demo",
+    "IDENTITY": "adapt/0/3/1/7",
     "ROUND": "0",
     "CHECKPOINT": "runs/demo/checkpoints/version-0001.npz",
     "RUN": "demo",

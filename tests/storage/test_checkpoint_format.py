@@ -20,7 +20,9 @@ def renumbered(path: Path, number: object) -> None:
     with np.load(path) as file:
         parts = dict(file)
     del parts["file_format"]
-    np.savez(path, **parts, **({} if number is None else {"file_format": np.array(number)}))
+    if number is not None:
+        parts["file_format"] = np.array(number)
+    np.savez(path, **parts)
 
 
 @pytest.mark.parametrize("number", [FORMAT + 1, 0, "two"])

@@ -19,12 +19,13 @@ from icrl_dist.launch import train
 from icrl_dist.results import rows
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from icrl_dist.telemetry import provenance
+from icrl_dist.telemetry.metrics import Metrics
 from learner import service
 from tests.results.row_blocks import block
 
 DECIDES_BYTES = {"python", "torch", "numpy", "mujoco", "dm-control", "metaworld", "stable-baselines3", "ray", "eclipse-zenoh"}
 WORDS = ("--episodes", "1", "--seeds", "1", "--p", "0")
-METRICS = service.Metrics
+METRICS = Metrics
 
 
 def git(folder: Path, *words: str) -> str:
@@ -155,8 +156,8 @@ def test_a_resume_with_other_software_is_noted_and_recorded_and_changes_no_diges
     resume()
     assert [event for event in events if event["event"] == "note"] == []
     provenance._libraries.cache_clear()
-    monkeypatch.setattr(provenance.metadata, "version", lambda name: "1.0" if name == "torch" else installed(name))
-    monkeypatch.setattr(provenance.version, "digest", lambda: "e" * 64)
+    monkeypatch.setattr(metadata, "version", lambda name: "1.0" if name == "torch" else installed(name))
+    monkeypatch.setattr(version, "digest", lambda: "e" * 64)
     for number in (1, 2):  # these are fitted again, with another manifest
         version_file(folder, number).unlink()
     result = resume()
