@@ -8,7 +8,7 @@ from tests.e2e.training import SMOKE, equal, result_of
 
 SCRIPT = """
 import json, os, signal, sys
-import icrl_dist
+import icrl_dist, ray
 
 def state():
     return [str(signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)], dict(os.environ)
@@ -17,7 +17,6 @@ os.environ.pop("OMP_WAIT_POLICY", None)
 os.environ["MUJOCO_GL"] = "disabled"  # set by the first import of a continuous problem
 before = state()
 made = icrl_dist.train(icrl_dist.load_run("smoke", *sys.argv[2:]), sys.argv[1], actors=1)
-import ray
 print(json.dumps({"same": state() == before, "ray": ray.is_initialized(), "deaths": made.result["worker_deaths"]}))
 """
 
