@@ -36,7 +36,8 @@ def test_every_example_runs_and_prints(shown):
     assert "random" in evaluate and re.search(r"^0\.3 +\d", evaluate, re.MULTILINE)
     assert "training_seed" in results and "worker w0 joined" not in results, "no progress unless it is asked for"
     assert "2 training seeds" in " ".join(compare.split()) and "ICAG" in compare
-    assert trajectories.startswith("728 trajectories") and len(names["one"]) == 9
+    trained = 280 + 2 * 7 * 2 * 16  # contexts; rounds, tasks, variations, trials
+    assert trajectories.startswith(f"{trained} trajectories") and len(names["one"]) == 9
     assert re.findall(r"episode (\d): return \d", agent) == list("12345")
     assert problem == ""
 
