@@ -47,12 +47,14 @@ def test_the_packages_declare_their_types():
         assert Path(package, "py.typed").is_file() and "py.typed" in data[package]
 
 
+@pytest.mark.integration
 def test_an_import_of_the_package_loads_nothing_heavy():
     script = "import sys, icrl_dist\nprint({'torch', 'ray', 'pandas', 'rich', 'numpy'} & set(sys.modules))"
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "set()"
 
 
+@pytest.mark.integration
 @pytest.mark.timeout(300)
 def test_a_users_script_passes_mypy_strict():
     """With the cache of ``make check`` this takes seconds, without it about half a minute."""
