@@ -85,11 +85,12 @@ class Fleet:
             actors = actors or 1
             if not oversubscribe:
                 check_cores(actors)
-        self._variables = local.set_variables(_SETTINGS)
+        self._variables = local.variables()
+        os.environ.update(_SETTINGS)
         try:
             self._ray = _connected(address, actors, note, stopped)
         except BaseException:
-            local.set_variables(self._variables)
+            local.restore_variables(self._variables)
             raise
         self.deaths = 0
         """Number of workers that died, except those that were lost with their node."""
@@ -303,7 +304,7 @@ class Fleet:
             self._kill(actor)
         self._running.clear()
         self._ray.shutdown()
-        local.set_variables(self._variables)
+        local.restore_variables(self._variables)
 
 
 def _connected(address: str | None, actors: int | None, note: Callable[[str], None], stopped: Callable[[], bool]) -> Any:

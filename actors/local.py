@@ -63,12 +63,13 @@ def refuse_running_session() -> None:
         )
 
 
-def set_variables(values: Mapping[str, str | None]) -> dict[str, str | None]:
-    """Set environment variables, None to remove one; returns the former values."""
-    former = {name: os.environ.get(name) for name in values}
-    for name, value in values.items():
-        if value is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
-    return former
+def variables() -> dict[str, str]:
+    """The environment variables that Ray reads and sets."""
+    return {name: value for name, value in os.environ.items() if name.startswith("RAY_") or name == "PYTHONBREAKPOINT"}
+
+
+def restore_variables(former: Mapping[str, str]) -> None:
+    """Set Ray's environment variables as ``variables`` returned them."""
+    for name in variables():
+        del os.environ[name]
+    os.environ.update(former)

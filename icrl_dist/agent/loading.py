@@ -28,10 +28,10 @@ SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
 def load_agent(
     what: str | Path, seed: int | None = None, deploy: Deployment | None = None, threads: int | None = 1
 ) -> InContextAgent:
-    """The agent of a run folder (its newest version), of a checkpoint file, or of the package, by its name.
+    """A trained agent, which acts without weight updates.
 
-    ``load_agent("darkroom")`` loads the agent of the package; write ``"./darkroom"`` for a run folder of that name.
-
+    ``what``: a run folder (its newest version), a checkpoint file, or the name of an agent of the package:
+    ``load_agent("darkroom")`` loads that agent, ``"./darkroom"`` is a run folder of that name.
     ``seed``: of the draws of its actions; None: other draws each time.  ``deploy``: the deployment rule, ``paper`` or
     ``committed``; None: the rule that it was trained for.
     ``threads``: CPU threads of torch while the agent acts and observes; None: the number that torch is set to.  More

@@ -60,11 +60,14 @@ def spec(task: Task) -> Spec:
 
 
 def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
-    """One variation environment (tau, phi) as a ``gymnasium.Env``; ``render_mode="rgb_array"``: it can render images.
+    """The environment (tau, phi) of ``variation`` as a ``gymnasium.Env``; ``render_mode="rgb_array"``: it can render images.
 
     The problem has a default section: a problem whose environments depend on more than the task needs ``Problem.batch``.
     The adversary is part of the environment: observations contain neither it nor its action, but
     ``info["adversary"]`` has the action (see ``Step.adversary``).
+
+    Observations are float32 ``(S,)`` in the environment's unit, actions integers or float32 vectors ``(A,)`` in [-1, 1].
+    Raises ValueError, with the nearest name, for a task of an unknown problem, and for another ``render_mode``.
     """
     return VariationEnv(variation, batch([variation]), render_mode)
 

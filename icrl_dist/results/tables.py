@@ -76,8 +76,9 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
     """The newest model of each later frame compared with that of the first, at every p that both have.
 
     ``frames``: result rows, each of the trainings of one method (``icrl_dist.read_results``); ``names``: what the table
-    calls them, by default the names of their models.  An effect whose 95% interval holds the value of equal agents
-    is worded "not shown".  Raises ConfigError for rows that cannot be paired (``comparison.compare``).
+    calls them, by default the names of their models; ``last``: the last episodes of an evaluation, whose mean return is
+    compared.  A notebook shows the table, and so does ``rich.print``.  An effect whose 95% interval holds the value of
+    equal agents is worded "not shown".  Raises ConfigError for rows that cannot be paired (``comparison.compare``).
     """
     if len(frames) < 2:
         raise ConfigError(f"compare: {len(frames)} frames were given; give at least two")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def read_dataset(run_dir: str | Path) -> StoredData:
-    """The trajectories that a run collected, also while the run is active; nothing on disk is changed.
+    """The trajectories that the run in the folder ``run_dir`` collected, also while it is active; nothing on disk is changed.
 
     Opening reads and checks every segment once.  Trajectories that a disk damaged are left out; ``icrl-dist train
     --resume`` collects them again.

@@ -139,6 +139,7 @@ def test_a_real_session_of_ray_still_works_after_the_refusal(tmp_path):
 def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
     def start(ray, *_, **__):
         assert os.environ["RAY_worker_niceness"] == "0"  # noqa: SIM112 - Ray's name
+        os.environ |= {"RAY_AUTH_MODE": "token", "PYTHONBREAKPOINT": "ray"}  # as Ray does
         if start_fails:
             raise RuntimeError("Ray did not start")
 
@@ -146,7 +147,8 @@ def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
     monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setattr(local, "start_ray", start)
     monkeypatch.setenv("RAY_worker_niceness", "5")
-    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
+    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_AUTH_MODE", "PYTHONBREAKPOINT"):
+        monkeypatch.delenv(name, raising=False)
     before = dict(os.environ)
     with pytest.raises(fleet.FleetFailed) if start_fails else contextlib.nullcontext():
         fleet.Fleet(1, 0).close()

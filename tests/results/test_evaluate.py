@@ -231,6 +231,7 @@ def folder(small_run, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.integration
 def test_the_suite_ends_with_one_json_object(folder, capsys):
     assert main.main(["evaluate", str(folder), "--suite", "posterior", "--seeds", "2", "--episodes", "6", "--json"]) == 0
     printed = capsys.readouterr()
@@ -255,6 +256,7 @@ def test_the_suite_ends_with_one_json_object(folder, capsys):
     assert all(meaning in printed.err for meaning in divergence.PRIORS.values()) and f"{answer['kl_nats']:.4f}" in printed.err
 
 
+@pytest.mark.integration
 def test_evaluations_add_rows_and_replace_no_report_of_other_settings(folder, capsys):
     reports = dict[Path, bytes]()
     for words in (["--p", "0", "0.2"], ["--p", "0.2"], ["--p", "0.2", "--seeds", "1"], ["--suite", "offline"]):
