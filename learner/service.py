@@ -258,7 +258,9 @@ class Service:
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         if phase.next_version > self.version:
             rated = self._method.label_quality(self._run, phase, self.store)
-            quality = training_rows.rate_labels(self._run, self._folder, phase, rated)
+            quality = training_rows.rate_labels(
+                self._run, self._folder, phase, rated, lambda text: self._reporter.event({"event": "note", "text": text})
+            )
             if quality is not None:
                 self._reporter.labels_rated(phase.round, quality)
 

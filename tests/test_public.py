@@ -55,6 +55,7 @@ def test_an_import_of_the_package_loads_nothing_heavy():
 
 
 @pytest.mark.integration
+@pytest.mark.integration
 @pytest.mark.timeout(300)
 def test_a_users_script_passes_mypy_strict():
     """With the cache of ``make check`` this takes seconds, without it about half a minute."""

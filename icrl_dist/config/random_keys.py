@@ -27,9 +27,9 @@ class RandomKey(enum.IntEnum):
     OOD_CALIBRATION = 105
     """Calibration episodes of the out-of-distribution score: (task, row, episode)."""
     POSTERIOR_SUITE = 106
-    """Contexts, queries and bootstrap of the comparison with the exact posterior."""
+    """Contexts and queries of the comparison with the exact posterior."""
     RESULTS = 107
-    """Bootstrap of the intervals in tables of results; its seed is 0, so equal rows give equal intervals."""
+    """Bootstrap of all intervals of results; its seed is 0, so equal rows give equal intervals."""
 
 
 def strength_key(p: float) -> int:

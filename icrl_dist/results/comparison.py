@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import ConfigError
 from icrl_dist.results import statistics
-from icrl_dist.results.summaries import LAST, Interval, Returns, returns
+from icrl_dist.results.returns import LAST, Returns, check_pairs, returns
+from icrl_dist.results.statistics import Interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,16 +38,15 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """``higher`` or ``lower`` if the interval lies on one side of the neutral value, else ``not shown``."""
-        if math.isnan(self.effect.low) or self.effect.low <= self.neutral <= self.effect.high:
-            return "not shown"
-        return "higher" if self.effect.low > self.neutral else "lower"
+        return self.effect.verdict(self.neutral)
 
 
 def newest_model(frame: pd.DataFrame) -> list[Returns]:
     """The newest policy version in rows of the suite ``online``, by p; of any other rows the only agent in them.
 
     If two rules deploy it, the rule is the one that is not Algorithm 1.  Raises ConfigError for rows with several
-    agents of which none is a model.
+    agents of which none is a model, for a model with several kinds of offline data, and for a training without rows
+    of the chosen agent.
     """
     online = frame[frame["suite"] == "online"]
     found = returns(online if len(online) else frame)
@@ -60,59 +58,52 @@ def newest_model(frame: pd.DataFrame) -> list[Returns]:
             f"a comparison needs one agent of these: {keys}; choose one, as in frame[frame.agent == {agents[0].agent!r}]"
         )
     chosen = max(models, key=lambda agent: (int(agent.agent[1:]), agent.deployment != "paper")) if models else agents[0]
-    return [one for one in found if one.agent == chosen]
+    if len(data := sorted({agent.data for agent in models})) > 1:
+        raise ConfigError(
+            f"a comparison needs one kind of offline data of these: {', '.join(data)}; choose one, as in "
+            f"frame[frame.data == {data[0]!r}]"
+        )
+    arm = [one for one in found if one.agent == chosen]
+    seeds = sorted({seed for one in found for seed in one.training_seeds})
+    for one in arm:
+        if missing := [str(seed) for seed in seeds if seed not in one.training_seeds]:
+            raise ConfigError(
+                f"a comparison needs {chosen.agent}, the newest model, of every training: at p = {one.p:g} there is none of "
+                f"training seed {', '.join(missing)}; train and evaluate it, or choose rows by agent, p or training_seed"
+            )
+    return arm
 
 
 def compare(first: Returns, second: Returns, last: int = LAST) -> list[Comparison]:
-    """Statistics of the mean return over the last episodes, with 95% intervals of ``statistics.bootstrap``.
+    """Statistics of the mean return over the last episodes, with 95% intervals of ``statistics.estimate``.
 
-    Pairs are rows of equal training seed, split seed, task, adversary and evaluation seed, in both agents.  Raises
-    ConfigError if a row has no partner.
+    Pairs are rows of equal training seed, split seed, task, adversary and evaluation seed, in both agents
+    (``check_pairs``).  Raises ConfigError if a row has no partner.
     """
-    _check_pairs(first, second)
-    scores = np.stack([first.scores(last), second.scores(last)])
-    values = _statistics(scores.mean(axis=-1)[None])[0]
-    drawn = statistics.bootstrap(scores, _statistics, generator(0, RandomKey.RESULTS), crossed=first.crossed)
-    low, high = statistics.interval(drawn)
-    count, answer = len(SINGLE), []
-    for i, name in enumerate((*SINGLE, "ratio", "improvement")):
-        column = 2 * count + i
-        one, two = (float(values[2 * i]), float(values[2 * i + 1])) if name in SINGLE else (None, None)
-        effect = Interval(float(values[column]), float(low[column]), float(high[column]))
-        answer.append(Comparison(first.p, name, one, two, effect, 0.5 if name == "improvement" else 0.0))
-    return answer
+    check_pairs(first, second)
+    if first.agent.data != second.agent.data:
+        raise ConfigError(f"a comparison needs one kind of offline data: data are {first.agent.data} and {second.agent.data}")
+    scores, crossed = np.stack([first.scores(last), second.scores(last)]), first.crossed
 
+    def over_cells(of: Float64[np.ndarray, "R 2 S C"]) -> Float64[np.ndarray, "R 3"]:
+        differences = [statistic(of[:, 1]) - statistic(of[:, 0]) for statistic in (statistics.mean, statistics.iqm)]
+        return np.stack([*differences, statistics.ratio(of[:, 1], of[:, 0]) - 1], axis=-1)
 
-def _statistics(scores: Float64[np.ndarray, "R 2 S C"]) -> Float64[np.ndarray, "R K"]:
-    """Each single statistic of the first and the second agent, the differences, the ratio less 1, the improvement."""
-    first, second = scores[:, 0], scores[:, 1]
-    pairs = [(of(first), of(second)) for of in SINGLE.values()]
-    differences = [two - one for one, two in pairs]
-    both = [statistics.ratio(second, first) - 1, statistics.probability_of_improvement(second, first)]
-    return np.stack([number for pair in pairs for number in pair] + differences + both, axis=-1)
+    def minimum(of: Float64[np.ndarray, "R 2 S C"]) -> Float64[np.ndarray, "R 1"]:
+        return (statistics.minimum(of[:, 1]) - statistics.minimum(of[:, 0]))[:, None]
 
+    def improvement(of: Float64[np.ndarray, "R 2 S C"]) -> Float64[np.ndarray, "R 1"]:
+        return statistics.probability_of_improvement(of[:, 1], of[:, 0], crossed)[:, None]
 
-def _check_pairs(first: Returns, second: Returns) -> None:
-    for what, one, two in (
-        ("training seeds", first.training_seeds, second.training_seeds),
-        ("evaluation seeds", first.evaluation_seeds, second.evaluation_seeds),
-        ("episodes", first.returns.shape[3], second.returns.shape[3]),
-        ("tasks", len(first.cells[0]), len(second.cells[0])),
-    ):
-        if one != two:
-            raise ConfigError(
-                f"comparison at p = {first.p:g}: {what} are {one} of {first.name} and {two} of {second.name}, so rows have no "
-                "partner: choose rows that both have, or evaluate again with equal settings"
-            )
-    for seed, ones, twos in zip(first.training_seeds, first.cells, second.cells, strict=True):
-        for index, (one, two) in enumerate(zip(ones, twos, strict=True)):
-            if one != two:
-                raise ConfigError(
-                    f"comparison at p = {first.p:g}, training seed {seed}, task {index}: {first.name} has {_cell(one)} and "
-                    f"{second.name} has {_cell(two)}: rows are paired by split seed, task and adversary, so evaluate both alike"
-                )
-
-
-def _cell(cell: tuple[object, ...]) -> str:
-    split, task, family, adversary = cell
-    return f"split seed {split}, task {task}, adversary {family} {adversary}"
+    mean, iqm, ratio = statistics.estimate(scores, over_cells, crossed)
+    (worst,) = statistics.estimate(scores, minimum, crossed, fixed_cells=True)
+    (better,) = statistics.estimate(scores, improvement, crossed, probability=True)
+    one, two = scores.mean(axis=-1)
+    return [
+        *(
+            Comparison(first.p, name, float(of(one)), float(of(two)), effect, 0.0)
+            for (name, of), effect in zip(SINGLE.items(), (mean, iqm, worst), strict=True)
+        ),
+        Comparison(first.p, "ratio", None, None, ratio, 0.0),
+        Comparison(first.p, "improvement", None, None, better, 0.5),
+    ]

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.random_keys import strength_key
-from icrl_dist.config.run import Deployment, Run
+from icrl_dist.config.run import ConfigError, Deployment, Run
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Reference
 from icrl_dist.problems import registry
@@ -86,13 +86,14 @@ class Result:
 
 def of_run(run: Run, name: str) -> Block:
     """The columns of result rows that are equal in all rows of a run."""
-    problem = registry.of(run)
+    split_seed = getattr(registry.of(run).config, "split_seed", None)
+    whole = isinstance(split_seed, int) and not isinstance(split_seed, bool) and abs(split_seed) < 2**63
     return {
         "run": name,
         "method": run.method,
         "problem": run.problem,
         "training_seed": run.seed,
-        "split_seed": getattr(problem.config, "split_seed", None),
+        "split_seed": split_seed if whole else None,  # a plugin may give the name another meaning
     }
 
 
@@ -141,7 +142,7 @@ def online(
             returns, broken = [], []
             made, ceiling = (agent.make, agent.ceiling) if isinstance(agent, Reference) else (agent, False)
             for ran in deploy_online(env, made(rows, env), trials):
-                returns.append(ran.returns)
+                returns.append(_checked(ran, run, name.key, p))
                 broken.append(np.zeros(len(rows), bool) if ran.diverged is None else ran.diverged)
                 progress(name.key, p, len(returns))
             values, diverged = (np.stack(of, axis=1).reshape(shape) for of in (returns, broken))
@@ -165,7 +166,8 @@ def offline(run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment |
         for source, key in sources(run).items():
             behavior = Agent(key)
             data = episode(env, references[behavior].make(rows, env), [i.rng(run.seed) for i in ids])
-            results.append(Result(behavior, p, data.returns.reshape(shape), chosen, optimum, diverged=_diverged(data, shape)))
+            returns = _checked(data, run, key, p).reshape(shape)
+            results.append(Result(behavior, p, returns, chosen, optimum, diverged=_diverged(data, shape)))
             policies: dict[Agent, Policy] = {
                 name: in_context(one, run.context, deploy)(rows, env) for name, one in models.items()
             }
@@ -173,7 +175,7 @@ def offline(run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment |
             for name, policy in policies.items():
                 if _accepts_data(policy):
                     ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
-                    found = Result(name, p, ran.returns.reshape(shape), chosen, optimum, data=source)
+                    found = Result(name, p, _checked(ran, run, name.key, p).reshape(shape), chosen, optimum, data=source)
                     results.append(dataclasses.replace(found, diverged=_diverged(ran, shape)))
     return results
 
@@ -184,6 +186,16 @@ def sources(run: Run) -> dict[str, str]:
     found = {"random": "random" if "random" in references else None}
     found["expert"] = next((key for key, one in references.items() if one.ceiling), None)
     return {name: key for name, key in found.items() if key is not None}
+
+
+def _checked(ran: Episodes, run: Run, agent: str, p: float) -> np.ndarray:
+    """The returns of a batch of episodes.  Raises ConfigError at once for one that is no finite number."""
+    if wrong := int((~np.isfinite(ran.returns)).sum()):
+        raise ConfigError(
+            f"evaluation of agent {agent} at p = {p:g}: the return is no finite number in {wrong} of {ran.returns.size} "
+            f"episodes; mend the rewards of problem {run.problem}"
+        )
+    return ran.returns
 
 
 def _diverged(ran: Episodes, shape: tuple[int, ...]) -> np.ndarray | None:

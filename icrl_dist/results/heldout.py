@@ -125,9 +125,19 @@ def _recorded(
     deploy: Deployment | None = None,
 ) -> pd.DataFrame:
     """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows as they were read."""
-    name = what.resolve().name if what.is_dir() else what.stem
+    folder = run_folder(what)
+    name = what.stem if folder is None else folder.resolve().name
     blocks = [one.block(run, name, tasks) for tasks, ones in found.items() for one in ones]
     return rows.read([rows.append(results, suite, report_name(run, what, suite, deploy), blocks)])
+
+
+def run_folder(what: Path) -> Path | None:
+    """The run folder that a run folder or a checkpoint file belongs to; None for a file outside of one."""
+    if what.is_dir():
+        return what
+    beside = what.absolute().parent
+    folder = beside.parent if beside.name == "checkpoints" else beside
+    return folder if (folder / "run.toml").exists() else None
 
 
 def check_suite(run: Run, suite: str) -> None:
@@ -191,7 +201,7 @@ def posterior(run: Run, what: Path, results: Path, report: ReportEvent) -> tuple
         evaluated[name] = posterior_suite.online(run, (agent, act), tasks, progress)
     frame = _recorded(run, what, results, "posterior", evaluated, "paper")
     for name, which in (("paper_gap", "test"), ("paper_gap_train", "train")):
-        numbers[name] = posterior_suite.gaps(frame[frame["tasks"] == which], run.seed)
+        numbers[name] = posterior_suite.gaps(frame[frame["tasks"] == which])
     return frame, numbers
 
 

@@ -87,7 +87,10 @@ def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:
     axes[0][2].set(xlabel="exact probability", ylabel="the model's, on average")
     for shift, (name, (goals, color)) in zip((-0.15, 0.15), zip(_GAPS, _GOALS.values(), strict=True), strict=True):
         at = [100 * row["gap"] for row in report[name].values()]
-        error = [[100 * abs(row[side] - row["gap"]) for row in report[name].values()] for side in ("low", "high")]
+        error = [
+            [0.0 if row[side] is None else 100 * abs(row[side] - row["gap"]) for row in report[name].values()]
+            for side in ("low", "high")
+        ]
         axes[1][2].bar(
             [i + shift for i in range(len(at))], at, 0.28, yerr=error, color=color, alpha=0.8, capsize=3, label=goals
         )

@@ -17,7 +17,7 @@ from rich.text import Text
 from icrl_dist.config.run import Run
 from icrl_dist.problems import registry
 from icrl_dist.results import plots, summaries
-from icrl_dist.results.summaries import Returns
+from icrl_dist.results.returns import Returns, returns
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
 from icrl_dist.storage.files import atomic_write
 
@@ -59,7 +59,7 @@ def online(run: Run, report: Path, frame: pd.DataFrame) -> Evaluation:
 
     Writes the numbers to ``report``.json, the figure to ``report``.png.
     """
-    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), summaries.returns(frame)
+    numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), returns(frame)
     _, tasks, evaluations, _ = found[0].returns.shape
     title = f"{run.method.upper()} on {registry.of(run).title(tasks)}, {evaluations} seeds"
     atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
@@ -87,7 +87,7 @@ def _diverged(found: Sequence[Returns]) -> list[str]:
 
 def offline(run: Run, frame: pd.DataFrame) -> Evaluation:
     """The evaluation with these rows of suite ``offline``."""
-    found = summaries.returns(frame)
+    found = returns(frame)
     title = registry.of(run).title(found[0].returns.shape[1])
     table = returns_table(frame, f"One episode given data collected before: {title}")
     return Evaluation(frame, (table,), tuple(_diverged(found)), {"rows": summaries.result_rows(frame)})

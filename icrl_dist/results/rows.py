@@ -58,7 +58,7 @@ COLUMNS: dict[str, Column] = {
     "method": Column("string", "method of the run, such as `icaa`"),
     "problem": Column("string", "problem of the run, such as `darkroom`"),
     "training_seed": Column("int64", "`seed` of the run"),
-    "split_seed": Column("int64", "`split_seed` of the run's problem; null if the problem has none", True),
+    "split_seed": Column("int64", "`split_seed` of the run's problem; null if it has none that is a whole number", True),
     "suite": Column("string", "`online`, `offline`, `posterior`, `label_quality` or `experts`"),
     "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
     "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),
@@ -73,7 +73,7 @@ COLUMNS: dict[str, Column] = {
     "p": Column("double", "strength of the test adversary, from `evaluate.p`; null if it is an adversary of training", True),
     "adversary_family": Column("string", "family of the adversary, such as `dirichlet`; `null` is no disturbance"),
     "adversary_index": Column(
-        "int64", "number of the adversary: of the test task that it was drawn for, or of the variation in training"
+        "int64", "number of the test task for which the adversary was drawn; in training, number of the variation"
     ),
     "adversary": Column("string", "parameters of the adversary, JSON; of a network they include its seed and strength"),
     "evaluation_seed": Column("int64", "number of the evaluation of the task, from 0; the context starts empty in each"),
@@ -89,17 +89,18 @@ COLUMNS: dict[str, Column] = {
 """The columns of the result rows, in the files' order."""
 _MADE_BY = ("package_version", "code_digest", "commit", "instruction_set", "threads")
 """The columns that are entries of ``provenance.record``."""
-_PROVENANCE = ("format", "evaluation", "written", *_MADE_BY, "libraries")
-_MEASURED = ("return", "optimum", "diverged", "surprise", "agreement", "ceiling")
-KEY = tuple(name for name in COLUMNS if name not in (*_PROVENANCE, *_MEASURED))
-"""The columns that name an episode: rows that are equal in all of them are repetitions of one episode."""
+REPEATED = ("run", "suite", "tasks", "agent", "deployment", "data", "p", "prior")
+"""Rows of several evaluations that are equal in these columns repeat one evaluation of one agent."""
+_WITHOUT_P = ("label_quality", "experts")
+"""Suites whose adversaries are of training, so p is null."""
 
 
 def append(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) -> Path:
     """Write the rows of one evaluation to a new file in ``folder`` and return its path.
 
     The file's name holds the suite, the first digits of the SHA-256 of ``settings`` (JSON values), and the time; no
-    existing file is replaced.  Raises StoreError if the file cannot be written.
+    existing file is replaced.  Raises StoreError if the file cannot be written, ConfigError for a return that is no finite
+    number.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -136,6 +137,12 @@ def _table(block: Block) -> pa.Table:
     schema, rows = _schema(), len(block["return"])
     if unknown := block.keys() - COLUMNS.keys():
         raise KeyError(f"no columns of result rows: {', '.join(sorted(unknown))}")
+    if wrong := int((~np.isfinite(block["return"])).sum()):
+        agents = ", ".join(sorted(set(np.atleast_1d(block["agent"]))))
+        raise ConfigError(
+            f"result rows of agent {agents}: column return is no finite number in {wrong} of {rows} episodes; mend the rewards "
+            f"of problem {block['problem']}"
+        )
     columns = []
     for field in schema:
         value = block.get(field.name)
@@ -149,7 +156,7 @@ def _table(block: Block) -> pa.Table:
 
 
 def read(files: Iterable[Path]) -> pd.DataFrame:
-    """The rows of some files, in the files' order.  An episode that several evaluations repeat is in it once, from the last.
+    """All rows of some files, in the files' order.
 
     Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
     """
@@ -158,7 +165,16 @@ def read(files: Iterable[Path]) -> pd.DataFrame:
     tables = [_read(path) for path in files]
     frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
     frame["split_seed"] = frame["split_seed"].astype("Int64")
-    return frame.drop_duplicates(list(KEY), keep="last", ignore_index=True)
+    return frame
+
+
+def _newest(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the last evaluation of each agent, as a whole: never episodes of two evaluations."""
+    import pandas as pd
+
+    order = pd.Series(pd.factorize(frame["evaluation"])[0], index=frame.index)
+    last = order.groupby([frame[column] for column in REPEATED], dropna=False).transform("max")
+    return frame[order == last].reset_index(drop=True)
 
 
 def _read(path: Path) -> pa.Table:
@@ -187,20 +203,29 @@ def _read(path: Path) -> pa.Table:
                 f"{path}: {missing} of {len(table)} rows have no {field.name}, so they can be neither told apart nor paired: "
                 "move the file away, and evaluate again"
             )
+    tested = ~np.isin(table.column("suite").to_numpy(), _WITHOUT_P)
+    for name, needed in (("return", np.ones(len(table), bool)), ("p", tested)):
+        if unknown := int((needed & ~np.isfinite(table.column(name).to_numpy())).sum()):
+            raise StoreError(
+                f"{path}: {name} is no finite number in {unknown} of {len(table)} rows: move the file away, and evaluate again"
+            )
     return table.select(schema.names).cast(schema)
 
 
-def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = False) -> pd.DataFrame:
+def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = False, all: bool = False) -> pd.DataFrame:
     """The result rows of one run folder or of several, one row per evaluated episode; docs/data.md explains the columns.
 
-    An episode that several evaluations of a run repeat is in the frame once, from the newest of them.
+    If several evaluations of a run evaluated one agent alike (equal columns ``REPEATED``), the frame holds the rows of the
+    newest only.
 
-    ``unfinished``: also read runs whose training has not finished.  Raises ConfigError for a folder without results
+    ``unfinished``: also read runs whose training has not finished; ``all``: the rows of all evaluations, which the column
+    ``evaluation`` tells apart.  Raises ConfigError for a folder without results
     and for an unfinished run, StoreError for a file of another format.
     """
-    folders = [Path(one) for one in ([runs] if isinstance(runs, str | Path) else runs)]
-    files = []
-    for folder in folders:
+    import pandas as pd
+
+    frames = []
+    for folder in dict.fromkeys(Path(one) for one in ([runs] if isinstance(runs, str | Path) else runs)):
         if not folder.is_dir():
             raise ConfigError(f"{folder}: no such run folder; `icrl-dist train demo` makes one in runs/demo")
         if not unfinished and is_unfinished(folder):
@@ -211,8 +236,8 @@ def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = Fal
         found = sorted((folder / "results").glob("*.parquet"), key=lambda path: path.stem.rsplit("-", 1)[-1])
         if not found:
             raise ConfigError(f"{folder}: holds no result rows; `icrl-dist evaluate {folder}` writes some")
-        files += found
-    return read(files)
+        frames.append(read(found) if all else _newest(read(found)))
+    return pd.concat(frames, ignore_index=True) if frames else read([])
 
 
 def is_unfinished(folder: Path) -> bool:

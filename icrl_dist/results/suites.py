@@ -68,7 +68,7 @@ def evaluate(
     heldout.check_suite(run, suite)
     rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)
     report = folder / "report" / heldout.report_name(run, source, suite, rule)
-    results = _results_folder(folder)
+    results = (heldout.run_folder(source) or folder) / "results"  # rows of a checkpoint in a run folder belong to that run
     with reporting(progress) as show:
         if source.is_dir() and is_unfinished(source):
             text = f"{source}: this run is not finished; the newest version so far is evaluated"
@@ -89,9 +89,3 @@ def _source_and_output(what: str | Path) -> tuple[Path, Path]:
         return shipped(what), Path("runs") / f"{what}-pretrained"
     source = Path(what)
     return source, source if source.is_dir() else source.parent
-
-
-def _results_folder(folder: Path) -> Path:
-    """Where the result rows are written: rows of a checkpoint in a run folder belong to that run."""
-    run = folder.parent if folder.name == "checkpoints" and (folder.parent / "run.toml").exists() else folder
-    return run / "results"

@@ -10,7 +10,8 @@ from rich.table import Table
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.results import comparison, statistics, summaries
-from icrl_dist.results.summaries import LAST, Interval
+from icrl_dist.results.returns import LAST, Returns, returns
+from icrl_dist.results.statistics import Interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,13 +22,13 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
 
     ``frame``: result rows of one suite.  The last column is the return of the last episodes as a share of the first
     reference that is a ceiling (oracle, scripted policy or experts), or of the exact optimum if there is none; without
-    either it is that return itself.
+    either it is that return itself.  Raises ConfigError for rows that are no evaluations of equal size.
     """
-    found = summaries.returns(frame)
-    trainings, tasks, evaluations, episodes = found[0].returns.shape
+    found = returns(frame)
+    trainings, tasks, evaluations, episodes = _shape(found)
     shown, last = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes], min(LAST, episodes)
-    known = trainings * tasks * evaluations > 1  # otherwise there is nothing to resample
-    caption = f"[...]: {statistics.resampled(trainings, tasks, evaluations, last)}" if known else "one evaluation: no intervals"
+    over = statistics.resampled(trainings, tasks, evaluations, last)
+    caption = f"[...]: {over}" if statistics.units((trainings, tasks, evaluations)) > 1 else over
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for name in ("p", "agent", *(f"ep {e}" for e in shown), f"last {last}"):
         table.add_column(name, justify="left" if name == "agent" else "right")
@@ -41,17 +42,33 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
             "" if before is not None and before.p == one.p else f"{one.p:g}",
             one.name,
             *(f"{mean[e - 1]:.1f}" for e in shown),
-            _with_interval(value, known and share is None, "{:.1f}"),
-            *([] if share is None else [_with_interval(share, known, "{:.0%}")]),
+            _with_interval(value, "{:.1f}") if share is None else f"{value.value:.1f}",
+            *([] if share is None else [_with_interval(share, "{:.0%}")]),
         )
     return table
 
 
-def _with_interval(of: Interval, known: bool, form: str) -> str:
+def _shape(found: Sequence[Returns]) -> tuple[int, ...]:
+    """Trainings, tasks, evaluations and episodes of all the rows of a table, whose caption names them once."""
+    for one in found:
+        if one.returns.shape != found[0].returns.shape:
+            shapes = ["{} trainings, {} tasks, {} evaluations, {} episodes".format(*of.returns.shape) for of in (found[0], one)]
+            raise ConfigError(
+                f"one table needs evaluations of equal size: {found[0].name} at p = {found[0].p:g} has {shapes[0]}, and "
+                f"{one.name} at p = {one.p:g} has {shapes[1]}; choose rows of one p or evaluation"
+            )
+    return found[0].returns.shape
+
+
+def _with_interval(of: Interval, form: str) -> str:
     if math.isnan(of.value):
         return "-"
-    value, low, high = (form.format(number) for number in (of.value, of.low, of.high))
-    return f"{value} \\[{low.removesuffix('%')}, {high.removesuffix('%')}]" if known and not math.isnan(of.low) else value
+    value, low, high = (form.format(number) for number in of)
+    return value if math.isnan(of.low) else f"{value} \\[{low.removesuffix('%')}, {high.removesuffix('%')}]"
+
+
+def _range(of: Interval, form: str) -> str:
+    return "-" if math.isnan(of.low) else f"{form.format(of.low)} .. {form.format(of.high)}"
 
 
 def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) -> Table:
@@ -64,15 +81,18 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
     """
     if len(frames) < 2:
         raise ConfigError(f"compare: {len(frames)} frames were given; give at least two")
+    if names and len(names) != len(frames):
+        raise ConfigError(f"compare: {len(names)} names were given for {len(frames)} frames; give one for each, or none")
     arms = [comparison.newest_model(frame) for frame in frames]
     called = list(names) or [arm[0].name for arm in arms]
     base = arms[0]
-    trainings, tasks, evaluations, episodes = base[0].returns.shape
+    trainings, tasks, evaluations, episodes = _shape(base)
     over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes))
     table = Table(
         title=f"Return of the last {min(last, episodes)} episodes, compared with {called[0]}",
         title_justify="left",
-        caption=f"{over}; the same resamples for both.  `not shown`: the interval holds the value of equal agents",
+        caption=f"{over}; the same resamples for both; for the minimum, tasks are not resampled.  `not shown`: the interval "
+        "holds the value of equal agents, or there is none",
         caption_justify="left",
     )
     for name in ("p", "statistic", called[0], "compared", "its value", "effect", "95%", "verdict"):
@@ -85,9 +105,9 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
             rows = comparison.compare(one, partners[one.p], last)
             for row in rows:
                 form = _FORMS.get(row.statistic, "{:+.2f}")
-                effect, low, high = (form.format(v) for v in (row.effect.value, row.effect.low, row.effect.high))
                 single = ["" if value is None else f"{value:.2f}" for value in (row.first, row.second)]
-                cells = (_STATISTICS.get(row.statistic, row.statistic), single[0], name, single[1], effect, f"{low} .. {high}")
+                effect = ["-" if math.isnan(row.effect.value) else form.format(row.effect.value), _range(row.effect, form)]
+                cells = (_STATISTICS.get(row.statistic, row.statistic), single[0], name, single[1], *effect)
                 table.add_row(f"{row.p:g}" if row is rows[0] else "", *cells, row.verdict, end_section=row is rows[-1])
     return table
 
@@ -143,9 +163,8 @@ def gap_table(report: Mapping[str, Any], title: str) -> Table:
         table.add_column(name, justify="left" if name in ("goals", "difference") else "right")
     for name, goals in (("paper_gap", "never trained on"), ("paper_gap_train", "trained on")):
         for index, (p, row) in enumerate(report[name].items()):
-            interval = f"{row['low']:+.1%} .. {row['high']:+.1%}"
+            gap = Interval(row["gap"], *(math.nan if row[side] is None else row[side] for side in ("low", "high")))
             last = index + 1 == len(report[name])
-            cells = (f"{row['model']:.1f}", f"{row['exact']:.1f}", f"{row['gap']:+.1%}", interval)
-            verdict = "not shown" if row["low"] <= 0 <= row["high"] else "higher" if row["low"] > 0 else "lower"
-            table.add_row("" if index else goals, p, *cells, verdict, end_section=last)
+            cells = (f"{row['model']:.1f}", f"{row['exact']:.1f}", f"{gap.value:+.1%}", _range(gap, "{:+.1%}"))
+            table.add_row("" if index else goals, p, *cells, gap.verdict(), end_section=last)
     return table

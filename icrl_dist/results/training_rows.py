@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,13 @@ from icrl_dist.results.rows import Block
 from icrl_dist.types import Trajectory
 
 
-def rate_labels(run: Run, folder: Path, phase: Phase, rated: Iterable[RatedVariation]) -> LabelQuality | None:
+def rate_labels(
+    run: Run, folder: Path, phase: Phase, rated: Iterable[RatedVariation], note: Callable[[str], None]
+) -> LabelQuality | None:
     """Write the trials of one round as rows of suite ``label_quality``; returns ``summaries.label_quality`` of them.
 
-    Without trials nothing is written and the result is None.  Raises StoreError if the rows cannot be written.
+    Without trials nothing is written and the result is None.  If the rows cannot be written, ``note`` is called with the
+    reason in one line and the result is None: training needs no rows, and after a resume the same error would come again.
     """
     rule, blocks, context_trials = methods.of(run).deployment(run), [], 0
     for one in rated:
@@ -39,8 +42,12 @@ def rate_labels(run: Run, folder: Path, phase: Phase, rated: Iterable[RatedVaria
         )
     if not blocks:
         return None
-    file = rows.append(folder / "results", "label_quality", {"round": phase.round}, blocks)
-    return summaries.label_quality(rows.read([file]), context_trials)
+    try:
+        file = rows.append(folder / "results", "label_quality", {"round": phase.round}, blocks)
+        return summaries.label_quality(rows.read([file]), context_trials)
+    except Exception as error:
+        note(f"round {phase.round}: its label quality is not stored, and training goes on: {' '.join(str(error).split())}")
+        return None
 
 
 def of_expert(run: Run, name: str, trials: Sequence[Trajectory]) -> Block:

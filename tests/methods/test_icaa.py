@@ -164,7 +164,7 @@ def test_label_quality_compares_labels_with_the_exact_answer(small_run: Run, col
         late.append(np.mean([t.episode_return for t in trials[cut:]]))
         optimum.append(exact.optimum([trials[0].variation])[0])
     expected = {"agreement": agreement, "context_return": early, "label_return": late, "optimum": optimum}
-    found = training_rows.rate_labels(small_run, tmp_path, phase, method.label_quality(small_run, phase, data))
+    found = training_rows.rate_labels(small_run, tmp_path, phase, method.label_quality(small_run, phase, data), pytest.fail)
     assert found is not None and dataclasses.asdict(found) == pytest.approx(
         {name: np.mean(values) for name, values in expected.items()} | {"labelling": 1.0}
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,9 @@ from icrl_dist.problems.darkroom import divergence, room
 from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent
 from icrl_dist.problems.darkroom.problem import ORACLE
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft_labels
-from icrl_dist.results import evaluate, posterior, summaries
+from icrl_dist.results import evaluate, statistics, summaries
 from icrl_dist.results.evaluate import Agent
+from icrl_dist.results.returns import returns
 from icrl_dist.results.statistics import mean_and_error
 from icrl_dist.results.tables import returns_table
 from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_file
@@ -108,7 +110,7 @@ def test_numbers_of_result_json_are_means_over_tasks_and_seeds():
 
 def test_adaptation_is_measured_relative_to_the_oracle():
     def result(*tasks):
-        (found,) = summaries.returns(frame(block([[task] for task in tasks], optimum=[9.0] * len(tasks))))
+        (found,) = returns(frame(block([[task] for task in tasks], optimum=[9.0] * len(tasks))))
         return found
 
     oracle, model = result((10, 10, 8, 12)), result((1, 8, 9, 10))
@@ -222,7 +224,7 @@ def folder(small_run, tmp_path, monkeypatch):
     spec = registry.of(run).spec
     model = PretrainedTransformer(spec, run.model)
     monkeypatch.setattr(divergence, "CONTEXTS", 4)
-    monkeypatch.setattr(posterior, "RESAMPLES", 100)
+    monkeypatch.setattr(statistics, "RESAMPLES", 100)
     arrays = {f"model/{name}": value for name, value in weights_of(model).items()}
     manifest = checkpoints.manifest(run, spec, 0, 1)
     save_checkpoint(version_file(tmp_path, 0), Checkpoint(arrays, manifest))
@@ -270,6 +272,13 @@ def test_evaluations_add_rows_and_replace_no_report_of_other_settings(folder, ca
     file = version_file(folder, 0)
     assert main.main(["evaluate", str(file), "--episodes", "1", "--p", "0"]) == 0
     assert len(list((folder / "results").iterdir())) == 5, "rows of a checkpoint file in a run folder belong to the run"
+    shutil.copy(file, folder / "agent.npz")
+    assert main.main(["evaluate", str(folder / "agent.npz"), "--episodes", "1", "--p", "0"]) == 0
+    frame = read_results(folder, unfinished=True)
+    assert (
+        set(frame.run) == {folder.resolve().name}
+        and len(frame[(frame.suite == "online") & (frame.p == 0)].episode.unique()) == 1
+    )
     assert main.main(["evaluate", str(folder), "--episodes", "1", "--p", "0"]) == 0
     assert f"{folder}: this run is not finished; the newest version so far is evaluated" in capsys.readouterr().out
 

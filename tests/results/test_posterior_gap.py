@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,8 +14,9 @@ from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.config.sections import AdversaryConfig, EvaluateConfig
 from icrl_dist.interfaces import Batch, MakePolicy, Policy
 from icrl_dist.problems import registry
-from icrl_dist.results import posterior
+from icrl_dist.results import posterior, statistics
 from icrl_dist.results.evaluate import Agent
+from icrl_dist.results.tables import gap_table
 from icrl_dist.types import NULL, Adversary, Task, Variation
 from tests.results.row_blocks import frame
 
@@ -27,13 +29,13 @@ def run(small_run: Run) -> Run:
 
 def gap(model: np.ndarray, exact: np.ndarray, p: float = 0.0) -> dict[str, Any]:
     """The gap of two agents with these mean returns of two episodes, by goal and seed."""
-    return posterior.gap(model[:, :, None] * [0.5, 1.5], exact[:, :, None] * [0.5, 1.5], p, seed=0)
+    return posterior.gap(model[:, :, None] * [0.5, 1.5], exact[:, :, None] * [0.5, 1.5], p)
 
 
 def gaps(run: Run, act: MakePolicy, goals: Sequence[Task]) -> dict[str, dict[str, Any]]:
     """The gaps of a policy to the exact agent on these goals, by way of result rows."""
     found = posterior.online(run, (Agent("t0"), act), goals)
-    return posterior.gaps(frame(*(one.block(run, "run", "test") for one in found), suite="posterior"), run.seed)
+    return posterior.gaps(frame(*(one.block(run, "run", "test") for one in found), suite="posterior"))
 
 
 def test_a_gap_is_a_ratio_of_means_of_pairs() -> None:
@@ -54,12 +56,13 @@ def test_a_gap_is_a_ratio_of_means_of_pairs() -> None:
             for seed in rng.integers(0, 2, size=2):
                 above, below = above + noisy[goal, seed], below + exact[goal, seed]
         slow.append(above / below - 1)
-    low, high = np.percentile(slow, (2.5, 97.5))
+    half = 2.571 * np.std(slow, ddof=1) * np.sqrt(6 / 5)  # Student's t with 5 degrees of freedom
+    low, high = found["gap"] - half, found["gap"] + half
     assert [found["low"], found["high"]] == pytest.approx([low, high], abs=0.1 * (high - low))
 
 
 def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(posterior, "RESAMPLES", 300)
+    monkeypatch.setattr(statistics, "RESAMPLES", 300)
     rng, covered, widths, gaps = np.random.default_rng(0), 0, [], []
     for _ in range(200):
         exact = rng.uniform(20, 100, size=(20, 1)) + rng.normal(0, 5, size=(20, 2))
@@ -74,6 +77,15 @@ def test_the_interval_covers_the_true_gap_and_not_much_more(monkeypatch: pytest.
 def test_a_return_of_0_of_the_exact_agent_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"return is 0 at p = 0\.4: no ratio to it; try more --episodes"):
         gap(np.ones((2, 2)), np.zeros((2, 2)), 0.4)
+
+
+def test_a_gap_without_an_interval_is_shown_as_such() -> None:
+    """One goal and seed leave nothing to resample; exact returns of 0 in most goals give undefined resamples."""
+    for exact in (np.ones((1, 1)), np.array([[1.0], [0.0], [0.0]])):
+        found = gap(exact / 2, exact)
+        assert (found["gap"], found["low"], found["high"]) == (-0.5, None, None) and json.dumps(found, allow_nan=False)
+        report = {"paper_gap": {"0": found}, "paper_gap_train": {"0": found}}
+        assert list(gap_table(report, "").columns[-1].cells) == ["not shown"] * 2
 
 
 def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) -> None:
@@ -95,4 +107,4 @@ def test_the_exact_agent_has_no_gap_to_itself_and_a_random_one_does(run: Run) ->
             adversary = Adversary.of("uniform", p=p) if p else NULL
             assert rows == tuple(Variation(problem.at_test_start(t), adversary) for t in goals for _ in range(5))
     worse = gaps(run, problem.references(run)["random"].make, problem.split.test)
-    assert all(row["high"] < 0 for row in worse.values())
+    assert all(row["gap"] < -0.2 and row["low"] < row["gap"] for row in worse.values()), "two goals give wide intervals"

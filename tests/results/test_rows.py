@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +23,7 @@ from icrl_dist.launch import run_folder
 from icrl_dist.problems import registry
 from icrl_dist.results import evaluate, rows
 from icrl_dist.results.evaluate import Agent
+from icrl_dist.results.returns import returns
 from icrl_dist.storage.files import StoreError
 from tests.results.row_blocks import block
 
@@ -98,12 +101,24 @@ def test_what_a_kill_leaves_is_not_read(folder):
     assert len(read_results(folder)) == 24
 
 
-def test_a_repeated_episode_is_read_once_from_the_newest_evaluation(folder):
-    rows.append(folder / "results", "online", {"p": 1}, [block(RETURNS[:, :1] + 1000, "t0")])
+def test_a_repeated_evaluation_is_read_as_a_whole_from_the_newest_file(folder):
+    """No episode of the older file stays, also where the newer one has fewer evaluation seeds, episodes or tasks."""
+    file = rows.append(folder / "results", "online", {"p": 1}, [block(RETURNS[:, :1, :1] + 1000, "t0")])
+    rows.append(folder / "results", "online", {"p": 2}, [block(RETURNS, "t0", p=0.2), block(RETURNS, "t0", prior="unseen")])
     frame = read_results(folder)
-    assert len(frame) == 24
-    again = frame[(frame.agent == "t0") & (frame.evaluation_seed == 0)]
-    assert (again["return"] >= 1000).all() and (frame["return"] >= 1000).sum() == len(again) == 4
+    again = frame[(frame.agent == "t0") & (frame.p == 0) & (frame.prior == "uniform")]
+    assert again["return"].tolist() == [1000.0, 1006.0] and set(again.evaluation) == {file.stem}
+    assert len(frame) == 12 + 2 + 12 + 12, "other agents, strengths and priors are other evaluations"
+    everything = read_results(folder, all=True)
+    assert len(everything) == 24 + 2 + 24 and everything.evaluation.nunique() == 3
+
+
+def test_runs_of_one_name_in_different_folders_are_different_runs(tmp_path):
+    for seed in (0, 1):
+        rows.append(tmp_path / str(seed) / "demo" / "results", "online", {}, [block(RETURNS, seed=seed, run="demo")])
+    folders = [tmp_path / str(seed) / "demo" for seed in (0, 1)]
+    assert read_results(folders).training_seed.value_counts().to_dict() == {0: 12, 1: 12}
+    assert len(read_results([folders[0], folders[0]])) == 12
 
 
 def test_the_rows_of_several_runs_are_read_together(folder, tmp_path):
@@ -135,6 +150,14 @@ def no_evaluation_seeds(table):
     return table.set_column(index, pa.field("evaluation_seed", pa.int64()), values)
 
 
+def changed(name, value):
+    def change(table):
+        index = table.schema.get_field_index(name)
+        return table.set_column(index, table.schema.field(index), pa.array([value] * len(table), pa.float64()))
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -144,6 +167,10 @@ def no_evaluation_seeds(table):
         (lambda table: table.append_column("mine", pa.nulls(24)), r"wrong columns \(mine\)"),
         (no_seeds, r"24 of 24 rows have no training_seed, .*move the file away, and evaluate again"),
         (no_evaluation_seeds, r"1 of 24 rows have no evaluation_seed"),
+        (changed("return", math.nan), r"return is no finite number in 24 of 24 rows: move the file away, and evaluate again"),
+        (changed("return", math.inf), r"return is no finite number"),
+        (changed("p", math.nan), r"p is no finite number in 24 of 24 rows"),
+        (changed("p", None), r"p is no finite number in 24 of 24 rows"),
     ],
 )
 def test_a_file_of_another_format_or_without_seeds_is_refused_in_one_line(folder, change, expected):
@@ -167,7 +194,46 @@ def test_rows_without_a_seed_are_not_written(tmp_path):
         rows.append(tmp_path, "online", {}, [{**block(RETURNS), "training_seed": None}])
     with pytest.raises(KeyError, match="sead"):
         rows.append(tmp_path, "online", {}, [{**block(RETURNS), "sead": 1}])
+    for value in (np.nan, np.inf):
+        with pytest.raises(ConfigError, match=r"agent t0: column return is no finite number in 1 of 2 .* problem darkroom"):
+            rows.append(tmp_path, "online", {}, [block([[[1.0, value]]])])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_return_of_nan_ends_an_evaluation_after_its_first_episode(small_run, monkeypatch):
+    problem, episodes = registry.of(small_run), []
+    agents = {Agent("random"): problem.references(small_run)["random"]}
+    real = type(problem).batch
+
+    def batch(self, variations):
+        env = real(self, variations)
+        step = env.step
+
+        def poor(*arguments):
+            found = step(*arguments)
+            return found._replace(reward=found.reward * np.nan)
+
+        monkeypatch.setattr(env, "step", poor)
+        return env
+
+    monkeypatch.setattr(type(problem), "batch", batch)
+    with pytest.raises(
+        ConfigError, match=r"agent random at p = 0: the return is no finite number in .*; mend the rewards"
+    ) as refused:
+        evaluate.online(small_run, agents, lambda *event: episodes.append(event))
+    assert not episodes and "\n" not in str(refused.value)
+    with pytest.raises(ConfigError, match="the return is no finite number"):
+        evaluate.offline(small_run, {})
+
+
+@pytest.mark.parametrize(("seed", "stored"), [(7, 7), ("north", None), ((1, 2), None), (True, None), (2**63, None)])
+def test_a_split_seed_that_is_no_number_of_64_bits_is_null(small_run, monkeypatch, tmp_path, seed, stored):
+    config = SimpleNamespace(split_seed=seed)
+    monkeypatch.setattr(registry, "of", lambda run: SimpleNamespace(config=config))
+    rows.append(tmp_path / "results", "online", {}, [{**block(RETURNS), **evaluate.of_run(small_run, "run")}])
+    frame = read_results(tmp_path)
+    assert (frame.split_seed.isna().all() and stored is None) or set(frame.split_seed) == {stored}
+    assert returns(frame)[0].cells[0][0][0] == stored
 
 
 def test_an_unfinished_run_is_refused_and_named(folder):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from itertools import groupby
+
+import numpy as np
+import pytest
 
 from icrl_dist import read_results
 from icrl_dist.methods import registry as methods
@@ -39,7 +43,8 @@ def test_a_round_that_a_resumed_run_rates_again_is_read_once(small_run, tmp_path
     trajectories = [trial for one in trials_of(small_run, phase, weights) for trial in one]
     data = InMemoryDataset(trajectories)
     found = [
-        training_rows.rate_labels(small_run, tmp_path, phase, method.label_quality(small_run, phase, data)) for _ in range(2)
+        training_rows.rate_labels(small_run, tmp_path, phase, method.label_quality(small_run, phase, data), pytest.fail)
+        for _ in range(2)
     ]
     assert found[0] == found[1] is not None and len(list((tmp_path / "results").iterdir())) == 2
     frame = read_results(tmp_path)
@@ -53,9 +58,26 @@ def test_a_round_that_a_resumed_run_rates_again_is_read_once(small_run, tmp_path
         assert tuple(json.loads(row["task"])["goal"]) == trial.variation.task.vector("goal")
 
 
+@pytest.mark.parametrize("fault", ["disk", "nan"])
+def test_rows_that_cannot_be_written_end_no_training(small_run, tmp_path, monkeypatch, fault):
+    method = methods.of(small_run)
+    notes: list[str] = []
+    phase = method.phases(small_run)[1]
+    trajectories = [trial for one in trials_of(small_run, phase, FixedWeights(small_run)) for trial in one]
+    rated = list(method.label_quality(small_run, phase, InMemoryDataset(trajectories)))
+    if fault == "disk":
+        (tmp_path / "results").touch()  # no folder can be made here
+    else:
+        trial = dataclasses.replace(trajectories[0], rewards=trajectories[0].rewards * np.nan)
+        rated[0] = rated[0]._replace(trials=[trial, *rated[0].trials[1:]])
+    assert training_rows.rate_labels(small_run, tmp_path, phase, rated, notes.append) is None
+    (note,) = notes
+    assert note.startswith("round 0: its label quality is not stored, and training goes on: ") and "\n" not in note
+
+
 def test_a_round_without_labels_of_the_model_writes_nothing(small_run, tmp_path):
     method = methods.of(small_run)
     pretrain = method.phases(small_run)[0]
     rated = method.label_quality(small_run, pretrain, InMemoryDataset([]))
-    assert training_rows.rate_labels(small_run, tmp_path, pretrain, rated) is None
+    assert training_rows.rate_labels(small_run, tmp_path, pretrain, rated, pytest.fail) is None
     assert not list(tmp_path.iterdir())

@@ -15,13 +15,19 @@ from rich.console import Console
 from icrl_dist import read_results
 from icrl_dist.cli import main
 from icrl_dist.config.random_keys import RandomKey, generator
-from icrl_dist.config.run import ConfigError
 from icrl_dist.results import statistics, tables
-from icrl_dist.results.comparison import Comparison
 from icrl_dist.results.names import AgentKey, names
-from icrl_dist.results.summaries import Interval
-from tests.results.row_blocks import block, frame
-from tests.results.test_statistics import slow_bootstrap, slow_improvement, slow_iqm, slow_mean, slow_minimum, slow_ratio
+from tests.results.row_blocks import block, cells_of, frame, rendered, unwrapped
+from tests.results.test_statistics import (
+    STUDENT,
+    slow_bootstrap,
+    slow_improvement,
+    slow_interval,
+    slow_iqm,
+    slow_mean,
+    slow_minimum,
+    slow_ratio,
+)
 
 pytestmark = pytest.mark.integration
 
@@ -50,23 +56,6 @@ def runs(tmp_path_factory):
     return found
 
 
-def rendered(table):
-    output = io.StringIO()
-    Console(file=output, width=250).print(table)
-    return output.getvalue()
-
-
-def unwrapped(text):
-    return " ".join(text.split())
-
-
-def cells_of(text):
-    """The cells of the body of a printed table, by row, and its header."""
-    header = next(line for line in text.splitlines() if line.startswith("┃"))
-    body = [line for line in text.splitlines() if line.startswith("│")]
-    return [c.strip() for c in header.strip("┃").split("┃")], [[c.strip() for c in line.strip("│").split("│")] for line in body]
-
-
 def records(rows, **wanted):
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
@@ -92,25 +81,25 @@ def means(scores):
     return [[sum(cell) / len(cell) for cell in training] for training in scores]
 
 
-def percentiles(values):
-    values = sorted(value for value in values if not math.isnan(value))
-    bounds = []
-    for share in (0.025, 0.975):
-        place = share * (len(values) - 1)
-        below = math.floor(place)
-        above = min(below + 1, len(values) - 1)
-        bounds.append(values[below] + (place - below) * (values[above] - values[below]))
-    return bounds
+def bounds(value, values, probability=False):
+    """The interval of a number over two units, trainings or tasks: all tables here have two."""
+    low, high = slow_interval(value, list(values), 2)
+    if probability:
+        half = max(high - value, STUDENT[2] * math.sqrt(3 / 64))
+        low, high = max(value - half, 0.0), min(value + half, 1.0)
+    return low, high
 
 
-def drawn(scores, statistic):
+def drawn(scores, statistic, fixed=False):
     import numpy as np
 
-    return slow_bootstrap(np.array(scores), statistic, generator(0, RandomKey.RESULTS), statistics.RESAMPLES, crossed=True)
+    rng = generator(0, RandomKey.RESULTS)
+    return slow_bootstrap(np.array(scores), statistic, rng, statistics.RESAMPLES, crossed=True, fixed=fixed)
 
 
-def numbers(text):
-    return [float(number) for number in re.findall(r"-?\d+\.?\d*", text)]
+def with_bounds(form, value, interval):
+    low, high = (form.format(bound).removesuffix("%") for bound in interval)
+    return form.format(value) if math.isnan(interval[0]) else f"{form.format(value)} [{low}, {high}]"
 
 
 @pytest.mark.parametrize(("method", "seeds"), [("icag", [1]), ("icaa", [1]), ("icaa", [0, 1])])
@@ -141,7 +130,7 @@ def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method, 
         resampled = drawn([scores, oracle], slow_ratio)
         value, share = slow_mean(means(scores)), slow_mean(means(scores)) / slow_mean(means(oracle))
         assert cells[5] == f"{value:.1f}"
-        assert cells[6] == "{:.0%} [{:.0f}, {:.0f}]".format(share, *(100 * bound for bound in percentiles(resampled)))
+        assert cells[6] == with_bounds("{:.0%}", share, bounds(share, resampled))
 
 
 def test_without_a_ceiling_the_interval_is_that_of_the_return():
@@ -149,8 +138,8 @@ def test_without_a_ceiling_the_interval_is_that_of_the_return():
     header, (cells,) = cells_of(rendered(tables.returns_table(frame(block(returns)), "")))
     assert header[-1] == "last 3"
     scores = [[[sum(evaluation) / 3 for evaluation in task] for task in returns]]
-    low, high = percentiles(drawn([scores], slow_mean))
-    assert cells[-1] == f"{slow_mean(means(scores)):.1f} [{low:.1f}, {high:.1f}]"
+    value = slow_mean(means(scores))
+    assert cells[-1] == with_bounds("{:.1f}", value, bounds(value, drawn([scores], slow_mean)))
 
 
 def test_every_number_of_result_json_follows_from_the_rows(runs):
@@ -171,8 +160,8 @@ def test_every_number_of_result_json_follows_from_the_rows(runs):
         assert numbers_of["optimum"] == round(sum(optimum) / 2, 3)
         assert numbers_of["last5"] == round(slow_mean(means(nested(own, LAST))), 3)
         assert numbers_of["last5_over_optimum"] == round(slow_mean(means(nested(own, LAST))) / (sum(optimum) / 2), 4)
-        resampled = drawn([nested(own, LAST)], slow_mean)
-        assert numbers_of["last5_interval"] == pytest.approx([round(bound, 3) for bound in percentiles(resampled)], abs=0.0011)
+        expected = bounds(slow_mean(means(nested(own, LAST))), drawn([nested(own, LAST)], slow_mean))
+        assert numbers_of["last5_interval"] == pytest.approx(expected, rel=1e-4, abs=0.0011)
 
 
 def test_the_labels_that_training_reports_follow_from_the_rows(runs):
@@ -215,22 +204,24 @@ def test_every_number_of_a_comparison_follows_from_the_rows(runs):
             lambda x, y: (
                 slow_mean(y) - slow_mean(x),
                 slow_iqm(y) - slow_iqm(x),
-                slow_minimum(y) - slow_minimum(x),
+                math.nan,
                 slow_ratio(y, x) - 1,
                 slow_improvement(y, x),
             ),
         )
+        resampled[:, 2] = drawn(newest, lambda x, y: slow_minimum(y) - slow_minimum(x), fixed=True)
         single = [(of(first), of(second)) for of in (slow_mean, slow_iqm, slow_minimum)]
         effects = [two - one for one, two in single] + [slow_ratio(second, first) - 1, slow_improvement(second, first)]
         forms = ["{:+.2f}"] * 3 + ["{:+.1%}", "{:.0%}"]
         for i, cells in enumerate(body[5 * level : 5 * level + 5]):
-            low, high = percentiles(resampled[:, i])
+            low, high = bounds(effects[i], resampled[:, i], probability=i == 4)
             if i < 3:
                 assert [cells[2], cells[4]] == [f"{value:.2f}" for value in single[i]]
             assert cells[5] == forms[i].format(effects[i])
-            assert cells[6] == " .. ".join(forms[i].format(bound) for bound in (low, high))
+            expected = " .. ".join(forms[i].format(bound) for bound in (low, high))
+            assert cells[6] == ("-" if math.isnan(low) else expected)
             neutral = 0.5 if i == 4 else 0.0
-            assert cells[7] == ("not shown" if low <= neutral <= high else "higher" if low > neutral else "lower")
+            assert cells[7] == ("higher" if low > neutral else "lower" if high < neutral else "not shown")
 
 
 def test_the_examples_of_the_page_run(runs, capsys):
@@ -245,59 +236,3 @@ def test_the_examples_of_the_page_run(runs, capsys):
     comparing = re.sub(r', "runs/ica.-2"', "", comparing)  # two trainings of each were made
     exec(comparing, {})
     assert "not shown" in capsys.readouterr().out
-
-
-def test_an_effect_is_worded_by_its_interval():
-    def verdict(low, high, neutral=0.0):
-        return Comparison(0.0, "mean", 1.0, 2.0, Interval((low + high) / 2, low, high), neutral).verdict
-
-    assert [verdict(0.1, 2), verdict(-2, -0.1), verdict(-1, 2), verdict(0, 2)] == ["higher", "lower", "not shown", "not shown"]
-    assert [verdict(0.4, 0.9, 0.5), verdict(0.6, 0.9, 0.5), verdict(math.nan, math.nan)] == ["not shown", "higher", "not shown"]
-
-
-def test_one_training_makes_no_claim_over_seeds():
-    text = rendered(tables.compare(frame(block([[[1.0]], [[2.0]]])), frame(block([[[3.0]], [[5.0]]]))))
-    assert "one training: 95% interval over 2 tasks" in unwrapped(text)
-    assert "it says nothing about other training seeds" in unwrapped(text) and "higher" in text
-
-
-TWO = [[[1.0, 2.0]], [[3.0, 4.0]]]
-
-
-@pytest.mark.parametrize(
-    ("other", "expected"),
-    [
-        (block(TWO, seed=1), r"training seeds are \(0,\) .* and \(1,\)"),
-        (block([[[1.0, 2.0]] * 2] * 2), r"evaluation seeds are \(0,\) .* and \(0, 1\)"),
-        (block([[[1.0]], [[2.0]]]), r"episodes are 2 .* and 1"),
-        (block(TWO[:1]), r"tasks are 2 .* and 1"),
-        (block(TWO, split_seed=3), r"training seed 0, task 0: .*split seed 0, .*split seed 3"),
-        (block(TWO, adversary='{"p": 0.1}'), r"rows are paired by split seed, task and adversary"),
-        (block(TWO, task='{"goal": 9}'), r'task \{"goal": 9\}'),
-        (block(TWO, p=0.2), r"evaluated at no p in common"),
-    ],
-)
-def test_rows_that_cannot_be_paired_are_refused(other, expected):
-    with pytest.raises(ConfigError, match=expected) as refused:
-        tables.compare(frame(block(TWO)), frame(other))
-    assert "\n" not in str(refused.value)
-
-
-def test_rows_that_are_no_full_grid_are_refused():
-    whole = frame(block(TWO))
-    with pytest.raises(ConfigError, match=r"t0, p = 0: 3 rows for 1 trainings, 2 tasks, 1 evaluations and 2 episodes"):
-        tables.returns_table(whole.iloc[:3], "")
-    with pytest.raises(ConfigError, match="choose rows of runs with different seeds"):
-        tables.returns_table(frame(block(TWO), block(TWO, run="same-seed")), "")
-    with pytest.raises(ConfigError, match="method is dpt, icaa; choose one"):
-        tables.returns_table(frame(block(TWO), block(TWO, "t1", method="icaa")), "")
-    with pytest.raises(ConfigError, match="there are none"):
-        tables.returns_table(whole.iloc[:0], "")
-    with pytest.raises(ConfigError, match="needs one agent of these: random, oracle"):
-        tables.compare(frame(block(TWO, "random"), block(TWO, "oracle")), whole)
-
-
-def test_the_newest_model_is_compared_by_the_rule_that_it_was_trained_for():
-    blocks = [block([[[value]]], "t3", deployment=rule) for value, rule in ((5.0, "committed"), (1.0, "paper"))]
-    text = rendered(tables.compare(frame(block([[[4.0]]], "t0")), frame(block([[[2.0]]], "t0"), *blocks)))
-    assert cells_of(text)[1][0][3:5] == ["T^3 (dpt)", "5.00"]
