@@ -14,7 +14,6 @@ import psutil
 import pytest
 
 from icrl_dist.agent.loading import load_agent
-from icrl_dist.cli import main
 from icrl_dist.config.run import load
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems.darkroom.exact_agents import RULES
@@ -134,10 +133,11 @@ def test_tap_and_the_documented_script_print_one_line_per_trajectory(undisturbed
         assert sum(i.startswith("adapt/1") for i in identities) == 14 * (20 + 1), name
 
 
-def test_evaluate_prints_returns_and_those_of_the_oracle(undisturbed, capsys):
-    words = ["evaluate", str(undisturbed[0]), "--episodes", "2", "--seeds", "2", "--p", "0", "0.4", "--json"]
-    assert main.main(words) == 0
-    rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
+def test_evaluate_prints_returns_and_those_of_the_oracle(undisturbed):
+    process = start("evaluate", undisturbed[0], "--episodes", "2", "--seeds", "2", "--p", "0", "0.4", "--json")
+    output = finish(process)
+    assert process.returncode == 0, output
+    rows = json.loads(output.splitlines()[-1])["rows"]
     agents = 4 + len(RULES)
     assert [row["p"] for row in rows] == [0.0] * agents + [0.4] * agents
     assert all(len(row["episodes"]) == 2 for row in rows)

@@ -17,6 +17,7 @@ from tests.results.test_evaluate import folder
 __all__ = ["folder"]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("suite", ["online", "offline", "posterior"])
 def test_an_evaluation_from_python_is_that_of_the_command(folder, suite, monkeypatch, capsys):
     output = io.StringIO()
@@ -45,6 +46,7 @@ def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(fol
     assert "this run is not finished" in printed and "held-out evaluation" in printed
 
 
+@pytest.mark.integration
 def test_an_agent_of_the_package_is_named_and_a_path_is_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = icrl_dist.evaluate("darkroom", suite="offline", seeds=1, p=[0.0])
