@@ -7,6 +7,7 @@ checkpoint written.
 from __future__ import annotations
 
 import os
+import select
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, train
-from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
 from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_type, with_problem
@@ -74,13 +75,39 @@ def _check_settings(words: Sequence[str], kind: type[Run], problem: str = "") ->
             former_names.check({section: {key: None}}, names_of(kind), problem, flag)
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError  # for ``main``; rich would exit with code 1
+
+
 def main(words: Sequence[str] | None = None) -> int:
-    """Run ``icrl-dist`` with these words (default: ``sys.argv``).  Returns the exit code."""
-    words = list(sys.argv[1:] if words is None else words)
+    """Run ``icrl-dist`` with these words (default: ``sys.argv``).  Returns the exit code.
+
+    If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
+    """
+    try:
+        try:
+            return _run(list(sys.argv[1:] if words is None else words))
+        finally:
+            sys.stdout.flush()  # else Python would find a closed pipe only when it exits
+    except BrokenPipeError:
+        if not _output_is_closed():
+            raise  # another pipe
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at exit
+        return BROKEN_PIPE
+
+
+def _output_is_closed() -> bool:
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _run(words: list[str]) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: decision 073
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
-    console = Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
+    console = _Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
     if not words or words[0] in ("--help", "-h"):
         print(_help())
         return OK if words else USAGE

@@ -274,3 +274,14 @@ def test_our_packages_are_the_ones_imported():
 
     roots = {os.path.dirname(os.path.dirname(known(package.__file__))) for package in (actors, learner, icrl_dist)}  # noqa: PTH120
     assert len(roots) == 1
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("words", ["train --help", "bench --help", "explain RUN", "explain RUN pretrain/0/0/0/0", "--version"])
+def test_a_reader_that_closes_the_pipe_ends_a_command_without_a_message(small_run, tmp_path, words):
+    train.prepare(small_run, tmp_path / "run", resume=False, overwrite=False)
+    train.train_inline(small_run, tmp_path / "run", lambda event: None)
+    command = f"{shlex.quote(sys.executable)} -m icrl_dist.cli {words.replace('RUN', str(tmp_path / 'run'))}"
+    script = f"{command} > >(exec 0<&-); echo $?"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=120)
+    assert (done.stdout, done.stderr) == ("141\n", "")

@@ -29,6 +29,8 @@ from tests.results.row_blocks import block, frame
 
 __all__ = ["no_tensorboard"]
 
+pytestmark = pytest.mark.integration
+
 
 def state():
     """What a run could change in its process."""

@@ -1,4 +1,5 @@
-"""A run folder as version 0.1.0 left it is evaluated, watched, explained, continued and forked; another format is refused."""
+"""A run folder with the names of version 0.1.0 and data of the present format is evaluated, watched, explained, continued and
+forked; data of another format is refused."""
 
 from __future__ import annotations
 
