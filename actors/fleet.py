@@ -10,13 +10,12 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from actors import local
 from actors.cluster import Cluster, brief
-from actors.placement import Node, Placement
+from actors.placement import EndedWorker, Node, Placement, check_cores
 from actors.ray_actor import WorkerActor
 from icrl_dist.config.run import ConfigError
 
@@ -43,13 +42,6 @@ _PAUSE_S = 0.25
 
 class FleetFailed(RuntimeError):  # noqa: N818
     """Workers die repeatedly, or Ray does not start; the message contains the last cause."""
-
-
-def check_cores(actors: int) -> None:
-    """Raises ConfigError if this machine has fewer than ``actors`` cores: Ray would never start the remaining workers."""
-    cores = len(os.sched_getaffinity(0))
-    if actors > cores:
-        raise ConfigError(f"--actors {actors}: this machine has {cores} cores; ask for at most {cores}")
 
 
 class Fleet:
@@ -103,7 +95,7 @@ class Fleet:
         self.lost: list[str] = []
         """Names of the workers that were lost with their nodes, in the order of detection; they caused no failure."""
         self._running: dict[Any, tuple[int, Any, str]] = {}
-        self._undecided: list[_EndedWorker] = []
+        self._undecided: list[EndedWorker] = []
         self._recent_deaths: list[tuple[float, int, str, str]] = []
         """Counted deaths: time, worker number, node identifier, worker name."""
         self._spare: Any = None
@@ -209,7 +201,7 @@ class Fleet:
             try:
                 self._ray.get(work)
             except Exception as error:
-                due.append(_EndedWorker(index, actor, node_id, error))
+                due.append(EndedWorker(index, actor, node_id, error))
             else:
                 self._remove_stopped(index)
         for ended in due:
@@ -257,7 +249,7 @@ class Fleet:
             node.workers.discard(index)
             node.cores -= 1
 
-    def _handle_end(self, ended: _EndedWorker, note: Callable[[str], None], progress: int) -> None:
+    def _handle_end(self, ended: EndedWorker, note: Callable[[str], None], progress: int) -> None:
         """Find out whether a worker died by itself, which costs a restart, or with its node, and restart it.
 
         Ray lists a node as alive for 15 s and longer after its end, but reports a broken connection at
@@ -269,7 +261,7 @@ class Fleet:
                 self._lost_with_node(index, actor)
                 return
             if isinstance(error, self._ray.exceptions.RayActorError) and not self._cluster.reachable(node_id):
-                self._undecided.append(_EndedWorker(index, actor, node_id, error, time.monotonic() + RECHECK_S))
+                self._undecided.append(EndedWorker(index, actor, node_id, error, time.monotonic() + RECHECK_S))
                 return
             self._kill(actor)  # it may still run, and nothing would detect its end
             self._recent_deaths.append((time.monotonic(), index, node_id, self._name(index)))
@@ -323,15 +315,3 @@ def _connected(address: str | None, actors: int | None, note: Callable[[str], No
         except (ConnectionError, ray.exceptions.AuthenticationError) as error:
             raise ConfigError(f"--address {address}: {error}; `ray status` there shows whether a cluster is up") from None
     return ray
-
-
-@dataclass(frozen=True, eq=False)
-class _EndedWorker:
-    """A worker that has ended, by itself or with its node."""
-
-    index: int
-    actor: Any
-    node_id: str
-    error: Exception
-    due: float = 0.0
-    """Time at which to find out how it ended."""

@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
+
+from icrl_dist.config.run import ConfigError
+
+
+def check_cores(actors: int) -> None:
+    """Raises ConfigError if this machine has fewer than ``actors`` cores: Ray would never start the remaining workers."""
+    cores = len(os.sched_getaffinity(0))
+    if actors > cores:
+        raise ConfigError(f"--actors {actors}: this machine has {cores} cores; ask for at most {cores}")
 
 
 @dataclass
@@ -85,3 +96,15 @@ class Placement:
 def _list(workers: Iterable[int], name: Callable[[int], str]) -> str:
     names = [name(worker) for worker in sorted(workers)]
     return " ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]}, {len(names)} workers"
+
+
+@dataclass(frozen=True, eq=False)
+class EndedWorker:
+    """A worker that has ended, by itself or with its node."""
+
+    index: int
+    actor: Any
+    node_id: str
+    error: Exception
+    due: float = 0.0
+    """Time at which to find out how it ended."""

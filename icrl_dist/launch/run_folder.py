@@ -312,21 +312,3 @@ class FolderTransaction:
             self.commit()
         else:
             self.roll_back()
-
-
-_PRODUCED = ("dataset_digest", "weights_digest", "version", "trajectories")
-
-
-def final_result(folder: Path, result: dict[str, Any], evaluation: dict[str, Any]) -> dict[str, Any]:
-    """The content of ``result.json``: the result of the training and of the evaluation.
-
-    If a finished run was resumed, the seconds of its first end are kept; if nothing was collected or
-    fitted since then, everything but the evaluation is kept.
-    """
-    try:
-        earlier: dict[str, Any] = json.loads((folder / "result.json").read_text())
-    except (FileNotFoundError, ValueError):
-        return result | evaluation
-    if any(earlier.get(name) != result.get(name) for name in _PRODUCED) or result.get("repaired"):
-        return result | {"seconds": earlier.get("seconds", result["seconds"])} | evaluation
-    return earlier | {"folder": result["folder"]} | evaluation

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from actors import local
-from actors.fleet import check_cores
+from actors.placement import check_cores
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, override
 from icrl_dist.console.display import ReportEvent, Show, reporting
-from icrl_dist.launch import run_folder
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.run_folder import FolderTransaction
 from icrl_dist.storage.files import atomic_write, hold
@@ -109,7 +108,7 @@ def train(
         except launch.TrainInterrupted:
             raise _interrupted(folder, transaction) from None
         result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
-        result = run_folder.final_result(folder, result, evaluation.summary)
+        result = _final_result(folder, result, evaluation.summary)
         atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
     return TrainResult(folder, result, evaluation)
 
@@ -161,3 +160,21 @@ def _interrupted(folder: Path, transaction: FolderTransaction) -> launch.TrainIn
     if not folder.exists():
         return launch.TrainInterrupted("nothing had been done yet", resumable=False)
     return launch.TrainInterrupted(f"{folder} holds the checkpoint: resume=True, or --resume, continues from it")
+
+
+_PRODUCED = ("dataset_digest", "weights_digest", "version", "trajectories")
+
+
+def _final_result(folder: Path, result: dict[str, Any], evaluation: dict[str, Any]) -> dict[str, Any]:
+    """The content of ``result.json``: the result of the training and of the evaluation.
+
+    If a finished run was resumed, the seconds of its first end are kept; if nothing was collected or
+    fitted since then, everything but the evaluation is kept.
+    """
+    try:
+        earlier: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    except (FileNotFoundError, ValueError):
+        return result | evaluation
+    if any(earlier.get(name) != result.get(name) for name in _PRODUCED) or result.get("repaired"):
+        return result | {"seconds": earlier.get("seconds", result["seconds"])} | evaluation
+    return earlier | {"folder": result["folder"]} | evaluation

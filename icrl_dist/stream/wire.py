@@ -327,5 +327,4 @@ def _hash(head: list[object], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
 
 @functools.lru_cache(maxsize=1024)
 def _title(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
-    packed: bytes = msgpack.packb([name, dtype, shape])
-    return packed
+    return bytes(msgpack.packb([name, dtype, shape]))
