@@ -34,7 +34,7 @@ def digest_of(module: str) -> str:
         spec = next((one for one in specs if one is None or one.origin is not None), None)
     except (ImportError, ValueError):
         return ""
-    if spec is None or spec.origin is None:
+    if spec is None or spec.origin is None or not spec.has_location:  # a module of Python itself may have no file
         return ""
     if spec.submodule_search_locations is None:
         file = Path(spec.origin)

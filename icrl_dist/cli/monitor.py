@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import threading
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from rich.console import Console
 
 from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, OK
 from icrl_dist.config.run import ConfigError, load_folder
+from icrl_dist.console.signals import on_signals
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,8 @@ def tap(arguments: TapArguments, console: Console) -> int:
     endpoint, certificates, run = _learner_of(arguments.what, arguments.connect, arguments.certificates)
     ended = threading.Event()
     tapped = TapWriter(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, ended.set)
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, lambda *_: ended.set())
-    with ZenohLink.connect(endpoint, arguments.timeout, security.client(certificates, "monitor")) as link:
+    client = security.client(certificates, "monitor")
+    with on_signals(ended.set), ZenohLink.connect(endpoint, arguments.timeout, client) as link:
         link.subscribe(f"icrl/{run or '*'}/mon/trajectories/**", tapped)
         ended.wait()
     if tapped.error is None:

@@ -9,15 +9,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.console.display import ReportEvent
+from icrl_dist.console.signals import on_signals
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.learner_process import TrainFailed
@@ -140,7 +140,7 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
                 service.fail(RunFailed(f"the worker failed: {error}"))
 
         thread = threading.Thread(target=work, name="worker", daemon=True)
-        with _on_signals(service.stop):
+        with on_signals(service.stop):
             thread.start()
             try:
                 result = service.run()
@@ -188,7 +188,7 @@ def train_ray(
     certificates = security.folder(run.stream.certificates)  # an absolute path: workers have another working directory
     interrupted = threading.Event()
     with contextlib.ExitStack() as stack:
-        handle_again = stack.enter_context(_on_signals(interrupted.set))
+        handle_again = stack.enter_context(on_signals(interrupted.set))
         if address is None:  # without a cluster both start at once; on a cluster the nodes are checked first
             learner = stack.enter_context(learner_process.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
@@ -262,28 +262,4 @@ def interruptible() -> contextlib.AbstractContextManager[object]:
     def interrupt() -> None:
         raise TrainInterrupted
 
-    return _on_signals(interrupt)
-
-
-@contextlib.contextmanager
-def _on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
-    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them.
-
-    The former handlers are set at the end.  Outside the main thread Python allows no handlers, and nothing is changed.
-    """
-    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
-    signals = [number for number in numbers if signal.getsignal(number) is not None]  # another could not be set again
-
-    def handle() -> list[Any]:
-        return [signal.signal(number, lambda *_: stop()) for number in signals]
-
-    before = handle()
-    try:
-        yield handle
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
-
-
-def _in_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()
+    return on_signals(interrupt)

@@ -7,7 +7,6 @@ import contextlib
 import json
 import logging
 import math
-import signal
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +16,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
+from icrl_dist.console.signals import on_signals
 from icrl_dist.monitor.event_stream import EventStream
 from icrl_dist.monitor.feed import Feed
 from icrl_dist.monitor.serve import application, serving
@@ -119,9 +119,7 @@ def serving_run(feed: Feed, host: str, port: int) -> Iterator[str]:
 def serve(feed: Feed, host: str, port: int, console: Console) -> int:
     """Serve the page until Ctrl-C or SIGTERM; returns the exit code.  Raises ConfigError if the address cannot be used."""
     over = threading.Event()
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, lambda *_: over.set())
-    with serving_run(feed, host, port) as url:
+    with on_signals(over.set), serving_run(feed, host, port) as url:
         console.print(f"the live view is at {url}  (Ctrl-C ends the view, not the run)", highlight=False, soft_wrap=True)
         over.wait()
     return 0

@@ -14,13 +14,13 @@ def installed(patch, **groups):
 
     ``patch``: a ``pytest.MonkeyPatch``.  A string in place of a class is an entry point, ``module:class``.
     """
-    caches = (plugins.find, plugins.sections, run._packaged, registry.problem)
+    caches = (plugins.find, plugins.sections, plugins.sources, run._packaged, registry.problem)
     entries = plugins._entries
 
     def entry(group, name, made):
         if isinstance(made, str):
             return metadata.EntryPoint(name, made, f"icrl_dist.{group}")
-        return SimpleNamespace(name=name, load=lambda: made)
+        return SimpleNamespace(name=name, module=made.__module__, dist=None, load=lambda: made)
 
     def with_toys(group):
         return {**entries(group), **{name: entry(group, name, made) for name, made in groups.get(group, {}).items()}}
