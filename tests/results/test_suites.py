@@ -25,7 +25,7 @@ def test_an_evaluation_from_python_is_that_of_the_command(folder, suite, monkeyp
     found = icrl_dist.evaluate(folder, suite=suite, episodes=6, seeds=2, p=[0.0, 0.2])
     assert torch.equal(torch.get_rng_state(), random)
     assert capsys.readouterr().out == ""
-    monkeypatch.setattr(main, "Console", lambda *_, **__: Console(file=output, width=120, soft_wrap=True))
+    monkeypatch.setattr(main, "_Console", lambda *_, **__: Console(file=output, width=120, soft_wrap=True))
     words = ["evaluate", str(folder), "--suite", suite, "--episodes", "6", "--seeds", "2", "--p", "0", "0.2", "--json"]
     assert main.main(words) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(found.summary))

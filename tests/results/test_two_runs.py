@@ -49,7 +49,7 @@ def runs(tmp_path_factory):
             for seed in (0, 1):
                 printed, folder = io.StringIO(), base / f"{method}-{seed}"
                 console = Console(file=printed, width=250)
-                patch.setattr(main, "Console", lambda *_, console=console, **__: console)
+                patch.setattr(main, "_Console", lambda *_, console=console, **__: console)
                 words = ["train", "smoke", "--method", method, "--seed", str(seed), *TINY, "--out", str(folder)]
                 assert main.main(words) == 0, printed.getvalue()
                 found[method, seed] = SimpleNamespace(folder=folder, printed=printed.getvalue())
