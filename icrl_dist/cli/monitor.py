@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, OK
+from icrl_dist.cli.exit_codes import FAILED, OK
 from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.console.signals import on_signals
 
@@ -118,9 +118,9 @@ def tap(arguments: TapArguments, console: Console) -> int:
         ended.wait()
     if tapped.error is None:
         return OK
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python must not try to flush the rest at exit
     if isinstance(tapped.error, BrokenPipeError):
-        return BROKEN_PIPE
+        raise tapped.error  # ``main`` ends every command alike whose reader has gone
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python must not try to flush the rest at exit
     print(f"icrl-dist: tap: standard output cannot be written: {tapped.error.strerror}", file=sys.stderr)
     return FAILED
 
