@@ -10,7 +10,7 @@ from icrl_dist.config.run import ConfigError
 
 
 class AgentKey(NamedTuple):
-    """The columns of result rows that tell the agents of one suite apart."""
+    """The columns of result rows by which the agents of one suite differ."""
 
     agent: str
     deployment: str = ""

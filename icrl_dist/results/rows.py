@@ -200,8 +200,8 @@ def _read(path: Path) -> pa.Table:
     for field in schema:
         if not field.nullable and (missing := table.column(field.name).null_count):
             raise StoreError(
-                f"{path}: {missing} of {len(table)} rows have no {field.name}, so they can be neither told apart nor paired: "
-                "move the file away, and evaluate again"
+                f"{path}: {missing} of {len(table)} rows have no {field.name}, so they can be neither distinguished nor "
+                "paired: move the file away, and evaluate again"
             )
     tested = ~np.isin(table.column("suite").to_numpy(), _WITHOUT_P)
     for name, needed in (("return", np.ones(len(table), bool)), ("p", tested)):
@@ -218,9 +218,9 @@ def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = Fal
     If several evaluations of a run evaluated one agent alike (equal columns ``REPEATED``), the frame holds the rows of the
     newest only.
 
-    ``unfinished``: also read runs whose training has not finished; ``all``: the rows of all evaluations, which the column
-    ``evaluation`` tells apart.  Raises ConfigError for a folder without results
-    and for an unfinished run, StoreError for a file of another format.
+    ``unfinished``: also read runs whose training has not finished; ``all``: the rows of all evaluations, which differ in
+    the column ``evaluation``.  Raises ConfigError for a folder without results and for an unfinished run, StoreError for
+    a file of another format.
     """
     import pandas as pd
 
