@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import json
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any
@@ -23,7 +22,7 @@ from icrl_dist.config.sac import SACConfig
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import calibrated_strength
 from icrl_dist.problems.continuous.disturbance import Make, Report, Setting
-from icrl_dist.storage.files import atomic_write
+from icrl_dist.storage.files import write_json
 from icrl_dist.types import Task, Variation
 
 COMPETENT = 0.25
@@ -181,7 +180,7 @@ def _store(row: dict[str, Any]) -> None:
     others = [old for old in calibrated_strength.own() if any(old[name] != row[name] for name in key)]
     file = calibrated_strength.own_file()
     file.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(file, lambda out: out.write(json.dumps([*others, row], indent=1).encode() + b"\n"))
+    write_json(file, [*others, row])
 
 
 def describe_row(row: dict[str, Any]) -> str:

@@ -18,7 +18,7 @@ import torch
 from icrl_dist.bench import incontext_cost as cost
 from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.bench import peer
-from icrl_dist.storage.files import atomic_write
+from icrl_dist.storage.files import write_json
 
 FLOORS = {"training": 600.0, "deployment": 1100.0}
 """Contexts, and environment steps in 20 environments, per CPU-second of the official code."""
@@ -112,7 +112,7 @@ def _trainings(path: Path, seeds: range, report: Report) -> dict[str, Any]:
 
 
 def _save(path: Path, content: dict[str, Any]) -> None:
-    atomic_write(path, lambda file: file.write(json.dumps(content, indent=1).encode()))
+    write_json(path, content)
 
 
 def _settings() -> dict[str, Any]:

@@ -16,7 +16,7 @@ from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, overri
 from icrl_dist.console.display import ReportEvent, Show, reporting
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.storage.files import atomic_write, hold
+from icrl_dist.storage.files import hold, write_json
 from icrl_dist.storage.fork import parse_source
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def train(
             raise _interrupted(folder, transaction) from None
         result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
         result = _final_result(folder, result, evaluation.summary)
-        atomic_write(folder / "result.json", lambda file: file.write(json.dumps(result, indent=1).encode() + b"\n"))
+        write_json(folder / "result.json", result)
     return TrainResult(folder, result, evaluation)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,7 @@ from icrl_dist.problems import registry
 from icrl_dist.results import plots, summaries
 from icrl_dist.results.returns import Returns, returns
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
-from icrl_dist.storage.files import atomic_write
+from icrl_dist.storage.files import write_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +61,7 @@ def online(run: Run, report: Path, frame: pd.DataFrame) -> Evaluation:
     numbers, scores, found = summaries.result_rows(frame), summaries.surprise(frame), returns(frame)
     _, tasks, evaluations, _ = found[0].returns.shape
     title = f"{run.method.upper()} on {registry.of(run).title(tasks)}, {evaluations} seeds"
-    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(numbers, indent=1).encode()))
+    write_json(report.with_name(f"{report.name}.json"), numbers)
     figure = plots.adaptation(numbers, report.with_name(f"{report.name}.png"), title)
     surprises = [
         f"surprise at the end, p = {p}: median {score['median']:.2f}, above 1 in {score['above_1']:.0%}"
@@ -100,7 +99,7 @@ def posterior(run: Run, report: Path, frame: pd.DataFrame, found: dict[str, Any]
     """
     problem = registry.of(run)
     title = f"{run.method.upper()} compared with the exact posterior: {problem.title(len(problem.evaluated))}"
-    atomic_write(report.with_name(f"{report.name}.json"), lambda file: file.write(json.dumps(found, indent=1).encode()))
+    write_json(report.with_name(f"{report.name}.json"), found)
     figure = plots.agreement(found, report.with_name(f"{report.name}.png"), title)
     assert problem.posterior is not None, "``check_suite`` refuses problems without one"
     tables = [

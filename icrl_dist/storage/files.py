@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import json
 import os
 import time
 from collections.abc import Callable
@@ -65,6 +66,12 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
     finally:
         part.unlink(missing_ok=True)
     sync_folder(path.parent)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write JSON values to ``path`` as ``atomic_write`` does, indented, with a newline at the end."""
+    content = json.dumps(value, indent=1).encode() + b"\n"
+    atomic_write(path, lambda file: file.write(content))
 
 
 def sync_folder(folder: Path) -> None:

@@ -15,7 +15,7 @@ from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder, parse_written
 from icrl_dist.storage.checkpoint import load_checkpoint, newest_version, require_format, version_file
 from icrl_dist.storage.dataset import Dataset
-from icrl_dist.storage.files import StoreError, atomic_write
+from icrl_dist.storage.files import StoreError, write_json
 from icrl_dist.storage.sharing import adopt
 from icrl_dist.types import Identity
 
@@ -105,7 +105,7 @@ def fork(theirs: Path, version: int, run: Run, folder: Path) -> None:
         "dataset_digest": manifest["dataset_digest"],
         "ancestors": [{"version": newest, "run": dumps(ancestor)} for newest, ancestor in ancestors],
     }
-    atomic_write(folder / _FILE, lambda file: file.write(json.dumps(record, indent=1).encode()))
+    write_json(folder / _FILE, record)
 
 
 def _check_same(parent: Run, run: Run, what: str) -> None:

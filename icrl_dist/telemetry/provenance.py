@@ -18,7 +18,7 @@ from typing import Any
 
 from icrl_dist import __version__, version
 from icrl_dist.config import plugins
-from icrl_dist.storage.files import atomic_write
+from icrl_dist.storage.files import write_json
 
 LIBRARIES = (
     *("torch", "numpy", "scipy", "gymnasium", "mujoco", "dm-control", "metaworld", "stable-baselines3"),
@@ -132,8 +132,7 @@ def add_session(folder: Path, policy_version: int, made_by: Mapping[str, Any]) -
 
 
 def _write(folder: Path, records: list[dict[str, Any]]) -> None:
-    content = json.dumps({"sessions": records}, indent=1) + "\n"
-    atomic_write(folder / FILE, lambda file: file.write(content.encode()))
+    write_json(folder / FILE, {"sessions": records})
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
