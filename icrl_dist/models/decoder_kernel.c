@@ -358,12 +358,13 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
                 long visible[QUERIES], b = (start + i / heads) / length;
                 int count = 0;
                 if (alone && i % heads == 0) put(m, l, b, past, normed + i / heads * wide);
-                for (; count < QUERIES && i < rows * heads; count++, i++) {
+                for (; count < QUERIES && i < rows * heads; i++) {
                     long row = start + i / heads;
                     if (row / length != b || (alone && count && i % heads == 0)) break;
+                    if (l == m->layers - 1 && row % length < first) continue; /* nobody reads its final state */
                     query[count] = q + i / heads * q_wide + i % heads * width;
                     to[count] = attended + i / heads * q_wide + i % heads * width;
-                    visible[count] = past + (alone ? 0 : row % length) + 1;
+                    visible[count++] = past + (alone ? 0 : row % length) + 1;
                 }
                 attend(m, l, b, query, to, visible, count, mixed);
             }
