@@ -76,7 +76,7 @@ class Decoder:
 
     def __init__(self, trunk: GPT, batch: int) -> None:
         with torch.no_grad():
-            self._layers = layers_of(trunk)
+            self._layers = [_Layer.of(cast(Block, block)) for block in trunk.blocks]
             self._norm = weight_and_bias(trunk.norm)
         self._batch = batch
         self.clear()
@@ -204,11 +204,6 @@ class Decoder:
             scores[..., -len(x) :].masked_fill_(hidden[:, None], float("-inf"))
             x = layer.attn_out_and_mlp(x, (scores.softmax(-1) @ visible).flatten(1))
         return _layer_norm(x[new:], self._norm)
-
-
-def layers_of(trunk: GPT) -> list[_Layer]:
-    """Copies of a trunk's layers, in the form that deployment uses."""
-    return [_Layer.of(cast(Block, block)) for block in trunk.blocks]
 
 
 def weight_and_bias(module: nn.Module) -> Linear:

@@ -383,4 +383,23 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
     }
 }
 
+/* Rows x (rows, inputs) times a padded matrix, plus a bias: to (rows, columns). */
+TARGET void NAMED(icrl_linear, KIND)(float *to, const float *x, const float *weight, const float *bias, int inputs, int columns,
+                                     int rows) {
+    const Linear layer = {weight, bias};
+    linear(to, columns, x, inputs, layer, inputs, rows, 0);
+}
+
+/* Softmax of each row of x (rows, columns), in place; the first n numbers of a row count, the others become 0. */
+TARGET void NAMED(icrl_softmax, KIND)(float *x, int columns, int n, int rows) {
+    for (int r = 0; r < rows; r++, x += columns) {
+        float highest = x[0], total = 0.0f;
+        for (int i = 1; i < n; i++) highest = x[i] > highest ? x[i] : highest;
+        for (int i = 0; i < columns; i += LANES)
+            store(x + i, choose(first_lanes(n - i), exponential(sub(load(x + i), all(highest))), all(0.0f)));
+        for (int i = 0; i < n; i++) total += x[i];
+        for (int i = 0; i < n; i++) x[i] /= total;
+    }
+}
+
 #endif

@@ -1,6 +1,7 @@
-"""The decoder of ``models.decoder`` through a compiled kernel: ``decoder_kernel.c``, built when the package is.
+"""The deployed trunk through a compiled kernel, ``decoder_kernel.c``, with numpy and without torch.
 
-Results are equal to torch's to 1e-5, and equal bit by bit on all processors that the kernel runs on.
+Results are equal to those of ``models.decoder`` to 1e-5, and equal bit by bit on all processors that the
+kernel runs on.  It is built when the package is installed, if there is a C compiler.
 """
 
 from __future__ import annotations
@@ -8,20 +9,16 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib.util
-from typing import cast
+import platform
+from collections.abc import Mapping
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-from torch.nn import functional as F
+import numpy as np
+from jaxtyping import Float32
 
-from icrl_dist.models.decoder import Linear, layers_of, weight_and_bias
-from icrl_dist.models.gpt import GPT
-
-_LANES = 16
-_BLOCKS = 4
+_LANES, _BLOCKS = 16, 4
 _CHUNK = _LANES * _BLOCKS
 _KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",)}
+"""The instruction sets that the C file names, by machine, each including the ones before it."""
 
 _Pair = ctypes.c_void_p * 2
 
@@ -45,55 +42,119 @@ class _Decoder(ctypes.Structure):
 
 
 @functools.cache
-def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None where it was not built."""
+def _library() -> ctypes.CDLL | None:
     found = importlib.util.find_spec("icrl_dist.models._decoder_kernel")
     return None if found is None or found.origin is None else ctypes.CDLL(found.origin)
 
 
 @functools.cache
 def kinds() -> tuple[str, ...]:
-    """The instruction sets for which the kernel was built and which this processor has, the best one last."""
-    import platform
+    """The instruction sets that the kernel can use on this processor, the widest last; none if it was not built."""
+    library = _library()
+    return () if library is None else _KINDS.get(platform.machine(), ())[: library.icrl_kinds()]
 
-    built = library()
-    return () if built is None else _KINDS.get(platform.machine(), ())[: built.icrl_kinds()]
+
+class Kernel:
+    """The functions of the kernel for one instruction set; None: the widest of this processor.
+
+    Raises RuntimeError if the kernel was not built or cannot be used here.
+    """
+
+    def __init__(self, kind: str | None = None) -> None:
+        library = _library()
+        if library is None or not kinds() or (kind or kinds()[-1]) not in kinds():
+            raise RuntimeError(f"kernel {kind or ''}: this installation has {', '.join(kinds()) or 'none'} for this processor")
+        self.kind = kind or kinds()[-1]
+        pointer, number = ctypes.c_void_p, ctypes.c_int
+        self.run = self._function("run", pointer, pointer, pointer, *[ctypes.c_long] * 3, number)
+        self._linear = self._function("linear", *[pointer] * 4, *[number] * 3)
+        self._softmax = self._function("softmax", pointer, *[number] * 3)
+        library.icrl_work.restype = ctypes.c_long
+        self.work_size = library.icrl_work
+
+    def _function(self, name: str, *arguments: type) -> ctypes._NamedFuncPointer:
+        found = getattr(_library(), f"icrl_{name}_{self.kind}")
+        found.argtypes, found.restype = arguments, None
+        return found
+
+    def linear(self, x: Float32[np.ndarray, "R I"], weight: Float32[np.ndarray, "I C"], bias: Float32[np.ndarray, " C"]) -> np.ndarray:
+        """``x @ weight + bias``; each sum over I runs in order, beginning with the bias.  C is a multiple of 16."""
+        x = np.ascontiguousarray(x, np.float32)
+        to = np.empty((len(x), weight.shape[1]), np.float32)
+        self._linear(address(to), address(x), address(weight), address(bias), *weight.shape, len(x))
+        return to
+
+    def softmax(self, x: Float32[np.ndarray, "R C"], n: int) -> Float32[np.ndarray, "R n"]:
+        """The softmax of the first n numbers of each row, in place; C is a multiple of 16."""
+        self._softmax(address(x), x.shape[1], n, len(x))
+        return x[:, :n]
+
+
+def address(array: np.ndarray) -> int:
+    """Where the numbers of an array begin."""
+    found: int = array.__array_interface__["data"][0]
+    return found
+
+
+def padded(array: np.ndarray) -> Float32[np.ndarray, "*N C"]:
+    """The array with its last axis filled up with zeros to a multiple of 16."""
+    fill = -array.shape[-1] % _LANES
+    return np.ascontiguousarray(np.pad(np.asarray(array, np.float32), [(0, 0)] * (array.ndim - 1) + [(0, fill)]))
 
 
 class KernelDecoder:
-    """``models.decoder.Decoder``, through the kernel: one fused pass, float32 on a CPU, one thread."""
+    """``models.decoder.Decoder`` through the kernel: B growing contexts, float32, one thread.
 
-    def __init__(self, trunk: GPT, batch: int, kind: str | None = None) -> None:
-        built = library()
-        assert built is not None, "the kernel was not built"
-        self._run = getattr(built, f"icrl_run_{kind or kinds()[-1]}")
-        self._run.argtypes = [ctypes.c_void_p] * 3 + [ctypes.c_long] * 3 + [ctypes.c_int]
-        self._run.restype = None
-        self._batch, self._width = batch, trunk.norm.normalized_shape[0]
-        with torch.no_grad():
-            layers = layers_of(trunk)
-            self._kept: list[Tensor] = []
-            """What the kernel has pointers to."""
-            pointers = (_Layer * len(layers))()
-            for to, layer in zip(pointers, layers, strict=True):
-                for name, of in zip(("norm_attention", "query", "out", "norm_mlp", "up", "down"), layer[1:], strict=True):
-                    setattr(to, name, self._pointers(cast(Linear, of)))
-            work = torch.zeros(built.icrl_work(self._width, layers[0].heads))
-            self._kept.append(work)
-            self._layers = len(layers)
-            self._decoder = _Decoder(
-                self._width, layers[0].heads, len(layers), batch, pointers, self._pointers(weight_and_bias(trunk.norm)), None, work.data_ptr()
-            )
+    ``weights``: those of ``models.gpt.GPT``, by their names there.  They are copied.
+    """
+
+    def __init__(self, weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel) -> None:
+        self._kernel, self._batch, self._width = kernel, batch, len(weights["norm.weight"])
+        self._kept: list[np.ndarray] = []
+        """What the kernel has pointers to."""
+        self._layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
+        layers = (_Layer * self._layers)()
+        for number, layer in enumerate(layers):
+            self._fill(layer, {n.split(".", 2)[2]: w for n, w in weights.items() if n.startswith(f"blocks.{number}.")}, heads)
+        work = np.zeros(kernel.work_size(self._width, heads), np.float32)
+        self._kept.append(work)
+        norm = self._pair(weights["norm.weight"], weights["norm.bias"])
+        self._decoder = _Decoder(self._width, heads, self._layers, batch, layers, norm, None, address(work))
         self._address = ctypes.addressof(self._decoder)
-        self._chunks: list[Tensor] = []
+        self._chunks: list[np.ndarray] = []
         self.length = 0
         """Tokens in each context."""
 
-    def _pointers(self, of: Linear) -> ctypes.Array[ctypes.c_void_p]:
-        """Weight and bias as the kernel reads them: inputs as rows, columns padded with zeros."""
-        tensors = [F.pad(t, (0, -t.shape[-1] % _LANES)).contiguous() for t in (of[0].T, of[1])]
-        self._kept += tensors
-        return _Pair(*(t.data_ptr() for t in tensors))
+    def _fill(self, layer: _Layer, block: Mapping[str, np.ndarray], heads: int) -> None:
+        """The weights of one block, with W_k multiplied into the queries and W_v into the output projection.
+
+        ``models.decoder._Layer`` does the same with torch and says why.
+        """
+        d = self._width
+        e = d // heads
+        wq, wk, wv = block["qkv.weight"].reshape(3, heads, e, d)
+        bq, _, bv = block["qkv.bias"].reshape(3, heads, e)
+        out = block["out.weight"].reshape(d, heads, e).transpose(1, 2, 0)
+        # A query's matrix and bias, then both scaled: (heads, D + 1, D).
+        query = np.stack([self._product(np.vstack([wq[h].T, bq[h]]), wk[h]) for h in range(heads)]) * np.float32(e**-0.5)
+        mixed = np.concatenate([self._product(wv[h].T, out[h]) for h in range(heads)])
+        passed = self._product(bv.reshape(1, d), out.reshape(d, d))[0]
+        layer.norm_attention = self._pair(block["norm_attention.weight"], block["norm_attention.bias"])
+        layer.query = self._pair(query[:, :-1].transpose(1, 0, 2).reshape(d, heads * d), query[:, -1].reshape(-1))
+        layer.out = self._pair(mixed, block["out.bias"] + passed)
+        layer.norm_mlp = self._pair(block["norm_feed.weight"], block["norm_feed.bias"])
+        layer.up = self._pair(block["feed.0.weight"].T, block["feed.0.bias"])
+        layer.down = self._pair(block["feed.2.weight"].T, block["feed.2.bias"])
+
+    def _product(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """``a @ b``, with sums in the kernel's order."""
+        wide = padded(b)
+        return self._kernel.linear(a, wide, np.zeros(wide.shape[1], np.float32))[:, : b.shape[1]]
+
+    def _pair(self, weight: np.ndarray, bias: np.ndarray) -> ctypes.Array[ctypes.c_void_p]:
+        pair = [padded(weight), padded(bias)]
+        self._kept += pair
+        return _Pair(*map(address, pair))
 
     def clear(self) -> None:
         """Empty every context."""
@@ -101,50 +162,48 @@ class KernelDecoder:
 
     def _reserve(self, tokens: int) -> None:
         """Make room for contexts of that many tokens."""
-        if len(self._chunks) * _CHUNK >= tokens:
-            return
-        while len(self._chunks) * _CHUNK < tokens:
-            # Zeros: lanes without a token are multiplied by a weight of 0.
-            self._chunks.append(torch.zeros(self._layers, self._batch, _BLOCKS, self._width, _LANES))
-        self._pointers_to_chunks = self._chunk_pointers(0)
-        self._decoder.chunks = self._pointers_to_chunks
+        if len(self._chunks) * _CHUNK < tokens:
+            while len(self._chunks) * _CHUNK < tokens:
+                # Zeros, because lanes without a token are multiplied by a weight of 0.
+                self._chunks.append(np.zeros((self._layers, self._batch, _BLOCKS, self._width, _LANES), np.float32))
+            self._pointers = self._chunk_pointers(0)
+            self._decoder.chunks = self._pointers
 
     def _chunk_pointers(self, row: int) -> ctypes.Array[ctypes.c_void_p]:
         """Pointers to the chunks, from context ``row`` on."""
-        places = [chunk[layer, row].data_ptr() for chunk in self._chunks for layer in range(self._layers)]
+        places = [address(chunk) + layer * chunk.strides[0] + row * chunk.strides[1] for chunk in self._chunks for layer in range(self._layers)]
         return (ctypes.c_void_p * len(places))(*places)
 
-    def append(self, x: Float[Tensor, "B T D"]) -> None:
+    def append(self, x: Float32[np.ndarray, "B T D"]) -> None:
         """Append embedded tokens to the contexts; each token sees its whole context up to itself."""
-        new = x.shape[1]
-        self._reserve(self.length + new)
-        x = x.contiguous()
-        self._run(self._address, x.data_ptr(), None, self.length, new, new, 0)
-        self.length += new
+        self._pass(x, x.shape[1])
+        self.length += x.shape[1]
 
-    def query(self, x: Float[Tensor, "B D"]) -> Float[Tensor, "B D"]:
+    def query(self, x: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B D"]:
         """Final states of one query token per context, which sees its context and itself."""
-        self._reserve(self.length + 1)
-        x, states = x.contiguous(), torch.empty(self._batch, self._width)
-        self._run(self._address, x.data_ptr(), states.data_ptr(), self.length, 1, 0, 0)
-        return states
+        return self._pass(x[:, None], 0)
 
-    def window(self, x: Float[Tensor, "B L D"], arrived: Float[Tensor, "B D"] | None = None) -> Float[Tensor, "B D"]:
+    def window(self, x: Float32[np.ndarray, "B L D"], arrived: Float32[np.ndarray, "B D"] | None = None) -> Float32[np.ndarray, "B D"]:
         """Final state of the last token of one window per context.
 
         Each token of the window sees its context, the tokens before it in the window, and itself.  A
         token ``arrived`` joins the context first.
         """
-        new = int(arrived is not None)
-        x = (x if arrived is None else torch.cat([arrived[:, None], x], dim=1)).contiguous()
-        tokens, states = x.shape[1], torch.empty(self._batch, self._width)
-        self._reserve(self.length + tokens)
-        self._run(self._address, x.data_ptr(), states.data_ptr(), self.length, tokens, tokens - 1, 0)
-        # The window's tokens stay in the chunks, after the end of the context: the next ones overwrite them.
-        self.length += new
+        x = x if arrived is None else np.concatenate([arrived[:, None], x], axis=1)
+        states = self._pass(x, x.shape[1] - 1)
+        # The window's tokens stay after the end of the context; the next tokens overwrite them.
+        self.length += int(arrived is not None)
         return states
 
-    def query_row(self, row: int, x: Float[Tensor, "Q D"], appended: Float[Tensor, "E D"]) -> Float[Tensor, "Q D"]:
+    def _pass(self, x: Float32[np.ndarray, "B T D"], first: int) -> Float32[np.ndarray, "B D"]:
+        """Pass T tokens per context through the layers; the final states of those from ``first`` on, one or none."""
+        x = np.ascontiguousarray(x, np.float32)
+        self._reserve(self.length + x.shape[1])
+        states = np.empty((self._batch, self._width), np.float32)
+        self._kernel.run(self._address, address(x), address(states), self.length, x.shape[1], first, 0)
+        return states
+
+    def query_row(self, row: int, x: Float32[np.ndarray, "Q D"], appended: Float32[np.ndarray, "E D"]) -> Float32[np.ndarray, "Q D"]:
         """Final states of Q query tokens, each of which sees the whole of context ``row`` and itself.
 
         They also see the ``appended`` tokens, as if these had joined the context.  The decoder does not change.
@@ -153,9 +212,8 @@ class KernelDecoder:
         self._reserve(self.length + new + 1)
         one, chunks = _Decoder.from_buffer_copy(self._decoder), self._chunk_pointers(row)
         one.batch, one.chunks = 1, chunks
-        address, states = ctypes.addressof(one), torch.empty(queries, self._width)
-        x, appended = x.contiguous(), appended.contiguous()
-        if new:
-            self._run(address, appended.data_ptr(), None, self.length, new, new, 0)
-        self._run(address, x.data_ptr(), states.data_ptr(), self.length + new, queries, 0, 1)
+        at, states = ctypes.addressof(one), np.empty((queries, self._width), np.float32)
+        x, appended = np.ascontiguousarray(x, np.float32), np.ascontiguousarray(appended, np.float32)
+        self._kernel.run(at, address(appended), address(states), self.length, new, new, 0)
+        self._kernel.run(at, address(x), address(states), self.length + new, queries, 0, 1)
         return states
