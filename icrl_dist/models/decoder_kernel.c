@@ -5,7 +5,7 @@
    processors.  Compile with -ffp-contract=off, so that the compiler fuses nothing by itself, and without
    -ffast-math.
 
-   Context tokens (normalized states, as in models/decoder.py) are stored in chunks of 64 per context: 4
+   Context tokens (normalized states, as in models/decoder.py) are stored in chunks of 128 per context: 8
    blocks of D rows of 16 tokens.  The 16 lanes of a V are 16 tokens, so scores need no sum over lanes.
    Softmax is online and by lane: each lane has its own maximum and sums, and the lanes are merged at the
    end.  So a decision reads each token from memory once.
@@ -17,7 +17,7 @@
 #include <stdint.h>
 
 #define LANES 16
-#define BLOCKS 4               /* per chunk */
+#define BLOCKS 8               /* per chunk */
 #define CHUNK (LANES * BLOCKS) /* tokens per chunk */
 #define ROWS 16                /* tokens that pass through the layers together */
 #define QUERIES 4              /* queries of one context that read a chunk together */
@@ -34,6 +34,7 @@ typedef struct {
     Linear norm;
     float **chunks; /* chunk c of layer l at [c * layers + l]: (batch, BLOCKS, width, LANES) */
     float *work;    /* icrl_work() numbers */
+    int32_t far_away; /* whether the chunks are so large that they do not stay in the second-level cache */
 } Decoder;
 
 static inline int padded(int n) { return (n + LANES - 1) / LANES * LANES; }
@@ -53,15 +54,18 @@ long icrl_work(int width, int heads) {
 #define KIND avx2
 #define TARGET __attribute__((target("avx2,fma")))
 #define REGISTERS 2
+#define TOGETHER 4 /* blocks whose sums fit into registers */
 #define FMA _mm256_fmadd_ps
 #include "decoder_kernel.c"
 #undef KIND
 #undef TARGET
 #undef REGISTERS
+#undef TOGETHER
 #undef FMA
 #define KIND avx512
 #define TARGET __attribute__((target("avx512f,avx2,fma")))
 #define REGISTERS 1
+#define TOGETHER 8
 #define FMA _mm512_fmadd_ps
 #include "decoder_kernel.c"
 
@@ -75,6 +79,7 @@ int icrl_kinds(void) {
 #define KIND neon
 #define TARGET
 #define REGISTERS 4
+#define TOGETHER 4
 #define FMA(a, b, c) vfmaq_f32(c, a, b)
 #include "decoder_kernel.c"
 int icrl_kinds(void) { return 1; }
@@ -244,36 +249,55 @@ INLINE void linear(float *to, int columns, const float *x, int stride, const Lin
     }
 }
 
-/* `count` queries of one context read one chunk; query g sees the first limit[g] tokens of it.
-   mixed: (count, width, LANES), the sums of tokens by lane. */
+/* The scores of `count` queries for n blocks of tokens, from block k0 of a chunk on: weight[g][k] for query g
+   and block k.  `next`, unless 0, is brought nearer: as many numbers as are read here. */
+#define scores NAMED(scores, KIND)
+INLINE void scores(V weight[][BLOCKS], const float *const *q, const float *chunk, const float *next, int width, int count, int k0,
+                   int n) {
+    UNROLL for (int g = 0; g < count; g++) UNROLL for (int k = 0; k < n; k++) weight[g][k0 + k] = all(0.0f);
+    for (int d = 0; d < width; d++) UNROLL for (int k = 0; k < n; k++) {
+        if (next) __builtin_prefetch(next + ((k0 * width + d * n) + k) * LANES, 0, 2);
+        V token = load(chunk + ((k0 + k) * width + d) * LANES);
+        UNROLL for (int g = 0; g < count; g++) weight[g][k0 + k] = fma(token, all(q[g][d]), weight[g][k0 + k]);
+    }
+}
+
+/* Add the tokens of these blocks, times their weights, to `mixed` (count, width, LANES), which is multiplied
+   by correction[g] first if this is given. */
+#define mix NAMED(mix, KIND)
+INLINE void mix(float *mixed, V weight[][BLOCKS], const V *correction, const float *chunk, int width, int count, int k0, int n) {
+    for (int d = 0; d < width; d++) UNROLL for (int g = 0; g < count; g++) {
+        float *place = mixed + (g * width + d) * LANES;
+        V part = load(place);
+        if (correction) part = mul(part, correction[g]);
+        UNROLL for (int k = 0; k < n; k++) part = fma(load(chunk + ((k0 + k) * width + d) * LANES), weight[g][k0 + k], part);
+        store(place, part);
+    }
+}
+
+/* `count` queries of one context read the first `live` blocks of a chunk; query g sees its first limit[g]
+   tokens.  mixed, highest and total: the sums so far, by lane. */
 #define attend_chunk NAMED(attend_chunk, KIND)
 INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const *q, const float *chunk, const float *next,
-                         const int *limit, int width, int count) {
+                         const int *limit, int width, int count, int live) {
     V weight[QUERIES][BLOCKS], correction[QUERIES];
-    UNROLL for (int g = 0; g < count; g++) UNROLL for (int k = 0; k < BLOCKS; k++) weight[g][k] = all(0.0f);
-    for (int d = 0; d < width; d++) UNROLL for (int k = 0; k < BLOCKS; k++) {
-        __builtin_prefetch(next + (d * BLOCKS + k) * LANES, 0, 2);
-        V token = load(chunk + (k * width + d) * LANES);
-        UNROLL for (int g = 0; g < count; g++) weight[g][k] = fma(token, all(q[g][d]), weight[g][k]);
-    }
+    int head = live < TOGETHER ? live : TOGETHER;
+    scores(weight, q, chunk, next, width, count, 0, head);
+    if (live > head) scores(weight, q, chunk, next, width, count, head, live - head);
     UNROLL for (int g = 0; g < count; g++) {
         V before = highest[g];
-        UNROLL for (int k = 0; k < BLOCKS; k++)
+        UNROLL for (int k = 0; k < live; k++)
             highest[g] = choose(first_lanes(limit[g] - k * LANES), maximum(highest[g], weight[g][k]), highest[g]);
         correction[g] = exponential(sub(before, highest[g]));
         total[g] = mul(total[g], correction[g]);
-        UNROLL for (int k = 0; k < BLOCKS; k++) {
+        UNROLL for (int k = 0; k < live; k++) {
             V e = exponential(sub(weight[g][k], highest[g]));
             weight[g][k] = choose(first_lanes(limit[g] - k * LANES), e, all(0.0f));
             total[g] = add(total[g], weight[g][k]);
         }
     }
-    for (int d = 0; d < width; d++) UNROLL for (int g = 0; g < count; g++) {
-        float *place = mixed + ((long)g * width + d) * LANES;
-        V part = mul(load(place), correction[g]);
-        UNROLL for (int k = 0; k < BLOCKS; k++) part = fma(load(chunk + (k * width + d) * LANES), weight[g][k], part);
-        store(place, part);
-    }
+    mix(mixed, weight, correction, chunk, width, count, 0, head);
+    if (live > head) mix(mixed, weight, 0, chunk, width, count, head, live - head);
 }
 
 /* Attention of up to QUERIES queries of context b in layer l, query g over its first visible[g] tokens.
@@ -297,13 +321,20 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
         }
         const float *chunk = m->chunks[c * m->layers + l] + offset;
         /* What is read next: this context's next chunk, or the next context's first one. */
-        const float *next = (c + 1) * CHUNK < most ? m->chunks[(c + 1) * m->layers + l] + offset
-                                                   : m->chunks[l] + (b + 1 < m->batch ? offset + CHUNK * width : 0);
+        const float *next = !m->far_away                ? 0
+                            : (c + 1) * CHUNK < most ? m->chunks[(c + 1) * m->layers + l] + offset
+                                                     : m->chunks[l] + (b + 1 < m->batch ? offset + CHUNK * width : 0);
         if (count == QUERIES)
-            attend_chunk(mixed, highest, total, q, chunk, next, limit, width, QUERIES);
+            attend_chunk(mixed, highest, total, q, chunk, next, limit, width, QUERIES, BLOCKS);
         else
             for (int g = 0; g < count; g++)
-                attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, next, limit + g, width, 1);
+                switch ((limit[g] + LANES - 1) / LANES) {
+#define LIVE(n)                                                                                                               \
+    case n:                                                                                                                   \
+        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, next, limit + g, width, 1, n);          \
+        break;
+                    LIVE(1) LIVE(2) LIVE(3) LIVE(4) LIVE(5) LIVE(6) LIVE(7) LIVE(8)
+                }
     }
     for (int g = 0; g < count; g++) {
         float lanes[LANES], top;
