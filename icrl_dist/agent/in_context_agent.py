@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.outcome_readout import OutcomeModel
 
 
-class InContextAgent:
+class InContextAgent(CopiedWhole):
     """T_theta deployed in B environments at once, without weight updates.
 
     ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` records the transition.  With the deployment

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from icrl_dist.config import former_names, plugins
 from icrl_dist.config.ranges import Seed
@@ -76,9 +76,21 @@ class Run:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     alerts: AlertsConfig = field(default_factory=AlertsConfig)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By the settings, because a class that ``run_type`` makes has no name of its own by which pickle could find it."""
+        settings = {name: getattr(self, name) for name in names_of(type(self))}
+        return _remade, (type(self) is Run, settings)
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self  # a run and its sections cannot change
+
     def section(self, name: str) -> Any:
         """The section of this name; sections of the problem and of methods are included."""
         return getattr(self, name)
+
+
+def _remade(without_sections: bool, settings: dict[str, Any]) -> Run:
+    return (Run if without_sections else run_type(settings["problem"]))(**settings)
 
 
 def run_type(problem: str | None) -> type[Run]:

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.types import Variation
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ Action = np.int64 | np.ndarray[Any, np.dtype[np.float32]]
 Image = np.ndarray[Any, np.dtype[np.uint8]]
 
 
-class VariationEnv(gymnasium.Env[Observation, Action]):
+class VariationEnv(CopiedWhole, gymnasium.Env[Observation, Action]):
     """The MDP (S, A, P_{tau,phi}, R_{tau,phi}, gamma, rho_tau) of section 4.1.
 
     An episode is truncated at the horizon or when the simulation breaks down (``info["diverged"]``); it is

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int64
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Transitions, Windows
 
@@ -19,7 +20,7 @@ def default_deployment(model: ModelConfig) -> Deployment:
     return "committed" if model.window > 1 else "paper"
 
 
-class InContextPolicy:
+class InContextPolicy(CopiedWhole):
     """T_theta(. | s, D_on): the context is frozen within an episode and grows at its end.
 
     Lines 10 to 17 of Algorithm 1.  A context longer than ``context.max`` drops its oldest episodes and
@@ -91,7 +92,7 @@ class InContextPolicy:
         if self._watch is not None and self._deployed.state is not None:
             self._watch(self._deployed.state.cpu().numpy(), observation, action, reward, next_observation)
             self._deployed.state = None
-        self._pending.append((observation, action, next_observation, reward))
+        self._pending.append(tuple(np.array(column) for column in (observation, action, next_observation, reward)))
         if done:
             self._add_own(self._ended_episode())
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float64, Int, UInt8
 
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.problems.darkroom.adversaries import override_distribution
 from icrl_dist.types import Spec, Step, Task, Variation
 
@@ -64,7 +65,7 @@ def next_cell(size: int) -> Int[np.ndarray, "C A"]:
     return table
 
 
-class DarkRoom:
+class DarkRoom(CopiedWhole):
     """B variation environments of one size and horizon, stepped as one batch."""
 
     def __init__(self, variations: Sequence[Variation]) -> None:
