@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 from icrl_dist.config import former_names, plugins
+from icrl_dist.config.paths import path_of
 from icrl_dist.config.ranges import Seed
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import (
@@ -146,8 +147,9 @@ def load_run(what: str | Path, *settings: str) -> Run:
     ``dataclasses.replace(run, seed=3)`` changes a run too; ``icrl_dist.train`` checks it.
     Raises ConfigError, with the nearest name, for an unknown run or key, and for an impossible value.
     """
-    is_path = isinstance(what, Path) or "/" in what
-    run = load_folder(Path(what)) if is_path and Path(what).is_dir() else load(str(what))
+    path = path_of("what", what)
+    is_path = not isinstance(what, str) or "/" in what
+    run = load_folder(path) if is_path and path.is_dir() else load(str(path) if is_path else str(what))
     return override(run, settings, str(what))
 
 

@@ -207,7 +207,7 @@ class Decoder:
             normed = _layer_norm(x, layer.norm_attention)
             visible = torch.cat([tokens[row, :-1], recent[row, : self._recent_count], normed])
             # (E + Q, heads * D) -> (E + Q, heads, D): all heads share the tokens.
-            q = F.linear(normed, *layer.query).view(len(x), layer.heads, -1)
+            q = F.linear(normed, *layer.query).view(len(x), layer.heads, x.shape[1])
             scores = q @ visible.T
             scores[..., -len(x) :].masked_fill_(hidden[:, None], float("-inf"))
             x = layer.attn_out_and_mlp(x, (scores.softmax(-1) @ visible).flatten(1))

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from icrl_dist.agent.loading import SHIPPED, checkpoint_file, shipped
+from icrl_dist.agent.loading import SHIPPED, agent_checkpoint, checkpoint_file, shipped
+from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
-from icrl_dist.storage.checkpoint import load_checkpoint
 
 Suite = Literal["online", "offline", "posterior"]
 Prior = Literal["uniform", "unseen"]
@@ -53,7 +53,7 @@ def evaluate(
     for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
         if value is not None and value not in get_args(choices):
             raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
-    run = parse_written(str(load_checkpoint(checkpoint_file(source)).manifest.get("run", "")), str(source))
+    run = parse_written(str(agent_checkpoint(checkpoint_file(source)).manifest["run"]), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,
@@ -87,5 +87,5 @@ def _source_and_output(what: str | Path) -> tuple[Path, Path]:
     """The run folder or checkpoint to evaluate, and the folder that its report and result rows are written below."""
     if what in SHIPPED:
         return shipped(what), Path("runs") / f"{what}-pretrained"
-    source = Path(what)
+    source = path_of("what", what)
     return source, source if source.is_dir() else source.parent

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int64
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
+from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Transitions, Windows
@@ -178,6 +179,9 @@ class CommittedPolicy(InContextPolicy):
             self._deployed.append(Transitions(*(column[:, encoded:] for column in episode)))
 
 
+_RULES: dict[Deployment, type[InContextPolicy]] = {"paper": InContextPolicy, "committed": CommittedPolicy}
+
+
 def in_context(
     model: PretrainedTransformer,
     batch: int,
@@ -189,12 +193,14 @@ def in_context(
 
     ``watch`` is called after every decision with the decision and its outcome.
 
-    Raises ConfigError for ``committed`` if the model was not trained on action windows.
+    Raises ConfigError for an unknown rule, and for ``committed`` if the model was not trained on action windows.
     """
-    rule = deploy or default_deployment(model.config)
+    rule = default_deployment(model.config) if deploy is None else deploy
+    if rule not in _RULES:
+        raise ConfigError(f"deploy = {rule!r}{nearest(str(rule), tuple(_RULES))}: choose {' or '.join(_RULES)}")
     if rule == "committed" and model.config.window == 1:
         raise ConfigError(
             "deploy 'committed': this agent was not trained on action windows (model.window = 1); "
             "deploy it by 'paper', or train with model.window, pretrain.windows and optim.windows"
         )
-    return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context, watch)
+    return _RULES[rule](model, batch, context, watch)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from icrl_dist.config.paths import folder_of
 from icrl_dist.config.run import ConfigError
 from icrl_dist.copies import NotCopied
 from icrl_dist.storage.dataset import Dataset
@@ -25,9 +26,7 @@ def read_dataset(run_dir: str | Path) -> StoredData:
     --resume`` collects them again.
     Raises ConfigError if the folder holds no run, StoreError for a dataset of another format.
     """
-    folder = Path(run_dir)
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such run folder; `icrl-dist train demo` makes one in runs/demo")
+    folder = folder_of("run_dir", run_dir)
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"{folder}: holds no run; name a run folder, such as runs/demo")
     return StoredData(Dataset(folder / "dataset", readonly=True))

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from icrl_dist.copies import CopiedWhole
+from icrl_dist.problems.checks import check_generators
 from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.dmc.domains import AXES, HORIZON, Preset, check, problem, spec
 from icrl_dist.problems.dmc.suite import BROKEN, DOMAINS, Rows, check_step, observed, rendered
@@ -80,8 +81,7 @@ class DMC(CopiedWhole):
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
         """Start an episode in every row as in dm_control, with the row's generator."""
-        if len(rngs) != self.batch:
-            raise ValueError(f"dmc: {len(rngs)} generators for {self.batch} rows")
+        check_generators("dmc", self.batch, rngs)
         for env, rng in zip(self._envs, rngs, strict=True):
             env.task.random.seed(int(rng.integers(2**32)))
             with env.physics.reset_context():

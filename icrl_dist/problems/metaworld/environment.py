@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from icrl_dist.copies import CopiedWhole
+from icrl_dist.problems.checks import check_generators
 from icrl_dist.problems.continuous.network_adversary import Networks
 from icrl_dist.problems.dmc.suite import BROKEN, check_step, rendered
 from icrl_dist.problems.metaworld import pick_place
@@ -97,8 +98,7 @@ class PickPlace(CopiedWhole):
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
         """Start an episode in every row.  The initial state of a task is fixed, so nothing is rendered."""
-        if len(rngs) != self.batch:
-            raise ValueError(f"metaworld: {len(rngs)} generators for {self.batch} rows")
+        check_generators("metaworld", self.batch, rngs)
         self._truth = np.stack([env.reset()[0] for env in self._envs])
         self._truth[:, _GOAL] = self._goals
         self._h = 0
