@@ -23,7 +23,7 @@ def test_wrong_uses_are_refused_with_the_argument_and_clear_ones_are_accepted(tm
     assert (ran.stdout, ran.returncode) == ("", 0), ran.stderr
 
 
-@pytest.mark.parametrize("command", [["evaluate"], ["export"], ["play", "--port", "0"]], ids=lambda command: command[0])
+@pytest.mark.parametrize("command", [["evaluate"], ["export"], ["play", "--web", "0"]], ids=lambda command: command[0])
 def test_a_command_refuses_a_file_that_is_no_checkpoint_without_numpys_advice(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
