@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -27,7 +27,7 @@ def evaluate(
     deploy: Deployment | None = None,
     episodes: int | None = None,
     seeds: int | None = None,
-    p: Sequence[float] | None = None,
+    p: Sequence[float] | float | None = None,
     prior: Prior | None = None,
     progress: Show = False,
 ) -> Evaluation:
@@ -57,7 +57,7 @@ def evaluate(
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,
-        "p": None if p is None else tuple(map(float, p)),
+        "p": None if p is None else _numbers("p", p),
         "prior": prior,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -81,6 +81,15 @@ def evaluate(
             found = reports.posterior(run, report, *heldout.posterior(run, source, results, show))
     answer = {"suite": suite, "deploy": rule, "what": str(source)}
     return dataclasses.replace(found, summary=answer | found.summary)
+
+
+def _numbers(name: str, value: Sequence[float] | float) -> tuple[float, ...]:
+    """Several numbers, or a single one."""
+    listed = value if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
+    try:
+        return tuple(map(float, listed))
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} = {value!r}: expected a number or a list of numbers") from None
 
 
 def _source_and_output(what: str | Path) -> tuple[Path, Path]:
