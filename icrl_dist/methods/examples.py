@@ -63,5 +63,11 @@ def cache(
 def draw(run: Run, pools: Sequence[Pool]) -> Draw:
     """What draws the training batches of these pools (``training.batches.draw``)."""
     optim = run.optim
-    sizes = {"batch": optim.batch, "queries": optim.queries, "transitions": optim.transitions, "windows": optim.windows}
-    return functools.partial(batches.draw, pools=pools, **sizes)
+    return functools.partial(
+        batches.draw,
+        pools=pools,
+        batch=optim.batch,
+        queries=optim.queries,
+        transitions=optim.transitions,
+        windows=optim.windows,
+    )

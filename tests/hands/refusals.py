@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def closed() -> Any:
 def over() -> Any:
     env = begun(room())
     for _ in range(3):
-        env.step(0)
+        env.step(np.int64(0))
     return env
 
 
@@ -101,7 +102,7 @@ TASKS: list[Case] = [
     (lambda: registry.batch([]), "one problem"),
 ]
 ENVIRONMENTS: list[Case] = [
-    (lambda: icrl_dist.make(room()).step(0), "reset"),
+    (lambda: icrl_dist.make(room()).step(np.int64(0)), "reset"),
     (lambda: icrl_dist.make(room(), "rgb_array").render(), "reset"),
     (lambda: over().step(0), "horizon of 3.*reset"),
     (lambda: closed().step(0), "closed"),
@@ -220,17 +221,17 @@ def files(folder: Path) -> list[Case]:
     wrong += [folder / "arrays.npz", folder / "torch.pt", no_agent]
     readers: tuple[Callable[[Any], object], ...] = (icrl_dist.load_agent, icrl_dist.evaluate)
     cases: list[Case] = [
-        (lambda read=read, path=path: read(path), f"{path.name}.*(not a checkpoint of this system|holds no agent)")
+        (partial(read, path), f"{path.name}.*(not a checkpoint of this system|holds no agent)")
         for read in readers
         for path in wrong
     ]
     all_readers = (*readers, icrl_dist.load_run, icrl_dist.read_dataset, icrl_dist.read_results)
     for read in all_readers:
         name = {"read_dataset": "run_dir", "read_results": "runs"}.get(read.__name__, "what")
-        cases += [(lambda read=read, odd=odd: read(odd), f"{name} = .*expected a path") for odd in (b"runs/demo", "", None, 5)]
+        cases += [(partial(read, odd), f"{name} = .*expected a path") for odd in (b"runs/demo", "", None, 5)]
         cases += [
-            (lambda read=read: read(folder / "missing"), "no such"),
-            (lambda read=read: read("x" * 5000), "what|runs|run_dir|no packaged run"),
+            (partial(read, folder / "missing"), "no such"),
+            (partial(read, "x" * 5000), "what|runs|run_dir|no packaged run"),
         ]
     cases += [
         (lambda: icrl_dist.load_agent(folder / "folder"), "holds no checkpoint"),
@@ -295,6 +296,7 @@ def tensors(value: Any) -> Any:
 
 
 def accepted() -> None:
+    int_like: Any = np.int64(0)
     usual, cheetah = played(), pushed(np.asarray)
     ways: list[tuple[str, object, object]] = [
         ("lists", played(lists), usual),
@@ -306,7 +308,7 @@ def accepted() -> None:
         ("float64 as an action", pushed(lambda action: action.astype(np.float64)), cheetah),
         (
             "a numpy seed",
-            icrl_dist.load_agent("darkroom", seed=np.int64(0)).act([[0, 0]]).tolist(),
+            icrl_dist.load_agent("darkroom", seed=int_like).act([[0, 0]]).tolist(),
             agent().act([[0, 0]]).tolist(),
         ),
         ("several threads", in_threads(), [usual] * 4),

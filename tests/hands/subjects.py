@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -176,6 +177,14 @@ def policy_of(name: str, make: Callable[[], Policy], spec: Spec = SPEC) -> Subje
     return Subject(f"policy-{name}", make, turn)
 
 
+def deployed(kind: type[InContextPolicy], spec: Spec) -> InContextPolicy:
+    return kind(model(spec), ROWS, CONTEXT)
+
+
+def walk(kind: str) -> Walks:
+    return Walks(4, 40, [kind] * ROWS, generators(0, ROWS))
+
+
 def _goals() -> list[Variation]:
     return [Variation(room.task(divmod(cell, 4), 4, 4), Adversary.of("uniform", p=0.2)) for cell in range(16)]
 
@@ -230,21 +239,21 @@ SUBJECTS = [
     agent_of("darkroom-paper", lambda: icrl_dist.load_agent("darkroom", seed=0, deploy="paper")),
     agent_of("vectors", vector_agent),
     *(
-        policy_of(f"{kind.__name__}-{name}", lambda kind=kind, spec=spec: kind(model(spec), ROWS, CONTEXT), spec)
+        policy_of(f"{kind.__name__}-{name}", partial(deployed, kind, spec), spec)
         for kind in (InContextPolicy, CommittedPolicy)
         for name, spec in (("discrete", SPEC), ("vectors", VECTORS))
     ),
-    *(policy_of(f"exact-{rule}", lambda rule=rule: exact(rule)) for rule in RULES),
+    *(policy_of(f"exact-{rule}", partial(exact, rule)) for rule in RULES),
     policy_of("optimal", optimal),
     policy_of("expert", expert, VECTORS),
     policy_of("random", lambda: RandomPolicy(5)),
     policy_of("random-vectors", RandomVectorPolicy, VECTORS),
-    *(policy_of(f"walk-{kind}", lambda kind=kind: Walks(4, 40, [kind] * ROWS, generators(0, ROWS))) for kind in KINDS),
+    *(policy_of(f"walk-{kind}", partial(walk, kind)) for kind in KINDS),
     policy_of("scripted", scripted, registry.spec(noisy_pick_place().task)),
     reads("run", lambda: load("smoke"), lambda run: run),
     reads("run-dmc", lambda: load("dmc-cheetah-run"), lambda run: run),
     *(
-        reads(f"problem-{name}", lambda name=name: registry.problem(name), lambda problem: problem.spec)
+        reads(f"problem-{name}", partial(registry.problem, name), lambda problem: problem.spec)
         for name in ("darkroom", "dmc-walker-run", "metaworld-pick-place")
     ),
     reads("exact-answers", lambda: registry.problem("darkroom").exact, lambda exact: exact.optimum([disturbed_room()])),
