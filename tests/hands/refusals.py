@@ -225,7 +225,12 @@ def files(folder: Path) -> list[Case]:
         for read in readers
         for path in wrong
     ]
-    all_readers = (*readers, icrl_dist.load_run, icrl_dist.read_dataset, icrl_dist.read_results)
+    all_readers: tuple[Callable[[Any], object], ...] = (
+        *readers,
+        icrl_dist.load_run,
+        icrl_dist.read_dataset,
+        icrl_dist.read_results,
+    )
     for read in all_readers:
         name = {"read_dataset": "run_dir", "read_results": "runs"}.get(read.__name__, "what")
         cases += [(partial(read, odd), f"{name} = .*expected a path") for odd in (b"runs/demo", "", None, 5)]
