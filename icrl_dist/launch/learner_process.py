@@ -18,6 +18,10 @@ from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
 
 
+CHECKPOINT_S = 60.0
+"""Seconds that a learner has to write its checkpoint when the run ends."""
+
+
 class TrainFailed(RuntimeError):  # noqa: N818
     """The run failed; the message is one line for the user."""
 
@@ -46,20 +50,33 @@ class LearnerProcess:
         self._start()
 
     def _start(self) -> None:
-        command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
         self._log = (self._folder / "learner.err").open("ab")
-        pipe = subprocess.PIPE
         environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}  # idle torch threads sleep: decision 073
-        self._process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True, env=environment
-        )
-        threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
+        events, write_end = os.pipe()
+        try:
+            command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
+            command += ["--events", str(write_end), "--driver", str(os.getpid())]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=self._log,
+                stderr=self._log,
+                pass_fds=(write_end,),
+                start_new_session=True,
+                env=environment,
+            )
+        except BaseException:
+            os.close(events)
+            raise
+        finally:
+            os.close(write_end)
+        threading.Thread(target=self._read, args=(events,), name="learner events", daemon=True).start()
 
-    def _read(self, process: subprocess.Popen[bytes]) -> None:
-        assert process.stdout is not None
-        with process.stdout:
-            for line in process.stdout:
-                self._queue.put(json.loads(line))
+    def _read(self, events: int) -> None:
+        with open(events, "rb") as lines:
+            for line in lines:
+                if line.endswith(b"\n"):  # else the learner was killed while it wrote the line
+                    self._queue.put(json.loads(line))
 
     def events(self) -> Iterator[dict[str, Any]]:
         """Events since the last call; waits at most 0.1 s for the first one."""
@@ -121,16 +138,16 @@ class LearnerProcess:
         """End the learner, which writes a checkpoint first."""
         self._process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=60)
+            self._process.wait(timeout=CHECKPOINT_S)
         for event in self.events():
             report(event)
 
     def end(self) -> None:
-        """Wait for the learner if it has finished, else terminate it; close its files."""
+        """Wait for the learner if it has finished, else terminate it, so that it writes a checkpoint; close its files."""
         try:
             if not self._finished:
                 self._process.terminate()
-            self._process.wait(timeout=10)
+            self._process.wait(timeout=10 if self._finished else CHECKPOINT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
