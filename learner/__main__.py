@@ -1,9 +1,10 @@
 """The learner process: ``python -m learner RUN_DIR``.
 
 ``icrl-dist train``, the driver, starts and supervises it.  Events go to the file descriptor ``--events``, a JSON
-line each; what libraries print goes to stdout and stderr, which are the log ``learner.err``.  The driver writes the
-names of workers that were lost with their nodes to stdin, one JSON list a line.  The process ends by itself, with a
-checkpoint, when the driver has died.
+line each; what libraries print goes to stdout and stderr, which are the log ``learner.err``.  The driver writes JSON
+objects to stdin, one a line: ``lost``, names of workers that were lost with their nodes, and ``processes``, those that
+the driver started, each with its time of creation.  When the driver has died, the learner ends them, writes a
+checkpoint and ends.
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.console.signals import on_signals
@@ -40,7 +44,9 @@ def main() -> int:
         "--endpoint", required=True, help="address to listen on, such as tcp/127.0.0.1:7447; port 0 chooses a free port"
     )
     parser.add_argument("--events", type=int, default=1, help="file descriptor for events; default: stdout")
-    parser.add_argument("--driver", type=int, default=os.getppid(), help="process that the learner ends with; default: its parent")
+    parser.add_argument(
+        "--driver", type=int, default=os.getppid(), help="process that the learner ends with; default: its parent"
+    )
     arguments = parser.parse_args()
     logging.basicConfig(filename=arguments.folder / "learner.log", level=logging.INFO, format="%(asctime)s %(message)s")
     os.set_inheritable(arguments.events, False)
@@ -81,8 +87,9 @@ def _serve(folder: Path, endpoint: str, report: _Events, driver: int) -> int:
         service = Service(run, folder, link, report)
         with on_signals(service.stop):
             signal.signal(signal.SIGTERM, lambda *_: service.stop())  # the driver's, also where it was ignored at the start
-            _end_with_driver(service, report.descriptor, driver)
-            threading.Thread(target=_read_lost_workers, args=(service,), name="stdin", daemon=True).start()
+            processes: list[tuple[int, float]] = []
+            threading.Thread(target=_read_driver, args=(service, processes), name="stdin", daemon=True).start()
+            _end_with_driver(service, report.descriptor, driver, processes)
             endpoint_file = folder / "endpoint"
             endpoint_file.write_text(link.endpoints[0] + "\n")
             place = {"endpoint": link.endpoints[0], "host": socket.gethostname(), "device": service.device}
@@ -100,8 +107,8 @@ def _serve(folder: Path, endpoint: str, report: _Events, driver: int) -> int:
     return DONE
 
 
-def _end_with_driver(service: Service, events: int, driver: int) -> None:
-    """Stop the service when the driver has died, even if it died before this call.
+def _end_with_driver(service: Service, events: int, driver: int, processes: Sequence[tuple[int, float]]) -> None:
+    """When the driver has died, also before this call, stop the service and end ``processes``.
 
     The reader of ``events`` ends with the driver at once; the parent is looked at too, because a process that the
     driver forked may still hold the reading end.
@@ -113,17 +120,24 @@ def _end_with_driver(service: Service, events: int, driver: int) -> None:
         while os.getppid() == driver and not reader.poll(500):
             pass
         service.stop()
+        for pid, created in processes:  # Ray's agents would stay for a minute
+            with contextlib.suppress(psutil.Error):
+                if psutil.Process(pid).create_time() == created:
+                    psutil.Process(pid).kill()
 
     threading.Thread(target=watch, name="driver", daemon=True).start()
 
 
-def _read_lost_workers(service: Service, stdin: int = 0) -> None:
+def _read_driver(service: Service, processes: list[tuple[int, float]], stdin: int = 0) -> None:
     with (
         contextlib.suppress(OSError),
         open(stdin, "rb", buffering=0, closefd=False) as lines,  # unbuffered: a buffer's lock would block the exit
     ):
         for line in lines:
-            service.worker_api.lost_with_node(json.loads(line))
+            message = json.loads(line)
+            if lost := message.get("lost"):
+                service.worker_api.lost_with_node(lost)
+            processes += [(pid, created) for pid, created in message.get("processes", ())]
 
 
 if __name__ == "__main__":

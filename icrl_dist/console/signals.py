@@ -35,5 +35,14 @@ def on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
             signal.signal(number, handler)
 
 
+def interruptible() -> contextlib.AbstractContextManager[object]:
+    """A context in which each of ``SIGNALS`` raises KeyboardInterrupt, for work that can be repeated."""
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    return on_signals(interrupt)
+
+
 def _in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()

@@ -10,9 +10,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
@@ -45,6 +47,7 @@ class LearnerProcess:
         self._error = ""
         self._finished = False
         self._excused: list[str] = []
+        self._processes: list[tuple[int, float]] = []
         self.deaths = 0
         """Number of restarts."""
         self._start()
@@ -102,12 +105,20 @@ class LearnerProcess:
         """
         if new := workers[len(self._excused) :]:
             self._excused += new
-            self._send(new)
+            self._send(lost=new)
 
-    def _send(self, workers: Sequence[str]) -> None:
+    def end_after_driver(self, processes: Iterable[psutil.Process]) -> None:
+        """Let the learner end these processes of this computer if this process dies before them."""
+        for process in processes:
+            with contextlib.suppress(psutil.Error):
+                if process.pid != self._process.pid:
+                    self._processes.append((process.pid, process.create_time()))
+        self._send(processes=self._processes)
+
+    def _send(self, **message: Sequence[Any]) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the learner has died; watch() sends the list to the next one
-            os.write(self._process.stdin.fileno(), json.dumps(workers).encode() + b"\n")
+        with contextlib.suppress(BrokenPipeError):  # the learner has died; watch() sends everything to the next one
+            os.write(self._process.stdin.fileno(), json.dumps(message).encode() + b"\n")
 
     def watch(self, report: ReportEvent) -> None:
         """Restart the learner from its checkpoint if it was killed.
@@ -132,7 +143,7 @@ class LearnerProcess:
         report({"event": "note", "text": f"the learner died (exit code {code}); restarting it from its checkpoint"})
         self._close_files()
         self._start()
-        self._send(self._excused)
+        self._send(lost=self._excused, processes=self._processes)
 
     def interrupt(self, report: ReportEvent) -> None:
         """End the learner, which writes a checkpoint first."""

@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.console.display import ReportEvent
@@ -30,7 +32,7 @@ from icrl_dist.telemetry import provenance
 
 
 class TrainInterrupted(Exception):  # noqa: N818
-    """The run was interrupted by SIGINT or SIGTERM; the message says what its folder holds now."""
+    """The run was interrupted by a signal (``console.signals``); the message says what its folder holds now."""
 
     def __init__(self, text: str = "its checkpoint is written", resumable: bool = True) -> None:
         super().__init__(text)
@@ -117,7 +119,10 @@ def check_security(run: Run, address: str | None) -> None:
 
 
 def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
-    """Run the learner in this process with one worker on a thread.  Returns the learner's result."""
+    """Run the learner in this process with one worker on a thread.  Returns the learner's result.
+
+    An error of ``report`` ends the run like a signal, with a checkpoint, and is raised then.
+    """
     import torch
 
     from actors.worker import Worker
@@ -125,9 +130,22 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
     from learner.service import Interrupted, RunFailed, Service
 
     hub = MemoryHub()
+    service: Service | None = None
+    errors: list[BaseException] = []
+
+    def receive(event: dict[str, Any]) -> None:
+        if service is None:
+            report(event)
+        elif not errors:
+            try:
+                report(event)
+            except BaseException as error:
+                errors.append(error)
+                service.stop()
+
     with _torch_unchanged(), hub.link() as learner_link, hub.link() as worker_link:
         try:
-            service = Service(run, folder, learner_link, report)
+            service = Service(run, folder, learner_link, receive)
         except RunFailed as error:
             raise TrainFailed(str(error)) from None
         worker = Worker(worker_link, folder.name, "w0")
@@ -145,15 +163,18 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
             try:
                 result = service.run()
                 service.worker_api.finish()
-                return result
             except Interrupted:
-                raise TrainInterrupted from None
+                if not errors:
+                    raise TrainInterrupted from None
             except RunFailed as error:
                 raise TrainFailed(str(error)) from None
             finally:
                 worker.stop()
                 thread.join(timeout=30)
                 service.close()
+    if errors:
+        raise errors[0]
+    return result
 
 
 @contextlib.contextmanager
@@ -214,6 +235,8 @@ def train_ray(
             for event in learner.events():
                 report(event)
                 if event["event"] == "listening" and not started:
+                    if address is None:
+                        learner.end_after_driver(psutil.Process().children(recursive=True))
                     fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
                 elif event["event"] == "progress":
@@ -232,6 +255,8 @@ def train_ray(
                 try:
                     working = fleet.watch(note, stored + quarantined)
                 except FleetFailed as error:
+                    if interrupted.is_set():  # the signal reached Ray's processes too
+                        continue
                     raise _failed(error) from None
                 learner.excuse(fleet.lost)
                 if not working:
@@ -254,12 +279,3 @@ def _remove_if_refused(folder: Path) -> Iterator[None]:
         if {file.name for file in folder.iterdir()} <= {"run.toml", provenance.FILE}:
             run_folder.remove(folder)
         raise
-
-
-def interruptible() -> contextlib.AbstractContextManager[object]:
-    """A context in which SIGINT and SIGTERM raise TrainInterrupted, for work that can be repeated."""
-
-    def interrupt() -> None:
-        raise TrainInterrupted
-
-    return on_signals(interrupt)

@@ -14,6 +14,7 @@ from actors.placement import check_cores
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, override
 from icrl_dist.console.display import ReportEvent, Show, reporting
+from icrl_dist.console.signals import interruptible
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.run_folder import FolderTransaction
 from icrl_dist.storage.files import hold, write_json
@@ -70,8 +71,9 @@ def train(
     ``resume``: continue the run in the folder; ``overwrite``: replace it.
     ``progress``: True shows it on standard output; a function receives each event, a dictionary.
 
-    Prints nothing without ``progress``.  In the main thread SIGINT and SIGTERM end the run with a checkpoint; the
-    former signal handlers are set again at the end.  In another thread they do not reach it.
+    Prints nothing without ``progress``.  In the main thread SIGINT, SIGTERM, SIGHUP and SIGUSR1 end the run with a
+    checkpoint, unless they were ignored before; the former signal handlers are set again at the end.  In another thread
+    they do not reach it.
 
     Raises ConfigError for impossible settings, for a folder that is in use, and if this process already uses Ray;
     TrainFailed if the run fails, TrainInterrupted if it is interrupted, StoreError if the folder cannot be written, and
@@ -93,10 +95,11 @@ def train(
         if address is None and not oversubscribe:
             check_cores(count or LOCAL_ACTORS)
         launch.check_security(settings, address)
-    transaction = launch.prepare(settings, folder, resume, overwrite, parent)
-    started = time.monotonic()
-    with reporting(progress) as show, contextlib.ExitStack() as locks:
-        try:
+    transaction: FolderTransaction | None = None
+    try:
+        with interruptible(), reporting(progress) as show, contextlib.ExitStack() as locks:
+            transaction = launch.prepare(settings, folder, resume, overwrite, parent)
+            started = time.monotonic()
             with transaction:
                 report = transaction.commit_at_checkpoint(show)
                 if engine == "inline":
@@ -105,11 +108,11 @@ def train(
                     result = launch.train_ray(settings, folder, count, address, report, oversubscribe, min_actors)
             locks.enter_context(hold(folder))  # no other command can replace the run during its evaluation
             evaluation = _evaluate(settings, folder, show)
-        except launch.TrainInterrupted:
-            raise _interrupted(folder, transaction) from None
-        result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
-        result = _final_result(folder, result, evaluation.summary)
-        write_json(folder / "result.json", result)
+            result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
+            result = _final_result(folder, result, evaluation.summary)
+            write_json(folder / "result.json", result)
+    except (launch.TrainInterrupted, KeyboardInterrupt):
+        raise _interrupted(folder, transaction) from None
     return TrainResult(folder, result, evaluation)
 
 
@@ -147,17 +150,16 @@ def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
 
     if not plugins.find("methods", run.method).trains:
         return reports.experts(heldout.experts(run, folder))
-    with launch.interruptible():
-        heldout.save_calibrated(folder, show)
-        frame = heldout.online(run, folder, folder / "results", show)
+    heldout.save_calibrated(folder, show)
+    frame = heldout.online(run, folder, folder / "results", show)
     return reports.online(run, folder / "report" / heldout.report_name(run, folder), frame)
 
 
-def _interrupted(folder: Path, transaction: FolderTransaction) -> launch.TrainInterrupted:
+def _interrupted(folder: Path, transaction: FolderTransaction | None) -> launch.TrainInterrupted:
     """The exception that says what the folder of an interrupted run holds."""
-    if transaction.rolled_back:
+    if transaction is not None and transaction.rolled_back:
         return launch.TrainInterrupted(f"{folder} is as it was before", resumable=False)
-    if not folder.exists():
+    if not (folder / "run.toml").is_file():
         return launch.TrainInterrupted("nothing had been done yet", resumable=False)
     return launch.TrainInterrupted(f"{folder} holds the checkpoint: resume=True, or --resume, continues from it")
 

@@ -2,12 +2,14 @@
 
 import json
 import os
+import subprocess
 import sys
 import threading
 import time
 from types import SimpleNamespace
 from typing import cast
 
+import psutil
 import pytest
 
 from icrl_dist.launch import learner_process
@@ -90,17 +92,33 @@ def test_the_learner_stops_also_if_its_driver_died_before_it_looked(events, driv
     service = cast(Service, SimpleNamespace(stop=stopped.set))
     if driver == "closed its end":
         os.close(events.read)
-        _end_with_driver(service, events.write, os.getppid())
+        _end_with_driver(service, events.write, os.getppid(), [])
         assert stopped.wait(0.4), "at once, not at the next look at the parent"
     else:
-        _end_with_driver(service, events.write, os.getpid())
+        _end_with_driver(service, events.write, os.getpid(), [])
         assert stopped.wait(5)
         os.close(events.read)
 
 
 def test_the_learner_goes_on_while_its_driver_lives(events):
     stopped = threading.Event()
-    _end_with_driver(cast(Service, SimpleNamespace(stop=stopped.set)), events.write, os.getppid())
+    _end_with_driver(cast(Service, SimpleNamespace(stop=stopped.set)), events.write, os.getppid(), [])
     assert not stopped.wait(0.7)
     os.close(events.read)
     assert stopped.wait(5)
+
+
+def test_the_learner_ends_the_processes_of_its_dead_driver_and_no_other(events):
+    """Not a process that has got the number of one that ended, nor one that the driver did not start."""
+    ours, reused, foreign = (subprocess.Popen(["sleep", "60"]) for _ in range(3))
+    try:
+        created = psutil.Process(ours.pid).create_time()
+        os.close(events.read)
+        service = cast(Service, SimpleNamespace(stop=lambda: None))
+        _end_with_driver(service, events.write, os.getppid(), [(2**22 + 1, created), (reused.pid, 1.0), (ours.pid, created)])
+        assert ours.wait(10) == -9
+        assert reused.poll() is None and foreign.poll() is None
+    finally:
+        for process in (ours, reused, foreign):
+            process.kill()
+            process.wait()
