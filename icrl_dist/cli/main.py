@@ -18,7 +18,7 @@ from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monit
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
-from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_type, with_problem
+from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_folder_of, run_type, with_problem
 from icrl_dist.console.signals import interruptible
 from icrl_dist.storage.fork import parse_source
 
@@ -57,7 +57,10 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     found: Any = tyro.cli(kind, prog=prog, args=list(words))
     if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
-        base = load(found.run) if found.run else load_folder(parse_source(found.source or "")[0])
+        folder = run_folder_of(found.run) if found.resume or found.resume_or_begin else None
+        if not found.run:
+            folder = parse_source(found.source or "")[0]
+        base = load(found.run) if folder is None else load_folder(folder)
         if "--problem" in (word.partition("=")[0] for word in words):
             base = with_problem(base, found.config.problem)
         _check_settings(words, type(base), base.problem)
@@ -115,6 +118,8 @@ def _run(words: list[str]) -> int:
         with interruptible():
             return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
     except KeyboardInterrupt:
+        if words[0] == "train":  # before the run began, or after it ended
+            console.print("interrupted", highlight=False)
         return INTERRUPTED
     except Exception as error:
         from icrl_dist.storage.files import explained

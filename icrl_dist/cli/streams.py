@@ -7,21 +7,25 @@ import io
 import os
 import select
 import sys
+from typing import TYPE_CHECKING
 
 from icrl_dist.cli.exit_codes import BROKEN_PIPE
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer as Buffer
 
 
 class _Terminal(io.FileIO):
     """A terminal.  When it is gone (a dropped ssh), nothing is shown from then on; whether the program ends is for SIGHUP."""
 
-    def write(self, data: bytes | bytearray | memoryview, /) -> int:  # type: ignore[override]
+    def write(self, data: Buffer, /) -> int:
         try:
             return super().write(data)
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
             discard(self.fileno())
-            return len(data)
+            return memoryview(data).nbytes
 
 
 def prepare() -> None:
@@ -38,7 +42,7 @@ def prepare() -> None:
             os.set_inheritable(number, True)
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(number, "w" if number else "r", closefd=False))
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
         elif number and stream is getattr(sys, f"__{name}__") and stream.isatty():
             raw = io.BufferedWriter(_Terminal(number, "w", closefd=False))
             setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=True))
@@ -50,10 +54,13 @@ def end_of_output() -> int:
     Must be called while that error is handled; it is raised again if another pipe caused it.
     """
     poll = select.poll()
-    poll.register(sys.stdout.fileno(), 0)
-    if not any(event & select.POLLERR for _, event in poll.poll(0)):
-        raise  # noqa: PLE0704 - within the handler of the caller
-    discard(sys.stdout.fileno())  # what is flushed at exit
+    for stream in (sys.stdout, sys.stderr):
+        poll.register(stream.fileno(), 0)
+    closed = [number for number, event in poll.poll(0) if event & select.POLLERR]
+    if sys.stdout.fileno() not in closed:
+        raise
+    for number in closed:
+        discard(number)  # what is flushed at exit
     return BROKEN_PIPE
 
 

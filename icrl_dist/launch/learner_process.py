@@ -19,7 +19,6 @@ import psutil
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
 
-
 CHECKPOINT_S = 60.0
 """Seconds that a learner has to write its checkpoint when the run ends."""
 

@@ -36,7 +36,7 @@ def start(tmp_path, monkeypatch):
 
 
 def texts(process, count):
-    deadline, found = time.monotonic() + 30, []
+    deadline, found = time.monotonic() + 30, list[str]()
     while len(found) < count:
         assert time.monotonic() < deadline
         found += [event["text"] for event in process.events()]
@@ -62,8 +62,9 @@ def test_an_event_that_a_killed_learner_wrote_in_part_is_left_out(start):
 
 def test_a_learner_ends_in_its_own_time_when_the_run_fails(start, tmp_path):
     """Its checkpoint may take longer than the end of a learner that has finished."""
-    process = start("trap 'sleep 0.3; touch $3/checkpoint; exit 130' TERM; echo '{\"event\": \"x\", \"text\": \"\"}' >&$events\n"
-                    "while :; do sleep 0.05; done")  # fmt: skip
+    event = json.dumps({"event": "note", "text": ""})
+    checkpoint = "sleep 0.3; touch $3/checkpoint; exit 130"
+    process = start(f"trap '{checkpoint}' TERM; echo '{event}' >&$events; while :; do sleep 0.05; done")
     texts(process, 1)
     process.end()
     assert (tmp_path / "checkpoint").exists()

@@ -21,7 +21,7 @@ from actors import fleet, local
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps
 from icrl_dist.console.signals import SIGNALS, interruptible
-from icrl_dist.launch import learner_process, whole_run
+from icrl_dist.launch import learner_process, resuming, whole_run
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout, reports
 from learner import checkpoints, reporter
@@ -268,8 +268,8 @@ def test_load_run_takes_names_files_and_folders(made, module_run, tmp_path):
 
 def test_the_default_folder_is_named_after_the_run(made):
     names = {"demo": "demo", "mine/small.toml": "small", "experts-dmc": "experts-dmc"}
-    assert {name: whole_run.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
-    assert whole_run.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
+    assert {name: resuming.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
+    assert resuming.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
 
 
 def test_an_evaluation_is_shown_by_print_and_by_a_notebook(module_run, tmp_path):
