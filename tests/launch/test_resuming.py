@@ -52,8 +52,7 @@ def trained(monkeypatch):
 
     error = [launch.TrainInterrupted()]
     monkeypatch.setattr(launch, "train_inline", train_inline)
-    made_error = made, error
-    return made_error
+    return made, error
 
 
 def train(*words):
