@@ -2,8 +2,13 @@
 
 import dataclasses
 import json
+import os
 import shutil
 import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -212,3 +217,23 @@ def test_a_failed_run_tells_python_how_to_go_on(here, trained, module_run):
 def test_load_refuses_a_run_folder_and_says_how_to_go_on(here):
     with pytest.raises(ConfigError, match="is a run folder: `icrl-dist train --resume runs/small`"):
         load("runs/small")
+
+
+def test_a_run_killed_during_its_evaluation_is_not_finished_and_goes_on(here, finished):
+    command = [sys.executable, "-m", "icrl_dist.cli", "train", "small.toml", "--engine", "inline", "--resume-or-begin"]
+    command += ["--out", "runs/killed"]
+    environment = os.environ | {"PYTHONPATH": str(Path(icrl_dist.__file__).parents[1])}
+    long = [*command, "--evaluate.episodes", "100000"]
+    process = subprocess.Popen(long, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (here / "runs" / "killed" / "checkpoints" / "version-0002.npz").exists():
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.kill()
+    process.wait()
+    assert not (here / "runs" / "killed" / "result.json").exists()
+    assert cli.main(command[3:]) == 0
+    results = [json.loads((folder / "result.json").read_text()) for folder in (finished, here / "runs" / "killed")]
+    names = ("dataset_digest", "weights_digest", "trajectories", "evaluate", "rows")
+    assert [results[0][name] for name in names] == [results[1][name] for name in names]
