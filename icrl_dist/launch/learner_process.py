@@ -146,22 +146,24 @@ class LearnerProcess:
 
     def interrupt(self, report: ReportEvent) -> None:
         """End the learner, which writes a checkpoint first."""
-        self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=CHECKPOINT_S)
+        self._stop()
         for event in self.events():
             report(event)
 
     def end(self) -> None:
-        """Wait for the learner if it has finished, else terminate it, so that it writes a checkpoint; close its files."""
+        """Wait for the learner if it has finished, else end it as ``interrupt`` does; close its files."""
+        self._stop()
+        self._close_files()
+
+    def _stop(self) -> None:
+        """Wait for a finished learner, terminate another one; kill it if it has not ended when its time is over."""
+        if not self._finished:
+            self._process.terminate()
         try:
-            if not self._finished:
-                self._process.terminate()
             self._process.wait(timeout=10 if self._finished else CHECKPOINT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._close_files()
 
     def _close_files(self) -> None:
         assert self._process.stdin is not None

@@ -71,6 +71,15 @@ def test_a_learner_ends_in_its_own_time_when_the_run_fails(start, tmp_path):
     assert learner_process.CHECKPOINT_S >= 60
 
 
+def test_a_learner_that_does_not_end_is_killed_once_its_time_is_over(start, monkeypatch):
+    event = json.dumps({"event": "note", "text": ""})
+    process = start(f"trap '' TERM; echo '{event}' >&$events; while :; do sleep 0.05; done")
+    texts(process, 1)
+    monkeypatch.setattr(learner_process, "CHECKPOINT_S", 0.3)
+    process.interrupt(lambda event: None)
+    assert process._process.returncode == -9
+
+
 @pytest.fixture
 def events():
     """The ends of a pipe for events; a test may close the reading one."""
