@@ -76,9 +76,9 @@ def train(
     if the folder holds a run, else begin it.  ``overwrite``: replace the run in the folder.
     ``progress``: True shows it on standard output; a function receives each event, a dictionary.
 
-    Prints nothing without ``progress``.  In the main thread SIGINT, SIGTERM, SIGHUP and SIGUSR1 end the run with a
-    checkpoint, unless they were ignored before; the former signal handlers are set again at the end.  In another thread
-    they do not reach it.
+    Prints nothing without ``progress``.  In the main thread the signals of ``console.signals`` (SIGINT, SIGTERM, SIGHUP
+    and others) end the run with a checkpoint, unless they were ignored before; the former signal handlers are set again at
+    the end.  In another thread they do not reach it.
 
     Raises ConfigError for impossible settings, for a folder that is in use, and if this process already uses Ray;
     TrainFailed if the run fails, TrainInterrupted if it is interrupted, StoreError if the folder cannot be written, and

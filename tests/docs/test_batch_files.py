@@ -92,7 +92,9 @@ def test_the_slurm_script_is_warned_queued_again_continues_and_ends_at_once_when
 def called(tmp_path, monkeypatch):
     """Call the command line with these words of a file, up to the training, which is interrupted; returns the exit code."""
 
-    def interrupted(*_):
+    def interrupted(run, folder, *_):
+        (folder / "checkpoints").mkdir(exist_ok=True)
+        (folder / "checkpoints" / "partial.npz").touch()
         raise launch.TrainInterrupted
 
     monkeypatch.setattr(launch, "train_ray", interrupted)
