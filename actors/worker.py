@@ -28,6 +28,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.credit import CreditSender
+from icrl_dist.stream.excerpts import plain
 from icrl_dist.stream.link import Link, LinkError, Refused, StreamKeys, Unanswered
 from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
@@ -141,6 +142,7 @@ class Worker:
 
     def _report(self, text: str, note: bool = False, reached: int = 0) -> None:
         """Send a note to the learner at once; other texts are part of the next heartbeat."""
+        text = plain(text, messages.LINE)
         if note:
             self._request("note", text=text)
         else:
