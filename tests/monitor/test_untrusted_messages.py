@@ -140,5 +140,5 @@ def test_the_learners_messages_count_on_its_own_topics_only(kind):
     for topic in (*(f"{topic}/w0" for topic in WORKER_TOPICS), "x", f"{kind}s"):
         send(state, topic, MESSAGES[kind] if kind != "event" else event("finished", "over"))
     after = state.snapshot(2.0)
-    assert after.pop("ignored") == {"wrong topic": 6}
+    assert after.pop("ignored") == {"wrong topic": 6} and after.pop("heard") == before.pop("heard") + 6
     assert after == {name: value for name, value in before.items() if name != "ignored"}
