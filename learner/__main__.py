@@ -21,6 +21,7 @@ from typing import Any
 from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.storage.files import StoreError, explained
 from icrl_dist.stream import security
+from icrl_dist.stream.credit import REQUEST_BYTES
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.budget import log_to
@@ -60,7 +61,8 @@ def main() -> int:
 
 def _serve(folder: Path, endpoint: str, report: Any) -> int:
     run = load_folder(folder)
-    with ZenohLink.listen(endpoint, security.learner(run.stream.certificates, folder.name)) as link:
+    settings = security.learner(run.stream.certificates, folder.name)
+    with ZenohLink.listen(endpoint, settings, run.stream.max_message_bytes + 2 * REQUEST_BYTES) as link:
         service = Service(run, folder, link, report)
         for name in (signal.SIGINT, signal.SIGTERM):
             signal.signal(name, lambda *_: service.stop())

@@ -63,13 +63,18 @@ class ZenohLink(Link):
         atexit.register(self.close)
 
     @classmethod
-    def listen(cls, endpoint: str, config: Mapping[str, object] | None = None) -> ZenohLink:
+    def listen(cls, endpoint: str, config: Mapping[str, object] | None = None, largest: int = 64 << 20) -> ZenohLink:
         """Listen on ``endpoint``, such as ``tcp/127.0.0.1:7447``; with port 0 on a free port.
 
-        ``config`` sets further Zenoh keys (TLS, access control).  Raises LinkError if it cannot listen there.
+        ``config`` sets further Zenoh keys (TLS, access control).  A message of more than ``largest`` bytes is dropped
+        before it is complete.  Raises LinkError if it cannot listen there.
         """
         descriptors = Descriptors()
-        limits = {"transport/unicast/max_sessions": descriptors.sessions, "transport/unicast/accept_timeout": 5_000}
+        limits = {
+            "transport/unicast/max_sessions": descriptors.sessions,
+            "transport/unicast/accept_timeout": 5_000,
+            "transport/link/rx/max_message_size": largest,
+        }
         settings = {"mode": "peer", "connect/endpoints": [], **limits, **(config or {})}
         for left in range(9, -1, -1):
             bound = _with_port(endpoint)

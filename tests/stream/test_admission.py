@@ -25,10 +25,12 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (min(limit, 200), limit))
 from icrl_dist.stream import admission, security
 from icrl_dist.stream.zenoh_link import ZenohLink
 vars(admission).update(changes)
-with ZenohLink.listen("tls/127.0.0.1:0", security.learner(folder, "run")) as link:
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+with ZenohLink.listen("tls/127.0.0.1:0", security.learner(folder, "run"), 4 << 20) as link:
     def answer(query):
         files = [open(os.devnull) for _ in range(30)]  # as a learner opens segments and checkpoints
-        query.reply(json.dumps([len(os.listdir("/proc/self/fd")), link._admission.closed]).encode())
+        query.reply(json.dumps([len(os.listdir("/proc/self/fd")), link._admission.closed, peak()]).encode())
     link.serve("icrl/run/work", answer)
     print(link.endpoints[0], flush=True)
     sys.stdin.read()
@@ -61,7 +63,7 @@ def connect(endpoint, certified, role="worker", timeout_s=30.0):
 
 
 def state(link):
-    """Open descriptors of the other process while it opens 30 files, and whether its port is closed."""
+    """Open descriptors of the other process while it opens 30 files, whether its port is closed, and its peak memory, MB."""
     return json.loads(link.request("icrl/run/work", b"", timeout_s=10.0))
 
 
@@ -78,7 +80,7 @@ def test_bare_connections_leave_descriptors_and_the_port_opens_again(listening, 
                 flood.enter_context(socket.create_connection(place, timeout=0.5))
                 time.sleep(0.001)
         assert 16 <= made < 599, "the port is closed"
-        used, closed = state(worker)
+        used, closed, _ = state(worker)
         assert closed and used < 450, "before the descriptors are used up"
         flood.close()
         eventually(lambda: not state(worker)[1])
@@ -108,6 +110,17 @@ def test_sessions_have_a_limit_below_that_of_the_descriptors(listening, certifie
                 links.append(stack.enter_context(connect(endpoint, certified, timeout_s=1.0)))
         assert 24 <= len(links) <= 48
         assert state(links[0])[0] <= 128, "the 30 files were opened"
+
+
+def test_a_message_beyond_the_limit_is_dropped_before_it_is_complete(listening, certified):
+    endpoint = listening(300)
+    with connect(endpoint, certified) as worker:
+        eventually(lambda: state(worker) and True)
+        assert worker.request("icrl/run/work", bytes(3 << 20), timeout_s=10.0)
+        before = state(worker)[2]
+        with pytest.raises(Unanswered):
+            worker.request("icrl/run/work", bytes(200 << 20), timeout_s=2.0)
+        assert state(worker)[2] < before + 40, "MB"
 
 
 def test_the_limit_on_descriptors_is_raised_and_has_a_reserve():

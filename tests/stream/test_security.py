@@ -128,7 +128,9 @@ def flat(value, prefix=""):
 
 
 # Timeouts and buffer sizes of our link, which do not concern security.
-TUNING = ("connect/timeout_ms", "connect/exit_on_failure", "connect/retry", "transport/link/tx/", "transport/link/rx/")
+TUNING = ("connect/timeout_ms", "connect/exit_on_failure", "connect/retry", "transport/link/tx/", "transport/link/rx/buffer")
+# Depends on this machine's limit on descriptors.
+TUNING += ("transport/unicast/max_sessions",)
 
 
 def differences(template, system):
