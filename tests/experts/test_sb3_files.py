@@ -8,8 +8,8 @@ import json
 import os
 import pickle
 import zipfile
+from typing import Any
 
-import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ class Bomb:
 
 
 def encoded(value):
-    return base64.b64encode(cloudpickle.dumps(value)).decode()
+    return base64.b64encode(pickle.dumps(value)).decode()
 
 
 def rewritten(source, target, **members):
@@ -168,8 +168,10 @@ def test_malformed_files_are_refused_with_their_name(tmp_path):
     engine, whole = SACBatch([0], SPEC, SMALL, "cpu"), tmp_path / "whole.zip"
     engine.save_sb3(0, whole)
     spare = torch_pickle({"log_ent_coef": torch.zeros(3)})
-    changes = [{"data": b"{"}, {"data": b"[]"}, {"data": None}, {"data": b"{}"}, {"policy.pth": None}, {"policy.pth": spare}]
-    changes += [{"pytorch_variables.pth": spare}, {"pytorch_variables.pth": None}, {"actor.optimizer.pth": spare}]
+    changes: list[dict[str, Any]] = [{"data": data} for data in (b"{", b"[]", b"{}", None)]
+    changes += [{"policy.pth": content} for content in (None, spare)]
+    changes += [{"pytorch_variables.pth": content} for content in (None, spare)]
+    changes += [{"actor.optimizer.pth": spare}]
     for change in changes:
         with pytest.raises(ValueError, match=r"broken\.zip is no file .* save it again"):
             engine.load_sb3([rewritten(whole, tmp_path / "broken.zip", **change)])

@@ -73,7 +73,8 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
     if found != ((spec.observation,), (spec.actions,), list(config.hidden)):
         raise ValueError(
             f"{path} holds an expert of {tuple(found[0])} observations, {tuple(found[1])} actions and hidden layers "
-            f"{found[2]}, not {spec.observation}, {spec.actions} and {config.hidden}: load it with its own spec and hidden layers"
+            f"{found[2]}, not {spec.observation}, {spec.actions} and {config.hidden}: "
+            "load it with its own spec and hidden layers"
         )
     if activation != "ReLU" or set(low) != {-1.0} or set(high) != {1.0}:
         raise ValueError(
