@@ -51,8 +51,8 @@ def test_the_tests_that_the_page_names_exist():
 
 def test_the_limits_are_those_of_the_program():
     table = PAGE.partition("## Limits")[2].partition("## ")[0]
-    limits = (admission._MOST_DESCRIPTORS, admission._RESERVE, admission.MAX_PENDING, admission.MAX_SESSIONS)
-    limits += (admission.MAX_MONITORS, known_workers.MAX_WORKERS, crash_reports.MAX_FILES, event_stream.MAX_VIEWERS)
+    limits = [admission._MOST_DESCRIPTORS, admission._RESERVE, admission.MAX_PENDING, admission.MAX_SESSIONS]
+    limits += [admission.MAX_MONITORS, known_workers.MAX_WORKERS, crash_reports.MAX_FILES, event_stream.MAX_VIEWERS]
     assert not [limit for limit in limits if not re.search(rf"(?<![\d,]){limit:,}(?![\d,]*\d)", table)]
 
 
