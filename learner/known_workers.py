@@ -15,6 +15,9 @@ MAX_WORKERS = 4096
 _MAX_LONG_WORK = 64
 """Texts about long work in a message to views."""
 
+_MAX_SILENT = 256
+"""Workers whose silence may be an alert: those that have been silent for the longest time."""
+
 _COUNTS = ("episodes", "steps", "resent", "trajectories", "waited_s")
 
 
@@ -61,15 +64,17 @@ class KnownWorkers:
     @property
     def totals(self) -> dict[str, Any]:
         """Sums of the counters of all workers, and by worker the seconds waited and the seconds since its last message."""
-        now, counters = time.monotonic(), list(self.counters.values())
-        connected = [worker for worker, alive in list(self.alive.items()) if alive and worker in self.counters]
+        now, known, alive = time.monotonic(), dict(self.counters), dict(self.alive)  # copies: other threads change them
+        counters = known.values()
+        silent = [(worker, last) for worker, last in dict(self.last_message).items() if worker in alive]
+        silent.sort(key=lambda one: one[1])
         return {
             "episodes": sum(one["episodes"] for one in counters),
             "acknowledged": sum(one["trajectories"] for one in counters),
             "resent": self.resent,
             "waited_s": sum(one["waited_s"] for one in counters),
-            "waited": {worker: self.counters[worker]["waited_s"] for worker in connected},
-            "silent": {worker: now - last for worker, last in list(self.last_message.items())},
+            "waited": {worker: known[worker]["waited_s"] for worker in known if alive.get(worker)},
+            "silent": {worker: now - last for worker, last in silent[:_MAX_SILENT]},
         }
 
     @property

@@ -107,6 +107,16 @@ def test_thousands_of_names_leave_room_for_the_workers_that_are_there(server, mo
     assert known.alive["w0"] and "w0" in known.counters and goes_on(server)
 
 
+def test_the_alerts_about_silence_are_limited_to_workers_that_have_connected(server, monkeypatch):
+    monkeypatch.setattr(known_workers, "_MAX_SILENT", 4)
+    for n in range(20):
+        server.ask(f"stranger-{n}")
+        server.worker_api._on_liveliness(f"w{n}", True)
+        server.ask(f"w{n}")
+    assert list(server.worker_api.known.totals["silent"]) == ["w0", "w1", "w2", "w3"]
+    assert len(server.worker_api.known.totals["waited"]) == 20
+
+
 def test_what_workers_report_is_limited_in_number(server, monkeypatch):
     monkeypatch.setattr(crash_reports, "MAX_FILES", 7)
     monkeypatch.setattr(server.worker_api, "_budget", budget.Budget(20, 0.0))
