@@ -218,7 +218,7 @@ def strangers(training: Training, strike: Strike, disk_bytes: int) -> Struck:
                 held.enter_context(socket.create_connection(target, timeout=0.5))
         result = training.result()
     return Struck(
-        where, made >= 100, f"{made} connections held, then {'no' if made + 1 < STRANGERS else 'any'} more admitted", result
+        where, made >= 64, f"{made} connections held, then {'no' if made + 1 < STRANGERS else 'any'} more admitted", result
     )
 
 
