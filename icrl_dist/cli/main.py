@@ -6,6 +6,7 @@ checkpoint written.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -20,7 +21,9 @@ from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
 from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_folder_of, run_type, with_problem
 from icrl_dist.console.signals import interruptible
+from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.storage.fork import parse_source
+from icrl_dist.stream.excerpts import plain
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "train": (train.TrainArguments, train.train),
@@ -78,7 +81,7 @@ def _check_settings(words: Sequence[str], kind: type[Run], problem: str = "") ->
             former_names.check({section: {key: None}}, names_of(kind), problem, flag)
 
 
-class _Console(Console):
+class _Console(PlainConsole):
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError  # for ``main``; rich would exit with code 1
 
@@ -100,6 +103,8 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: decision 073
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without UTF-8 cannot show every printable character
+        sys.stdout.reconfigure(errors="backslashreplace")
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = _Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
@@ -128,7 +133,7 @@ def _run(words: list[str]) -> int:
         code = _code(explanation)
         if code is None:
             raise
-        print(f"icrl-dist: {' '.join(str(explanation).split())}", file=sys.stderr)
+        print(f"icrl-dist: {plain(' '.join(str(explanation).split()), 4_000)}", file=sys.stderr)
         return code
 
 
