@@ -14,6 +14,9 @@ from typing import Protocol, Self
 
 _log = logging.getLogger(__name__)
 
+WORKER_TOPICS = ("worker", "trajectories", "episode", "belief")
+"""The topics of the monitor plane on which workers publish, each followed by the worker's name; the learner owns the others."""
+
 
 @dataclass(frozen=True, slots=True)
 class StreamKeys:
@@ -48,6 +51,11 @@ class StreamKeys:
     def monitor_all(self) -> str:
         """All topics of the monitor plane."""
         return f"icrl/{self.run}/mon/**"
+
+    @property
+    def monitor_of_workers(self) -> tuple[str, ...]:
+        """The part of the monitor plane on which workers publish."""
+        return tuple(f"icrl/{self.run}/mon/{topic}/*" for topic in WORKER_TOPICS)
 
     @property
     def heartbeats(self) -> str:
