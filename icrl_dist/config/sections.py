@@ -11,6 +11,7 @@ from icrl_dist.config.ranges import NotNegative, NotNegativeFloat, Positive, Pos
 from icrl_dist.stream.schema import Remedy
 
 Deployment = Literal["paper", "committed"]
+Decoder = Literal["auto", "torch", "kernel"]
 """How T_theta is deployed online.
 
 ``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition enters
@@ -156,6 +157,10 @@ class ContextConfig:
     """Maximum number of transitions in a context; above it the oldest whole episodes are dropped."""
     keep: Literal["all", "last"] = "all"
     """``all``: keep every episode (Algorithm 1, line 16); ``last``: keep only the newest."""
+    decoder: Decoder = "auto"
+    """What computes decisions on a CPU: ``torch``, or ``kernel``, the compiled decoder, which is several times as fast and
+    gives equal decisions on all processors.  ``auto``: the kernel if it was built, for models up to 128 wide.  A run keeps
+    the one that it began with, because digests depend on it."""
 
 
 @dataclass(frozen=True)

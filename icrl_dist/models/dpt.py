@@ -6,16 +6,20 @@ token.  Observations are scaled to [-1, 1] by the spec, so the model depends on 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from icrl_dist.config.sections import ModelConfig
+from icrl_dist.interfaces import Actions
 from icrl_dist.models import heads
 from icrl_dist.models.decoder import Decoder, weight_and_bias
+from icrl_dist.models.deployed import Columns, WindowColumns
 from icrl_dist.models.gpt import GPT, KVCache
 from icrl_dist.types import Spec
 
@@ -133,52 +137,58 @@ def _prefix_mask(prefix: Int[Tensor, "B Q"], cache: KVCache) -> Bool[Tensor, "B 
 
 
 class DeployedTransformer:
-    """T_theta with one growing context per environment (B of them): a decision costs one token.
-
-    Weights are copied: after more training of the model, make a new one.
-    """
+    """``models.deployed.Deployed`` by torch, on the device of the model."""
 
     def __init__(self, model: PretrainedTransformer, batch: int) -> None:
         self._model, self._decoder = model, Decoder(model.trunk, batch)
         self._embed, self._head = weight_and_bias(model.embed_query), weight_and_bias(model.head)
-        self.state: Float[Tensor, "B D"] | None = None
-        """Final states of the trunk at the last decision; None before the first."""
+        self.state: Float32[np.ndarray, "B D"] | None = None
 
     @property
     def length(self) -> int:
-        """Transitions in each context."""
         return self._decoder.length
 
     def clear(self) -> None:
-        """Empty every context."""
         self._decoder.clear()
 
     @torch.inference_mode()
-    def append(self, transitions: Transitions) -> None:
-        """Append transitions to each context."""
-        self._decoder.append(self._model.tokens(transitions))
+    def append(self, transitions: Columns) -> None:
+        self._decoder.append(self._tokens(transitions))
 
     @torch.inference_mode()
-    def decide(self, states: Float[Tensor, "B S"]) -> Float[Tensor, "B O"]:
-        """Outputs of T_theta at one query state per context, given the whole context."""
-        self.state = self._decoder.query(F.linear(self._model.features(states), *self._embed))
-        return F.linear(self.state, *self._head)
+    def decide(self, states: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
+        return self._outputs(self._decoder.query(self._queries(states)))
 
     @torch.inference_mode()
-    def decide_window(self, windows: Windows, arrived: Transitions | None = None) -> Float[Tensor, "B O"]:
-        """Outputs at the last state of one window per context, given the whole context.
-
-        One transition per context may join the context first (``arrived``).
-        """
-        token = None if arrived is None else self._model.tokens(arrived)[:, 0]
-        self.state = self._decoder.window(self._model.window_tokens(windows)[:, 0], token)
-        return F.linear(self.state, *self._head)
+    def decide_window(self, windows: WindowColumns, arrived: Columns | None = None) -> Float32[np.ndarray, "B O"]:
+        token = None if arrived is None else self._tokens(arrived)[:, 0]
+        # The model takes several windows per context, (B, R, L): here R is 1.
+        tokens = self._model.window_tokens(Windows(*(column[:, None] for column in self._tensors(*windows))))[:, 0]
+        return self._outputs(self._decoder.window(tokens, token))
 
     @torch.inference_mode()
-    def decide_row(self, row: int, states: Float[Tensor, "Q S"], appended: Transitions) -> Float[Tensor, "Q O"]:
-        """Outputs at Q query states, given the whole context ``row`` and E more transitions (of this context).
+    def decide_row(self, row: int, states: Float32[np.ndarray, "Q S"], appended: Columns) -> Float32[np.ndarray, "Q O"]:
+        found = self._decoder.query_row(row, self._queries(states), self._tokens(appended)[0])
+        outputs: np.ndarray = F.linear(found, *self._head).cpu().numpy()
+        return outputs
 
-        Equal to ``decide`` for each state.  Nothing changes: later decisions are as without this call.
-        """
-        queries = F.linear(self._model.features(states), *self._embed)
-        return F.linear(self._decoder.query_row(row, queries, self._model.tokens(appended)[0]), *self._head)
+    def act(self, outputs: Float32[np.ndarray, "B O"], u: Float[np.ndarray, "B U"]) -> Actions:
+        return self._model.action_head.act(torch.from_numpy(outputs), u)
+
+    def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
+        found: np.ndarray = torch.from_numpy(outputs).softmax(-1).numpy()
+        return found
+
+    def _queries(self, states: Float32[np.ndarray, "Q S"]) -> Float[Tensor, "Q D"]:
+        return F.linear(self._model.features(*self._tensors(states)), *self._embed)
+
+    def _tokens(self, transitions: Columns) -> Float[Tensor, "B T D"]:
+        return self._model.tokens(Transitions(*self._tensors(*transitions)))
+
+    def _outputs(self, state: Float[Tensor, "B D"]) -> Float32[np.ndarray, "B O"]:
+        self.state = state.cpu().numpy()
+        outputs: np.ndarray = F.linear(state, *self._head).cpu().numpy()
+        return outputs
+
+    def _tensors(self, *columns: np.ndarray) -> Iterator[Tensor]:
+        return (torch.from_numpy(np.array(column)).to(self._model.low.device) for column in columns)

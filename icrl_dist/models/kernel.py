@@ -10,7 +10,7 @@ import ctypes
 import functools
 import importlib.util
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Float32
@@ -75,7 +75,7 @@ class Kernel:
         library.icrl_work.restype = ctypes.c_long
         self.work_size = library.icrl_work
 
-    def _function(self, name: str, *arguments: type) -> ctypes._NamedFuncPointer:
+    def _function(self, name: str, *arguments: type) -> Callable[..., None]:
         found = getattr(_library(), f"icrl_{name}_{self.kind}")
         found.argtypes, found.restype = arguments, None
         return found

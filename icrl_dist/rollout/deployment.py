@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, Int64
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
+from icrl_dist.config.sections import ContextConfig, Decoder, Deployment, ModelConfig
 from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
-from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Transitions, Windows
+from icrl_dist.models.deployed import Columns, Deployed, WindowColumns
+from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer
+from icrl_dist.models.kernel import kinds
+from icrl_dist.models.kernel_transformer import KernelTransformer, usable
+from icrl_dist.models.weights import weights_of
 
 
 def default_deployment(model: ModelConfig) -> Deployment:
@@ -30,9 +31,9 @@ class InContextPolicy(CopiedWhole):
 
     def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
         self.model, self.batch, self._config, self._watch = model, batch, context, watch
-        self._episodes: list[Transitions] = []
+        self._episodes: list[Columns] = []
         self._pending: list[tuple[np.ndarray, ...]] = []
-        self._deployed = DeployedTransformer(model, batch)
+        self._deployed = deployed(model, batch, context.decoder)
 
     @property
     def length(self) -> int:
@@ -41,11 +42,11 @@ class InContextPolicy(CopiedWhole):
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
         """The actions that the uniform numbers in [0, 1) select: one number per row, or one per component."""
-        return self.model.action_head.act(self._decide(observation), u)
+        return self._deployed.act(self._decide(observation), u)
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
         """The distribution over discrete actions."""
-        return self._decide(observation).softmax(-1).cpu().numpy()
+        return self._deployed.probabilities(self._decide(observation))
 
     def distribution(self, states: Float32[np.ndarray, "Q S"], row: int = 0) -> Float[np.ndarray, "Q A"]:
         """T_theta(. | s, D) at any states s, with the context D that environment ``row`` will have at its next decision.
@@ -53,14 +54,12 @@ class InContextPolicy(CopiedWhole):
         The action window (zeta) is not an input, so each state is a query of its own.  The policy does not
         change: later actions are the same with and without this call.
         """
-        (queries,) = self._tensors(states)
-        new = Transitions(*self._tensors(*(column[None] for column in self._stacked(self._not_encoded(), row))))
-        outputs = self._deployed.decide_row(row, queries, new)
-        return outputs.softmax(-1).cpu().numpy()
+        new = Columns(*(column[None] for column in self._stacked(self._not_encoded(), row)))
+        return self._deployed.probabilities(self._deployed.decide_row(row, states, new))
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
         """D of ``distribution``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
-        ended = zip(*([c[row].cpu().numpy() for c in episode] for episode in self._episodes), strict=True)
+        ended = zip(*([c[row] for c in episode] for episode in self._episodes), strict=True)
         columns = [np.concatenate(column) for column in ended] or self._stacked([], row)
         return tuple(np.concatenate(both) for both in zip(columns, self._stacked(self._running(), row), strict=True))
 
@@ -79,8 +78,8 @@ class InContextPolicy(CopiedWhole):
         columns = ([step[i][row] for step in steps] for i in range(len(kinds)))
         return [np.array(c, kind).reshape(-1, *shape) for c, kind, shape in zip(columns, kinds, shapes, strict=True)]
 
-    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
-        return self._deployed.decide(torch.from_numpy(np.array(observation)).to(self.model.low.device))
+    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
+        return self._deployed.decide(observation)
 
     def observe(
         self,
@@ -91,21 +90,21 @@ class InContextPolicy(CopiedWhole):
         done: bool,
     ) -> None:
         if self._watch is not None and self._deployed.state is not None:
-            self._watch(self._deployed.state.cpu().numpy(), observation, action, reward, next_observation)
+            self._watch(self._deployed.state, observation, action, reward, next_observation)
             self._deployed.state = None
         self._pending.append(tuple(np.array(column) for column in (observation, action, next_observation, reward)))
         if done:
             self._add_own(self._ended_episode())
 
-    def _add_own(self, episode: Transitions) -> None:
+    def _add_own(self, episode: Columns) -> None:
         """Add an episode of this policy to the context."""
         self._add(episode)
 
-    def _ended_episode(self) -> Transitions:
+    def _ended_episode(self) -> Columns:
         """The episode that has just ended."""
         columns = [np.stack(column, axis=1) for column in zip(*self._pending, strict=True)]
         self._pending = []
-        return Transitions(*self._tensors(*columns))
+        return Columns(*columns)
 
     def append(
         self,
@@ -115,16 +114,13 @@ class InContextPolicy(CopiedWhole):
         rewards: Float32[np.ndarray, "B T"],
     ) -> None:
         """Add one episode, of this or any other policy, to the context."""
-        self._add(Transitions(*self._tensors(observations, actions, next_observations, rewards)))
+        self._add(Columns(*(np.array(column) for column in (observations, actions, next_observations, rewards))))
 
-    def _add(self, episode: Transitions) -> None:
+    def _add(self, episode: Columns) -> None:
         if not self._add_to_context(episode):
             self._deployed.append(episode)
 
-    def _tensors(self, *columns: np.ndarray) -> Iterator[torch.Tensor]:
-        return (torch.from_numpy(np.array(column)).to(self.model.low.device) for column in columns)
-
-    def _add_to_context(self, episode: Transitions) -> bool:
+    def _add_to_context(self, episode: Columns) -> bool:
         """Add an episode to the context; True if older ones were dropped and the whole context was encoded again."""
         kept = [] if self._config.keep == "last" else list(self._episodes)
         total = sum(e.actions.shape[1] for e in kept) + episode.actions.shape[1]
@@ -133,7 +129,7 @@ class InContextPolicy(CopiedWhole):
         dropped, self._episodes = len(kept) < len(self._episodes), [*kept, episode]
         if dropped:
             self._deployed.clear()
-            self._deployed.append(Transitions(*(torch.cat(columns, dim=1) for columns in zip(*self._episodes, strict=True))))
+            self._deployed.append(Columns(*(np.concatenate(columns, axis=1) for columns in zip(*self._episodes, strict=True))))
         return dropped
 
 
@@ -149,7 +145,7 @@ class CommittedPolicy(InContextPolicy):
         super().__init__(model, batch, context, watch)
         self._encoded = 0  # number of the transitions in self._pending that the decoder has encoded
 
-    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float[torch.Tensor, "B O"]:
+    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
         for step in self._pending[self._encoded : -1]:  # observed since the last decision; the newest follows below
             self._deployed.append(self._one(step))
         newest = self._one(self._pending[-1]) if self._encoded < len(self._pending) else None
@@ -157,8 +153,8 @@ class CommittedPolicy(InContextPolicy):
         past = self._pending[1 - self.model.config.window :]
         nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
         columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
-        states, actions, _, rewards = (np.stack(column, axis=1)[:, None] for column in columns)
-        return self._deployed.decide_window(Windows(*self._tensors(states, actions, rewards)), newest)
+        states, actions, _, rewards = (np.stack(column, axis=1) for column in columns)
+        return self._deployed.decide_window(WindowColumns(states, actions, rewards), newest)
 
     def _running(self) -> list[tuple[np.ndarray, ...]]:
         return self._pending
@@ -166,17 +162,34 @@ class CommittedPolicy(InContextPolicy):
     def _not_encoded(self) -> list[tuple[np.ndarray, ...]]:
         return self._pending[self._encoded :]
 
-    def _one(self, step: tuple[np.ndarray, ...]) -> Transitions:
-        return Transitions(*self._tensors(*(column[:, None] for column in step)))
+    def _one(self, step: tuple[np.ndarray, ...]) -> Columns:
+        return Columns(*(column[:, None] for column in step))
 
     def _no_action(self, rows: int) -> Actions:
         spec = self.model.spec
         return np.zeros(rows, np.int64) if spec.discrete else np.zeros((rows, spec.actions), np.float32)
 
-    def _add_own(self, episode: Transitions) -> None:
+    def _add_own(self, episode: Columns) -> None:
         encoded, self._encoded = self._encoded, 0
         if not self._add_to_context(episode):
-            self._deployed.append(Transitions(*(column[:, encoded:] for column in episode)))
+            self._deployed.append(Columns(*(column[:, encoded:] for column in episode)))
+
+
+def deployed(model: PretrainedTransformer, batch: int, decoder: Decoder = "auto") -> Deployed:
+    """The transformer deployed in B environments by this decoder; ``auto``: the kernel where it can be used, else torch.
+
+    The kernel is for models of at most ``kernel_transformer.WIDEST`` on a CPU; others are deployed by torch.  Raises
+    ConfigError for ``kernel`` where this installation has none.
+    """
+    if decoder != "torch" and usable(model):
+        if kinds():
+            return KernelTransformer(model.spec, model.config, weights_of(model), batch)
+        if decoder == "kernel":
+            raise ConfigError(
+                "context.decoder = 'kernel': this installation has no compiled decoder for this processor; install a C compiler "
+                "and run `make env` again, or choose 'torch', which gives other digests"
+            )
+    return DeployedTransformer(model, batch)
 
 
 _RULES: dict[Deployment, type[InContextPolicy]] = {"paper": InContextPolicy, "committed": CommittedPolicy}

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from icrl_dist.methods.dpt_loss import batch_loss
-from icrl_dist.models.dpt import DeployedTransformer, Windows
+from icrl_dist.models.deployed import WindowColumns
+from icrl_dist.models.dpt import Windows
 from icrl_dist.models.heads import Gaussian
 from icrl_dist.training.batches import LabelledWindows, TrainingBatch
+from tests.models.deployments import Deploy, close, columns
 from tests.models.windowed import LENGTH, SPEC, B, R, T, build, part, transitions, windows
 
 
@@ -43,22 +45,23 @@ def test_a_change_in_a_window_changes_later_outputs_and_no_earlier_one(column, a
 @torch.no_grad()
 @pytest.mark.parametrize("heads", [1, 2])
 @pytest.mark.parametrize("together", [set(), {0, 7}, {9, 10}], ids=str)
-def test_a_context_that_grows_step_by_step_gives_the_outputs_of_training(heads, together):
+def test_a_context_that_grows_step_by_step_gives_the_outputs_of_training(heads, together, deploy: Deploy):
     """Transitions arrive with a decision, or several at once (``together``)."""
     model, whole, of = build(SPEC, heads), transitions(), part(windows(), slice(None), slice(0, 1))
-    deployed, t = DeployedTransformer(model, B), 0
+    deployed, t = deploy(model, B), 0
+    window = WindowColumns(*(column[:, 0].numpy() for column in of))
     while t < T:
         expected = model.decide_windows(of, model.encode(part(whole, slice(None), slice(0, t + 1))), torch.full((B, 1), t + 1))
         arrived = part(whole, slice(None), slice(t, t + 1))
-        torch.testing.assert_close(deployed.decide_window(of, arrived), expected[:, 0, -1], atol=1e-5, rtol=1e-5)
+        close(deployed.decide_window(window, columns(arrived)), expected[:, 0, -1])
         assert deployed.length == t + 1
-        torch.testing.assert_close(deployed.decide_window(of), expected[:, 0, -1], atol=1e-5, rtol=1e-5)
+        close(deployed.decide_window(window), expected[:, 0, -1])
         if t in together:
-            deployed.append(part(whole, slice(None), slice(t + 1, t + 4)))
+            deployed.append(columns(part(whole, slice(None), slice(t + 1, t + 4))))
             t += 3
         t += 1
     expected = model.decide(of.states[:, 0, :1], model.encode(whole))[:, 0]
-    torch.testing.assert_close(deployed.decide(of.states[:, 0, 0]), expected, atol=1e-5, rtol=1e-5)
+    close(deployed.decide(of.states[:, 0, 0].numpy()), expected)
 
 
 def test_every_label_has_the_same_weight_in_the_loss():

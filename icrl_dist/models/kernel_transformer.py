@@ -1,0 +1,115 @@
+"""The deployed transformer through the compiled kernel, without torch: ``models.dpt.DeployedTransformer`` on numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.special import ndtri
+
+from icrl_dist.config.sections import ModelConfig
+from icrl_dist.interfaces import Actions
+from icrl_dist.models.deployed import Columns, WindowColumns
+from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
+from icrl_dist.models.sampling import sample
+from icrl_dist.types import Spec
+
+if TYPE_CHECKING:
+    from icrl_dist.models.dpt import PretrainedTransformer
+
+WIDEST = 128
+"""The widest model for the kernel: at 256 torch's products are faster (docs/results/engine.md)."""
+FLOOR = 0.05
+"""Smallest standard deviation of a Gaussian, as in ``models.heads``."""
+
+
+def usable(model: PretrainedTransformer) -> bool:
+    """Whether the kernel is meant for this model: on a CPU, and not wider than ``WIDEST``."""
+    return model.low.device.type == "cpu" and model.config.width <= WIDEST
+
+
+class KernelTransformer:
+    """``models.deployed.Deployed`` by the kernel.
+
+    Every sum over inputs, tokens or actions runs in the kernel and in its order, so the outputs for discrete actions
+    are equal bit by bit on all processors, with one exception: sine and cosine of ``model.fourier`` are numpy's.
+    """
+
+    def __init__(
+        self, spec: Spec, config: ModelConfig, weights: Mapping[str, np.ndarray], batch: int, kernel: Kernel | None = None
+    ) -> None:
+        """``weights``: by their names in a checkpoint, without ``model/``."""
+        self._spec, self._config, self._kernel = spec, config, kernel or Kernel()
+        trunk = {name.removeprefix("trunk."): value for name, value in weights.items() if name.startswith("trunk.")}
+        self._decoder = KernelDecoder(trunk, config.heads, batch, self._kernel)
+        low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+        self._scale, self._shift = 2 / (high - low), -(high + low) / (high - low)
+        self._linear = {
+            name: (padded(weights[f"{name}.weight"].T), padded(weights[f"{name}.bias"]), len(weights[f"{name}.bias"]))
+            for name in ("embed_transition", "embed_query", "embed_taken", "head")
+            if f"{name}.weight" in weights
+        }
+        self.state: Float32[np.ndarray, "B D"] | None = None
+
+    @property
+    def length(self) -> int:
+        return self._decoder.length
+
+    def clear(self) -> None:
+        self._decoder.clear()
+
+    def append(self, transitions: Columns) -> None:
+        self._decoder.append(self._tokens(transitions))
+
+    def decide(self, states: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
+        return self._outputs(self._decoder.query(self._layer("embed_query", self._features(states))))
+
+    def decide_window(self, windows: WindowColumns, arrived: Columns | None = None) -> Float32[np.ndarray, "B O"]:
+        token = None if arrived is None else self._tokens(arrived)[:, 0]
+        states = self._features(windows.states)
+        # Each state, plus the previous state of the window with its action and reward; the first has no previous one.
+        taken = [states[:, :-1], self._actions(windows.prev_actions)[:, :-1], windows.prev_rewards[:, :-1, None]]
+        tokens = self._layer("embed_query", states)
+        tokens[:, 1:] += self._layer("embed_taken", np.concatenate(taken, axis=-1, dtype=np.float32))
+        return self._outputs(self._decoder.window(tokens, token))
+
+    def decide_row(self, row: int, states: Float32[np.ndarray, "Q S"], appended: Columns) -> Float32[np.ndarray, "Q O"]:
+        queries = self._layer("embed_query", self._features(states))
+        return self._layer("head", self._decoder.query_row(row, queries, self._tokens(appended)[0]))
+
+    def act(self, outputs: Float32[np.ndarray, "B O"], u: Float[np.ndarray, "B U"]) -> Actions:
+        if self._spec.discrete:
+            return sample(self.probabilities(outputs), u[:, 0])
+        mean, raw = np.split(outputs, 2, axis=-1)
+        deviation = FLOOR + np.logaddexp(np.float32(0), raw)
+        return np.clip(mean + deviation * ndtri(np.clip(u, 1e-6, 1 - 1e-6)), -1.0, 1.0).astype(np.float32)
+
+    def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
+        return self._kernel.softmax(padded(outputs), outputs.shape[1])
+
+    def _outputs(self, state: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B O"]:
+        self.state = state
+        return self._layer("head", state)
+
+    def _layer(self, name: str, x: Float32[np.ndarray, "*B I"]) -> Float32[np.ndarray, "*B O"]:
+        weight, bias, outputs = self._linear[name]
+        flat = self._kernel.linear(x.reshape(-1, x.shape[-1]), weight, bias)
+        return flat.reshape(*x.shape[:-1], flat.shape[1])[..., :outputs]
+
+    def _tokens(self, transitions: Columns) -> Float32[np.ndarray, "B T D"]:
+        observations, actions, after, rewards = transitions
+        columns = [self._features(observations), self._actions(actions), self._features(after), rewards[..., None]]
+        return self._layer("embed_transition", np.concatenate(columns, axis=-1, dtype=np.float32))
+
+    def _features(self, observations: Float32[np.ndarray, "*B S"]) -> Float32[np.ndarray, "*B F"]:
+        x = self._shift + np.asarray(observations, np.float32) * self._scale
+        if not self._config.fourier:
+            return x
+        half = np.float32(0.5 * np.pi)
+        waves = [f(half * k * x) for k in range(1, self._config.fourier + 1) for f in (np.sin, np.cos)]
+        return np.concatenate([x, *waves], axis=-1, dtype=np.float32)
+
+    def _actions(self, actions: np.ndarray) -> Float32[np.ndarray, "*B A"]:
+        return np.eye(self._spec.actions, dtype=np.float32)[actions] if self._spec.discrete else np.asarray(actions, np.float32)
