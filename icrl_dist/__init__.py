@@ -94,5 +94,11 @@ def __getattr__(name: str) -> object:
     if name == "oracle":
         return importlib.import_module("icrl_dist.problems.darkroom.solver")
     if name in _MODULES:
-        return getattr(importlib.import_module(_MODULES[name]), name)
+        try:
+            return getattr(importlib.import_module(_MODULES[name]), name)
+        except ImportError as error:
+            modules = importlib.import_module("icrl_dist.diagnostics.modules")
+            for package, file in modules.hidden_packages().items():
+                raise ImportError(f"{file} hides the package {package!r}, a part of icrl-dist: rename that file") from error
+            raise
     raise AttributeError(f"module 'icrl_dist' has no attribute {name!r}")

@@ -24,8 +24,9 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.diagnostics import cluster_file, cluster_nodes, node_facts
+from icrl_dist.diagnostics import cluster_file, cluster_nodes, node_facts, ray_job
 from icrl_dist.diagnostics.checks import Check
+from icrl_dist.diagnostics.modules import check_modules
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.stream import endpoints
 
@@ -38,6 +39,7 @@ def diagnose(endpoint: str, folder: Path) -> list[Check]:
     return [
         _python(),
         *_libraries(),
+        check_modules(),
         _cores(),
         _memory(),
         _endpoint(endpoint),
@@ -219,7 +221,7 @@ def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Che
         raise ConfigError(f"--endpoint {endpoint}: {error}") from None
     require_ray_token(address)
     try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        ray.init(address=address, job_config=ray_job.job_config(ray), log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(
             f"--address {address}: {error}; `ray status` on the head shows whether a cluster is running"

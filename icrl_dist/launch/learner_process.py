@@ -7,7 +7,6 @@ import json
 import os
 import queue
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -16,6 +15,7 @@ from typing import Any
 
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
+from icrl_dist.telemetry import processes
 
 
 class TrainFailed(RuntimeError):  # noqa: N818
@@ -46,12 +46,11 @@ class LearnerProcess:
         self._start()
 
     def _start(self) -> None:
-        command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
+        command = processes.python("-m", "learner", str(self._folder), "--endpoint", self.endpoint)
         self._log = (self._folder / "learner.err").open("ab")
         pipe = subprocess.PIPE
-        environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}  # idle torch threads sleep: decision 073
         self._process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True, env=environment
+            command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True, env=processes.environment()
         )
         threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
 
