@@ -5,7 +5,6 @@ import os
 
 import pytest
 
-from icrl_dist.storage import files
 from icrl_dist.storage.files import StoreError, atomic_write, explained
 from tests.calls import failing
 
@@ -25,7 +24,7 @@ def test_a_folder_that_cannot_be_created_is_an_error_with_the_file_s_name(tmp_pa
 def test_the_remedy_fits_the_cause(tmp_path, monkeypatch, number, remedy):
     path = tmp_path / "x"
     path.write_bytes(b"before")
-    monkeypatch.setattr(files.os, "fsync", failing(OSError(number, os.strerror(number))))
+    monkeypatch.setattr(os, "fsync", failing(OSError(number, os.strerror(number))))
     with pytest.raises(StoreError, match=remedy):
         atomic_write(path, lambda file: file.write(b"after"))
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
