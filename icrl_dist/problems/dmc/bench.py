@@ -126,7 +126,6 @@ class SACExperts(DisturbanceExperts):
 
 def _require_cache(config: SACConfig) -> None:
     """Raises ConfigError before a training whose expert is read from the cache, if there is none."""
-    if reason := cache.unusable(config) or (
-        "" if config.cache else "sac.cache = '': the expert is read from there: set it to a writable folder"
-    ):
+    reason = "" if config.cache else "sac.cache = '': the expert is read from there: set it to a writable folder"
+    if reason := reason or cache.unusable(config):
         raise ConfigError(reason)
