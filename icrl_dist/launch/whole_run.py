@@ -16,7 +16,7 @@ from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, overri
 from icrl_dist.console.display import ReportEvent, Show, reporting
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.storage.files import hold, write_json
+from icrl_dist.storage.files import hold, without_locks, write_json
 from icrl_dist.storage.fork import parse_source
 
 if TYPE_CHECKING:
@@ -96,6 +96,8 @@ def train(
     transaction = launch.prepare(settings, folder, resume, overwrite, parent)
     started = time.monotonic()
     with reporting(progress) as show, contextlib.ExitStack() as locks:
+        if warning := without_locks(folder):
+            show({"event": "note", "text": warning})
         try:
             with transaction:
                 report = transaction.commit_at_checkpoint(show)

@@ -21,7 +21,8 @@ def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
 
     Another process may move or replace the folder while this one waits, so the lock must be on
     the file that is in the folder afterwards.  Raises StoreError if another process still has the
-    lock after ``timeout_s``; a process that was just killed needs a moment to end.
+    lock after ``timeout_s``; a process that was just killed needs a moment to end.  On a file system
+    without locks the file is returned unlocked; see ``without_locks``.
     """
     path = folder / ".lock"
     deadline = time.monotonic() + timeout_s
@@ -36,18 +37,43 @@ def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
                 file.close()
                 raise StoreError(f"{folder}: another learner uses this folder; end it, or use another --out") from None
             time.sleep(0.05)
+        except OSError as error:
+            if error.errno in _NO_LOCKS:
+                return file
+            file.close()
+            raise
         file.close()
 
 
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+"""Errors of ``flock`` on file systems that have no locks, such as Lustre or NFS without their lock service."""
+
+
+def without_locks(folder: Path) -> str:
+    """A warning if the file system of a run folder has no locks; empty if it has."""
+    try:
+        with (folder / ".lock").open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return (
+                f"{folder}: its file system has no locks ({error.strerror}), so nothing prevents a second run there: start none"
+            )
+    return ""
+
+
 def held(folder: Path) -> bool:
-    """Whether a process has locked a run folder, as far as this node can see.  Changes nothing."""
+    """Whether a process has locked a run folder, as far as this node and this user can see.  Changes nothing."""
     try:
         with (folder / ".lock").open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a shared lock, so simultaneous calls do not see each other
     except BlockingIOError:
         return True
-    except FileNotFoundError:
+    except (FileNotFoundError, PermissionError):
         return False
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
     return False
 
 
