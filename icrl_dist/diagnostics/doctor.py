@@ -78,7 +78,10 @@ def _cores() -> Check:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     enough = True if count >= 2 else None
     return Check(
-        "cores", enough, str(count), "" if enough else "use --actors 1; the learner and the worker then share the core"
+        "cores",
+        enough,
+        str(count),
+        "" if enough else "nothing must be done: one worker starts, and shares the core with the learner",
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from actors import local
-from actors.placement import check_cores
+from actors.placement import check_cores, local_actors
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, override
 from icrl_dist.console.display import ReportEvent, Show, reporting
@@ -22,8 +22,6 @@ from icrl_dist.storage.fork import parse_source
 if TYPE_CHECKING:
     from icrl_dist.results.reports import Evaluation
 
-LOCAL_ACTORS = 2
-"""Default number of workers without a cluster."""
 Engine = Literal["ray", "inline"]
 
 
@@ -64,7 +62,8 @@ def train(
     ``run``: a ``Run`` (``icrl_dist.load_run``), the name of a packaged run, or the path of a run file; None with
     ``source``: the settings of that run.  ``out``: the run folder; None: runs/NAME of the packaged run or the file.
     ``engine``: ``ray`` for a learner process and Ray workers, ``inline`` for everything in this process.
-    ``address``: of a Ray cluster; ``actors``: number of workers, by default 2, on a cluster one for each core;
+    ``address``: of a Ray cluster; ``actors``: number of workers, by default 2 (1 on a single core), on a cluster one
+    for each core;
     ``min_actors``: on a cluster, start with this many after one minute; ``oversubscribe``: allow more workers than cores.
     ``source``: ``"RUN_DIR@ROUND"``, to start from T^ROUND of another run and its data.
     ``resume``: continue the run in the folder; ``overwrite``: replace it.
@@ -87,11 +86,11 @@ def train(
     for option, value in (("--actors", actors), ("--min-actors", min_actors)):
         if value is not None and value < 1:
             raise ConfigError(f"{option} {value}: at least 1 worker is needed")
-    count = LOCAL_ACTORS if actors is None and address is None else actors
+    count = local_actors() if actors is None and address is None else actors
     if engine == "ray":
         local.refuse_running_session()
         if address is None and not oversubscribe:
-            check_cores(count or LOCAL_ACTORS)
+            check_cores(count or 1)
         launch.check_security(settings, address)
     transaction = launch.prepare(settings, folder, resume, overwrite, parent)
     started = time.monotonic()

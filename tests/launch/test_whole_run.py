@@ -252,6 +252,5 @@ def test_a_run_on_a_file_system_without_locks_goes_on_with_one_warning(module_ru
     monkeypatch.setattr(fcntl, "flock", failing(OSError(errno.ENOLCK, "No locks available")))
     events = list[dict[str, object]]()
     whole_run.train(module_run, tmp_path / "run", engine="inline", progress=events.append)
-    assert [event["text"] for event in events if "No locks available" in str(event.get("text"))] == [
-        f"{tmp_path / 'run'}: its file system has no locks (No locks available), so nothing prevents a second run there: start none"
-    ]
+    (warning,) = [str(event["text"]) for event in events if "No locks available" in str(event.get("text"))]
+    assert warning.startswith(f"{tmp_path / 'run'}: its file system has no locks")
