@@ -6,10 +6,12 @@ checkpoint written.
 
 from __future__ import annotations
 
+import io
 import os
 import select
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -85,6 +87,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
     If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
     """
+    _write_any_text()
     try:
         try:
             return _run(list(sys.argv[1:] if words is None else words))
@@ -95,6 +98,13 @@ def main(words: Sequence[str] | None = None) -> int:
             raise  # another pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at exit
         return BROKEN_PIPE
+
+
+def _write_any_text() -> None:
+    """Let the streams write names that their encoding lacks as escapes: with LANG=C, and file names that are not UTF-8."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _output_is_closed() -> bool:
@@ -118,6 +128,11 @@ def _run(words: list[str]) -> int:
         return OK
     if words[0] not in COMMANDS:
         print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
+        return USAGE
+    try:
+        Path.cwd()
+    except OSError as error:
+        print(f"icrl-dist: the current folder cannot be used ({error.strerror}): change to another one", file=sys.stderr)
         return USAGE
     try:
         return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -136,9 +137,14 @@ def _recorded(
 ) -> pd.DataFrame:
     """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows."""
     folder = run_folder(what)
-    name = what.stem if folder is None else folder.resolve().name
+    name = named(what.stem if folder is None else folder.resolve().name)
     blocks = [one.block(run, name, tasks) for tasks, ones in found.items() for one in ones]
     return rows.record(results, suite, report_name(run, what, suite, deploy), blocks, unstored)
+
+
+def named(name: str) -> str:
+    """The name of a file or folder as text: bytes that are no UTF-8 become escapes, such as ``run\\xff``."""
+    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 def run_folder(what: Path) -> Path | None:
@@ -177,7 +183,8 @@ def offline(
 def experts(run: Run, folder: Path) -> pd.DataFrame:
     """The returns of all recorded episodes of a run's experts, which are written as result rows."""
     data = Dataset(folder / "dataset", readonly=True)
-    blocks = [training_rows.of_expert(run, folder.resolve().name, data.trials(key)) for key in data.variations("pretrain", 0)]
+    name = named(folder.resolve().name)
+    blocks = [training_rows.of_expert(run, name, data.trials(key)) for key in data.variations("pretrain", 0)]
     data.close()
     return rows.record(folder / "results", "experts", {}, blocks)
 

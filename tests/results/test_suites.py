@@ -3,7 +3,9 @@
 import inspect
 import io
 import json
+import os
 import shutil
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -54,6 +56,19 @@ def test_results_that_cannot_be_stored_are_shown_all_the_same(folder, suite, mon
     assert main.main(words) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out.splitlines()[-1]).keys() == found.summary.keys() and printed.err.count("not stored: ") == 1
+
+
+@pytest.mark.integration
+def test_a_folder_whose_name_is_no_utf_8_is_evaluated_and_named_with_escapes(folder, tmp_path_factory, monkeypatch):
+    odd = Path(os.fsdecode(os.fsencode(tmp_path_factory.mktemp("odd")) + b"/r\xff"))
+    shutil.copytree(folder, odd)
+    rows = icrl_dist.evaluate(odd, episodes=1, seeds=1, p=[0.0]).rows
+    assert set(rows.run) == {"r\\xff"} and set(icrl_dist.read_results(odd).run) == {"r\\xff"}
+    output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", output)
+    assert main.main(["evaluate", str(odd), "--episodes", "1", "--seeds", "1", "--p", "0"]) == 0
+    output.flush()
+    assert b"figure" in output.buffer.getvalue()  # type: ignore[attr-defined]
 
 
 def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(folder, capsys):
