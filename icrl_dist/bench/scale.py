@@ -222,7 +222,8 @@ def _workers(endpoint: str, count: int, seconds: float) -> Iterator[list[subproc
             stack.callback(other.kill)
             others.append(other)
         for other in others:
-            assert _read(other) == "ready"
+            if (line := _read(other)) != "ready":
+                raise RuntimeError(f"a process of simulated workers answered {line!r}")
         yield others
 
 

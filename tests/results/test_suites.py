@@ -68,7 +68,7 @@ def test_a_folder_whose_name_is_no_utf_8_is_evaluated_and_named_with_escapes(fol
     monkeypatch.setattr("sys.stdout", output)
     assert main.main(["evaluate", str(odd), "--episodes", "1", "--seeds", "1", "--p", "0"]) == 0
     output.flush()
-    assert b"figure" in output.buffer.getvalue()  # type: ignore[attr-defined]
+    assert b"figure" in output.buffer.getvalue()
 
 
 def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(folder, capsys):
