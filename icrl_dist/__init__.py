@@ -88,12 +88,17 @@ _MODULES = {
     "Variation": "icrl_dist.types",
 }
 
+_COMPUTE = ("InContextAgent", "evaluate", "load_agent")
+"""Names whose modules import torch, and that compute in this process; ``train`` imports torch when it needs it."""
+
 
 def __getattr__(name: str) -> object:
     """Import a public name at its first use, because most commands need no torch."""
     if name == "oracle":
         return importlib.import_module("icrl_dist.problems.darkroom.solver")
     if name in _MODULES:
+        if name in _COMPUTE:
+            importlib.import_module("icrl_dist.telemetry.processes").import_torch()
         try:
             return getattr(importlib.import_module(_MODULES[name]), name)
         except ImportError as error:

@@ -18,6 +18,7 @@ from icrl_dist.launch import train as launch
 from icrl_dist.launch.run_folder import FolderTransaction
 from icrl_dist.storage.files import hold, without_locks, write_json
 from icrl_dist.storage.fork import parse_source
+from icrl_dist.telemetry.processes import import_torch
 
 if TYPE_CHECKING:
     from icrl_dist.results.reports import Evaluation
@@ -101,6 +102,7 @@ def train(
             with transaction:
                 report = transaction.commit_at_checkpoint(show)
                 if engine == "inline":
+                    import_torch()
                     result = launch.train_inline(settings, folder, report)
                 else:
                     result = launch.train_ray(settings, folder, count, address, report, oversubscribe, min_actors)
@@ -144,6 +146,7 @@ def _folder(run: Run | str | Path | None, out: str | Path | None, source: str | 
 
 
 def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
+    import_torch()
     from icrl_dist.results import heldout, reports  # they import torch, so they come after the training
 
     if not plugins.find("methods", run.method).trains:

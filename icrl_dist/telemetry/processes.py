@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import site
 import sys
@@ -40,6 +41,20 @@ def code_path() -> list[str]:
     root = Path(__file__).resolve().parents[2]
     places = [*sysconfig.get_paths().values(), *site.getsitepackages(), site.getusersitepackages()]
     return [] if root in [Path(place).resolve() for place in places] else [str(root)]
+
+
+def import_torch() -> None:
+    """Import torch so that its idle threads sleep, if this process has not imported it and has set no policy.
+
+    OpenMP reads the variable once, when torch loads it; for other libraries and child processes it stays unset.
+    """
+    if "torch" in sys.modules or "OMP_WAIT_POLICY" in os.environ:
+        return
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    try:
+        importlib.import_module("torch")
+    finally:
+        del os.environ["OMP_WAIT_POLICY"]
 
 
 def is_learner(process: psutil.Process) -> bool:

@@ -51,3 +51,27 @@ def test_the_search_path_names_a_checkout_and_no_installed_package(monkeypatch):
     site = next(place for place in sys.path if place.endswith("site-packages"))
     monkeypatch.setattr(processes, "__file__", f"{site}/icrl_dist/telemetry/processes.py")
     assert processes.code_path() == []
+
+
+POLICY = """
+import os, sys
+{first}
+import icrl_dist
+{use}
+print("torch" in sys.modules, os.environ.get("OMP_WAIT_POLICY"))
+"""
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("use", ["icrl_dist.evaluate", "icrl_dist.load_agent", "icrl_dist.train"])
+def test_idle_threads_of_torch_sleep_also_in_a_process_of_python(use):
+    """libgomp prints the policy that it uses; a process that has set one keeps it."""
+    environment = {**processes.environment(), "OMP_DISPLAY_ENV": "true"}
+    del environment["OMP_WAIT_POLICY"]
+    if use == "icrl_dist.train":
+        use = "import icrl_dist.launch.whole_run as w; icrl_dist.train; assert 'torch' not in sys.modules; w.import_torch()"
+    for first, expected in (("", "PASSIVE"), ("os.environ['OMP_WAIT_POLICY'] = 'ACTIVE'", "ACTIVE")):
+        script = POLICY.format(first=first, use=use) + "import torch; torch.ones(1)"
+        done = subprocess.run(processes.python("-c", script), env=environment, capture_output=True, text=True, check=False)
+        assert f"OMP_WAIT_POLICY = '{expected}'" in done.stderr, done.stderr
+        assert done.stdout.split()[1] == ("None" if not first else "ACTIVE"), done.stderr
