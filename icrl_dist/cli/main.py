@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import os
-import select
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,11 +16,12 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, train
-from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, streams, train
+from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
-from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_type, with_problem
+from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_folder_of, run_type, with_problem
+from icrl_dist.console.signals import interruptible
 from icrl_dist.storage.fork import parse_source
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
@@ -59,7 +59,10 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     found: Any = tyro.cli(kind, prog=prog, args=list(words))
     if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
-        base = load(found.run) if found.run else load_folder(parse_source(found.source or "")[0])
+        folder = run_folder_of(found.run) if found.resume or found.resume_or_begin else None
+        if not found.run:
+            folder = parse_source(found.source or "")[0]
+        base = load(found.run) if folder is None else load_folder(folder)
         if "--problem" in (word.partition("=")[0] for word in words):
             base = with_problem(base, found.config.problem)
         _check_settings(words, type(base), base.problem)
@@ -87,6 +90,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
     If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
     """
+    streams.prepare()
     _write_any_text()
     try:
         try:
@@ -94,10 +98,7 @@ def main(words: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # else Python would find a closed pipe only when it exits
     except BrokenPipeError:
-        if not _output_is_closed():
-            raise  # another pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at exit
-        return BROKEN_PIPE
+        return streams.end_of_output()
 
 
 def _write_any_text() -> None:
@@ -105,12 +106,6 @@ def _write_any_text() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="backslashreplace")
-
-
-def _output_is_closed() -> bool:
-    poll = select.poll()
-    poll.register(sys.stdout.fileno(), 0)
-    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def _run(words: list[str]) -> int:
@@ -135,8 +130,11 @@ def _run(words: list[str]) -> int:
         print(f"icrl-dist: the current folder cannot be used ({error.strerror}): change to another one", file=sys.stderr)
         return USAGE
     try:
-        return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
+        with interruptible():
+            return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
     except KeyboardInterrupt:
+        if words[0] == "train":  # before the run began, or after it ended
+            console.print("interrupted", highlight=False)
         return INTERRUPTED
     except Exception as error:
         from icrl_dist.storage.files import explained
