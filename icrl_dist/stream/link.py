@@ -85,7 +85,9 @@ def may_drop(key: str) -> bool:
 
 def _part(name: str) -> str:
     if not name or any(c in "/*$?#" or not c.isprintable() for c in name):
-        raise ValueError(f"{name!r} cannot be part of a key: it must not be empty nor hold any of / * $ ? #")
+        raise ValueError(
+            f"{name!r} cannot be part of a key: it must not be empty nor hold any of / * $ ? # or unprintable characters"
+        )
     return name
 
 
