@@ -218,6 +218,7 @@ class RunState:
                 "variations": changed,
                 "variation_count": len(self._variations),
                 "variations_left_out": left_out,
+                "averages": self._variations.averages(),
                 "episodes": self._variations.episodes(since),
                 "series": self._rates.series(since),
                 "events": [event for event in self._events if event["seq"] > since],

@@ -1,4 +1,7 @@
-"""Returns of every variation over its episodes, and sampled episodes as drawings."""
+"""Returns of every variation over its episodes, and sampled episodes as drawings.
+
+What is kept does not depend on the order in which messages arrive: a view that joins late receives old returns after new ones.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,8 @@ import functools
 from collections import OrderedDict, deque
 from typing import Any, NamedTuple
 
+from icrl_dist.monitor import averages, validation
 from icrl_dist.monitor import drawing as drawings
-from icrl_dist.monitor import validation
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.types import STAGES, Identity
 
@@ -23,6 +26,8 @@ _MAX_ENTRIES = 4096
 _MAX_DRAWINGS = 48
 _OPTIMA_PER_TICK = 4
 """Each optimum takes some milliseconds to compute."""
+_PROMPT = 500
+"""Up to this many variations, averages are computed for every snapshot."""
 _CHANGES_PER_TICK = 200
 """Limit on the variations that become part of one change; the remaining ones follow at later ticks."""
 
@@ -72,21 +77,21 @@ class VariationReturns:
 
     def __init__(self) -> None:
         self.phases: dict[Pair, PhaseReturns] = {}
-        """By (stage, round), in order of arrival."""
-        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_MAX_LINEAGE)
+        """By (stage, round)."""
+        self.lineage: dict[tuple[Pair, int], tuple[str, int, float, int, str, str, float]] = {}
+        """The newest episodes, by phase and trial."""
         self.changed = 0
         """``seq`` of the newest change that snapshots contain."""
         self.dirty = False
         """Whether it changed since then."""
 
     def phase(self, identity: Identity) -> PhaseReturns:
-        """The phase of ``identity``, added if needed; beyond the limit the phase that arrived first is removed."""
+        """The phase of ``identity``, added if needed; beyond the limit the oldest round is removed, perhaps this one."""
         key = _phase_key(identity)
-        if key not in self.phases:
-            if len(self.phases) >= _MAX_PHASES:
-                del self.phases[next(iter(self.phases))]
-            self.phases[key] = PhaseReturns(f"{identity.stage}/{identity.round}")
-        return self.phases[key]
+        found = self.phases.setdefault(key, PhaseReturns(f"{identity.stage}/{identity.round}"))
+        if len(self.phases) > _MAX_PHASES:
+            del self.phases[min(self.phases)]
+        return found
 
 
 class VariationTable:
@@ -100,6 +105,9 @@ class VariationTable:
         self._dirty: deque[VariationReturns] = deque()
         self._episodes: OrderedDict[Pair, dict[str, Any]] = OrderedDict()
         self._next_seq = 1
+        self._averages: list[dict[str, Any]] = []
+        self._averaged = True
+        """Whether these are the averages of the present returns and optima."""
 
     def __len__(self) -> int:
         """Number of variations in messages so far, those beyond the limit included."""
@@ -128,7 +136,9 @@ class VariationTable:
                 self._unsolved.popitem(last=False)
         for trial, episode_return in zip(trials, returns, strict=True):
             phase.returns[trial] = episode_return
-            variation.lineage.append((phase.name, trial, episode_return, version, digest, worker, time))
+            variation.lineage[phase_key, trial] = phase.name, trial, episode_return, version, digest, worker, time
+        for _ in range(len(variation.lineage) - _MAX_LINEAGE):
+            del variation.lineage[min(variation.lineage)]
         for _ in range(len(phase.returns) - _MAX_RETURNS):
             del phase.returns[min(phase.returns)]
         self._mark_dirty(variation)
@@ -145,6 +155,7 @@ class VariationTable:
         return self._variations[key]
 
     def _mark_dirty(self, variation: VariationReturns) -> None:
+        self._averaged = False
         if not variation.dirty:
             variation.dirty = True
             self._dirty.append(variation)
@@ -194,6 +205,28 @@ class VariationTable:
         rows = [_row(key, variation) for key, variation in sorted(self._variations.items()) if variation.changed > since]
         return rows, len(self._left_out)
 
+    def averages(self) -> list[dict[str, Any]]:
+        """The mean return of each phase over all variations, oldest phase first; see ``averages.of_phase``.
+
+        Of many variations they are computed at every eighth tick only.
+        """
+        if not self._averaged and (len(self._variations) <= _PROMPT or self._next_seq % 8 == 0):
+            self._averaged = True
+            by_phase: dict[Pair, list[PhaseReturns]] = {}
+            for variation in self._variations.values():
+                for key, phase in variation.phases.items():
+                    if phase.returns and not phase.quarantine:
+                        by_phase.setdefault(key, []).append(phase)
+            self._averages = [
+                {"name": phases[0].name, **averages.of_phase([(p.returns, p.optimum) for p in phases], _MAX_RETURNS)}
+                for _, phases in sorted(by_phase.items())
+            ]
+        return self._averages
+
+    def covered(self) -> int:
+        """Number of variations that hold as many phases as are kept."""
+        return sum(len(variation.phases) >= _MAX_PHASES for variation in self._variations.values())
+
     def episodes(self, since: int) -> list[dict[str, Any]]:
         """Drawn episodes that arrived after ``since``, oldest first."""
         return [episode for episode in self._episodes.values() if episode["seq"] > since]
@@ -209,7 +242,7 @@ class VariationTable:
             return None
         return {
             **_row(key, found),
-            "lineage": [_lineage_entry(key, *entry) for entry in found.lineage],
+            "lineage": [_lineage_entry(key, *entry) for _, entry in sorted(found.lineage.items())],
             "episode": self._episodes.get(key),
         }
 

@@ -1,0 +1,57 @@
+"""Averages of a phase: the same variations in every episode, and the same numbers whatever the order of arrival."""
+
+import pytest
+
+from icrl_dist.monitor import variations
+from icrl_dist.monitor.averages import of_phase
+from icrl_dist.monitor.run_state import RunState
+from tests.monitor.messages import DIRICHLET, send_trajectories, trajectory
+
+UNSOLVED = {"adversary": DIRICHLET.replace(alpha=(0.0,) * 5)}
+
+
+def test_a_variation_that_is_behind_or_has_a_gap_is_not_in_the_mean():
+    whole, good = {t: 1.0 for t in range(10)}, {t: 3.0 for t in range(10)}
+    behind, gap = {t: 9.0 for t in range(4)}, {t: 9.0 for t in range(10) if t != 7}
+    found = of_phase([(one, None) for one in (whole, good, behind, gap)], 256)
+    assert (found["variations"], found["of"], found["trials"]) == (2, 4, 10)
+    assert (found["first"], found["last"], found["scaled"]) == (2.0, 2.0, False), "9.0 would be a peak that never was"
+
+
+def test_with_an_optimum_only_variations_that_have_one_are_in_the_mean():
+    found = of_phase([({0: 2.0}, 4.0), ({0: 9.0}, None), ({0: 9.0}, 0.0)], 256)
+    assert (found["variations"], found["of"], found["last"], found["scaled"]) == (1, 3, 0.5, True)
+
+
+def test_only_the_newest_returns_of_a_long_phase_count():
+    long = {t: float(t) for t in range(92, 100)}
+    found = of_phase([(long, None), ({t: 0.0 for t in range(90, 98)}, None)], 8)
+    assert (found["variations"], found["first"], found["last"]) == (1, 92.0, 97.0)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_averages_and_lineage_do_not_depend_on_the_order_of_arrival(order):
+    state = RunState("demo")
+    every = [(n, v, t) for n in range(5) for v in range(3) for t in range(20)]
+    for number, variation, trial in every[::order]:
+        total = (number + variation + trial) % 5
+        send_trajectories(state, trajectory(f"adapt/{number}/0/{variation}/{trial}", total=total, **UNSOLVED))
+    state.tick(1.0)
+    shown = state.snapshot(1.0)
+    assert [(one["name"], one["variations"], one["of"]) for one in shown["averages"]] == [(f"adapt/{n}", 3, 3) for n in (2, 3, 4)]
+    expected = [sum((n + v + t) % 5 for v in range(3) for t in range(15, 20)) / 15 for n in (2, 3, 4)]
+    assert [one["last"] for one in shown["averages"]] == pytest.approx(expected)
+    detail = state.variation("0/1")
+    assert detail is not None
+    assert [one["identity"] for one in detail["lineage"]][-1] == "adapt/4/0/1/19" and len(detail["lineage"]) == 32
+
+
+def test_averages_of_many_variations_are_computed_at_some_ticks_only(monkeypatch):
+    monkeypatch.setattr(variations, "_PROMPT", 1)
+    state = RunState("demo")
+    send_trajectories(state, *(trajectory(f"adapt/0/{task}/0/0", **UNSOLVED) for task in range(3)))
+    seen = []
+    for now in range(9):
+        state.tick(float(now))
+        seen.append(len(state.snapshot(float(now))["averages"]))
+    assert seen[0] == 0 and seen[-1] == 1
