@@ -11,8 +11,8 @@ UNSOLVED = {"adversary": DIRICHLET.replace(alpha=(0.0,) * 5)}
 
 
 def test_a_variation_that_is_behind_or_has_a_gap_is_not_in_the_mean():
-    whole, good = {t: 1.0 for t in range(10)}, {t: 3.0 for t in range(10)}
-    behind, gap = {t: 9.0 for t in range(4)}, {t: 9.0 for t in range(10) if t != 7}
+    whole, good = dict.fromkeys(range(10), 1.0), dict.fromkeys(range(10), 3.0)
+    behind, gap = dict.fromkeys(range(4), 9.0), {t: 9.0 for t in range(10) if t != 7}
     found = of_phase([(one, None) for one in (whole, good, behind, gap)], 256)
     assert (found["variations"], found["of"], found["trials"]) == (2, 4, 10)
     assert (found["first"], found["last"], found["scaled"]) == (2.0, 2.0, False), "9.0 would be a peak that never was"
@@ -25,7 +25,7 @@ def test_with_an_optimum_only_variations_that_have_one_are_in_the_mean():
 
 def test_only_the_newest_returns_of_a_long_phase_count():
     long = {t: float(t) for t in range(92, 100)}
-    found = of_phase([(long, None), ({t: 0.0 for t in range(90, 98)}, None)], 8)
+    found = of_phase([(long, None), (dict.fromkeys(range(90, 98), 0.0), None)], 8)
     assert (found["variations"], found["first"], found["last"]) == (1, 92.0, 97.0)
 
 
@@ -38,7 +38,9 @@ def test_averages_and_lineage_do_not_depend_on_the_order_of_arrival(order):
         send_trajectories(state, trajectory(f"adapt/{number}/0/{variation}/{trial}", total=total, **UNSOLVED))
     state.tick(1.0)
     shown = state.snapshot(1.0)
-    assert [(one["name"], one["variations"], one["of"]) for one in shown["averages"]] == [(f"adapt/{n}", 3, 3) for n in (2, 3, 4)]
+    assert [(one["name"], one["variations"], one["of"]) for one in shown["averages"]] == [
+        (f"adapt/{n}", 3, 3) for n in (2, 3, 4)
+    ]
     expected = [sum((n + v + t) % 5 for v in range(3) for t in range(15, 20)) / 15 for n in (2, 3, 4)]
     assert [one["last"] for one in shown["averages"]] == pytest.approx(expected)
     detail = state.variation("0/1")
