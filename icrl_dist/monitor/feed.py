@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any, Protocol, Self
 
+from icrl_dist.monitor.catch_up import CatchUp
 from icrl_dist.monitor.recording import Recording
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.stream.link import Link
@@ -39,16 +40,40 @@ class LiveFeed:
     """A live run, over a link to its learner."""
 
     def __init__(self, link: Link, run: str = "") -> None:
-        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint."""
+        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint; asks for its past."""
         self.state = RunState(run)
-        self._ended = threading.Event()
-        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.state.receive(key, payload, time.time()))
+        self._ended, self._lock = threading.Event(), threading.Lock()
+        self._epoch = ""
+        """Epoch of the state whose past was requested."""
+        self._collecting = ""
+        """The phase that is being collected."""
+        self._past = CatchUp(link, self.state)
+        link.subscribe(f"icrl/{run or '*'}/mon/**", self._receive)
         self._thread = threading.Thread(target=self._tick, name="run-state", daemon=True)
         self._thread.start()
 
+    def _receive(self, key: str, payload: bytes) -> None:
+        with self._lock:
+            self.state.receive(key, payload, time.time())
+            if self._begin():
+                self.state.receive(key, payload, time.time())
+            before, self._collecting = self._collecting, self.state.collecting
+            if before and before != self._collecting and self.state.working:
+                self._past.collected(self.state.name, before)
+
+    def _begin(self) -> bool:
+        """Request the past of a run that was just selected; returns whether there was one."""
+        if not self.state.name or self.state.epoch == self._epoch:
+            return False
+        self._past.begin(self.state.name)
+        self._epoch, self._collecting = self.state.epoch, ""
+        return True
+
     def _tick(self) -> None:
         while not self._ended.wait(PERIOD_S):
-            self.state.tick(time.time())
+            with self._lock:
+                self._begin()
+                self.state.tick(time.time())
 
     def now(self) -> float:
         return time.time()
@@ -62,6 +87,7 @@ class LiveFeed:
     def close(self) -> None:
         self._ended.set()
         self._thread.join(5.0)
+        self._past.close()
 
     def __enter__(self) -> Self:
         return self

@@ -65,24 +65,58 @@ class RunState:
             self._event_count = 0
             self._alerts: dict[str, dict[str, Any]] = {}
             self._beliefs: dict[str, dict[str, Any]] = {}
+            self.past = ""
+            """``loading`` while returns from before this view are requested, ``missing`` if the learner does not answer."""
 
     # Called by the feed.
 
-    def receive(self, key: str, payload: bytes, now: float) -> None:
-        """Take in one message of the monitor plane; any bytes are allowed."""
+    @property
+    def name(self) -> str:
+        """Name of the run that is shown; empty if there is none yet."""
+        return str(self._run["name"])
+
+    @property
+    def working(self) -> bool:
+        """Whether the run collects or fits, so its learner can answer."""
+        return self._run["state"] in ("collecting", "fitting")
+
+    @property
+    def collecting(self) -> str:
+        """The phase that is being collected, as ``adapt/1``; empty otherwise."""
+        with self._lock:
+            return "{phase}/{round}".format(**self._run) if self._run["state"] == "collecting" else ""
+
+    @property
+    def phases_so_far(self) -> list[str]:
+        """The phases up to the present one, oldest first."""
+        with self._lock:
+            names = [f"{stage}/{number}" for stage, number, _ in self._rates.phases]
+            now = "{phase}/{round}".format(**self._run) if "phase" in self._run else ""
+            return names[: names.index(now) + 1] if now in names else []
+
+    def has_all_phases(self, requested: int) -> bool:
+        """Whether the returns of ``requested`` older phases would not be kept: every variation has as many newer ones."""
+        with self._lock:
+            return self._variations.complete(self._run.get("variations", 0), requested)
+
+    def receive(self, key: str, payload: bytes, now: float, past: bool = False) -> None:
+        """Take in one message of the monitor plane; any bytes are allowed.
+
+        ``past``: an answer to a request, whose episodes were not finished now, so they do not count for rates.
+        """
         try:
             message = strict.unpack(payload, MAX_BYTES)
             kind = validation.text(message.get("kind"), 32)
             run = validation.text(key.partition("/")[2].partition("/")[0], 200)
             with self._lock:
-                self._apply(run, kind, message, now)
+                self._apply(run, kind, message, now, past)
         except strict.WireError as error:
             self.ignored[error.reason] += 1
         except InvalidMessageError as error:
             self.ignored[str(error)] += 1
         self.received += 1
 
-    def _apply(self, run: str, kind: str, message: dict[str, Any], now: float) -> None:
+    def _apply(self, run: str, kind: str, message: dict[str, Any], now: float, past: bool) -> None:
         if kind == "learner":
             progress = readers.progress(message)
             self._select(run, now)
@@ -94,7 +128,7 @@ class RunState:
         elif run != self._run["name"]:
             raise InvalidMessageError("another run" if self._run["name"] else "no run yet")
         elif kind == "trajectories":
-            self._apply_returns(message)
+            self._apply_returns(message, past)
         elif kind == "episode":
             self._variations.add_episode(validation.identity(message.get("identity")), message)
         elif kind == "worker":
@@ -119,12 +153,13 @@ class RunState:
             self.clear()
         self._run["name"], self._last_message = run, now
 
-    def _apply_returns(self, message: dict[str, Any]) -> None:
+    def _apply_returns(self, message: dict[str, Any], past: bool) -> None:
         worker, time = validation.text(message.get("worker")), validation.timestamp(message.get("time"))
         invalid = None
         for entry in validation.bounded_list(message.get("variations"), _MAX_VARIATIONS):
             try:
-                self._rates.count_episodes(self._variations.add_returns(validation.mapping(entry), worker, time))
+                added = self._variations.add_returns(validation.mapping(entry), worker, time)
+                self._rates.count_episodes(0 if past else added)
             except InvalidMessageError as error:  # the valid entries of the message still count
                 invalid = error
         if invalid:
@@ -178,14 +213,17 @@ class RunState:
         """Number of ticks so far."""
         return self._seq
 
-    def tick(self, now: float) -> None:
-        """Advance time: update rates, compute some optima, and remove old beliefs."""
+    def tick(self, now: float, partial: bool = False) -> None:
+        """Advance time: update rates, compute some optima, and remove old beliefs.
+
+        ``partial``: only the learner's messages were received for this time, so the rates of workers are unknown.
+        """
         with self._lock:
             self._seq += 1
             self._workers.tick(now)
             rows = self._workers.rows(now)
             steps_per_s, unstored = sum(row["steps_per_s"] for row in rows), sum(row["unstored"] for row in rows)
-            self._rates.tick(now, self._seq, self._run, steps_per_s, unstored)
+            self._rates.tick(now, self._seq, self._run, steps_per_s, unstored, partial)
             self._variations.tick(self._seq)
             self._beliefs = {w: b for w, b in self._beliefs.items() if now - b["heard"] <= _BELIEF_S}
 
@@ -219,6 +257,7 @@ class RunState:
                 "variation_count": len(self._variations),
                 "variations_left_out": left_out,
                 "averages": self._variations.averages(),
+                "past": self.past,
                 "episodes": self._variations.episodes(since),
                 "series": self._rates.series(since),
                 "events": [event for event in self._events if event["seq"] > since],

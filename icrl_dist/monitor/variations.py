@@ -223,9 +223,10 @@ class VariationTable:
             ]
         return self._averages
 
-    def covered(self) -> int:
-        """Number of variations that hold as many phases as are kept."""
-        return sum(len(variation.phases) >= _MAX_PHASES for variation in self._variations.values())
+    def complete(self, expected: int, phases: int) -> bool:
+        """Whether every one of ``expected`` variations has as many phases as are kept, after ``phases`` were requested."""
+        full = sum(len(variation.phases) >= _MAX_PHASES for variation in self._variations.values())
+        return phases >= _MAX_PHASES and full >= expected > 0
 
     def episodes(self, since: int) -> list[dict[str, Any]]:
         """Drawn episodes that arrived after ``since``, oldest first."""

@@ -50,6 +50,11 @@ class StreamKeys:
         return f"icrl/{self.run}/mon/**"
 
     @property
+    def past(self) -> str:
+        """The learner answers requests of monitors for what the run has done so far here."""
+        return f"icrl/{self.run}/mon/past"
+
+    @property
     def heartbeats(self) -> str:
         """Every worker's heartbeat on the monitor plane."""
         return f"icrl/{self.run}/mon/worker/*"
