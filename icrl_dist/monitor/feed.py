@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from icrl_dist.monitor.catch_up import CatchUp
+from icrl_dist.monitor.evaluation import EvaluationReader, running
 from icrl_dist.monitor.recording import Recording
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.stream.link import Link
@@ -39,9 +40,13 @@ class Feed(Protocol):
 class LiveFeed:
     """A live run, over a link to its learner."""
 
-    def __init__(self, link: Link, run: str = "") -> None:
-        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint; asks for its past."""
+    def __init__(self, link: Link, run: str = "", folder: Path | None = None) -> None:
+        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint; asks for its past.
+
+        ``folder``: the run folder, if it is on this machine: the evaluation runs when the learner has ended.
+        """
         self.state = RunState(run)
+        self._evaluation = None if folder is None else EvaluationReader(folder, self.state)
         self._ended, self._lock = threading.Event(), threading.Lock()
         self._epoch = ""
         """Epoch of the state whose past was requested."""
@@ -88,6 +93,8 @@ class LiveFeed:
         self._ended.set()
         self._thread.join(5.0)
         self._past.close()
+        if self._evaluation is not None:
+            self._evaluation.close()
 
     def __enter__(self) -> Self:
         return self
@@ -105,7 +112,8 @@ class ReplayFeed:
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False
-        self._at = self._recording.begin
+        self._evaluation = EvaluationReader(folder, self.state)
+        self._at = self._recording.end if running(folder) else self._recording.begin  # not a past run: it is evaluated now
         self._messages = self._recording.messages()
         self._next = next(self._messages, None)
         self._ended = threading.Event()
@@ -161,6 +169,7 @@ class ReplayFeed:
     def close(self) -> None:
         self._ended.set()
         self._thread.join(5.0)
+        self._evaluation.close()
         self._recording.close()
 
     def __enter__(self) -> Self:

@@ -11,7 +11,7 @@ import uuid
 from collections import Counter, deque
 from typing import Any
 
-from icrl_dist.monitor import readers, validation
+from icrl_dist.monitor import headline, readers, validation
 from icrl_dist.monitor.rates import RateSeries
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.monitor.variations import VariationTable
@@ -29,7 +29,7 @@ _BELIEF_S = 60.0
 """Age at which a belief is removed.  A worker sends a belief rarely (after 200 times its cost) where it costs much."""
 _MAX_VARIATIONS = 4096
 """Limit on the variations in one message."""
-_OVER = ("finished", "interrupted", "failed")
+_OVER = ("finished", "evaluating", "interrupted", "failed")
 
 
 class RunState:
@@ -44,6 +44,9 @@ class RunState:
         ``recorded``: the messages come from a recording, which has no heartbeats, so nothing counts as silent.
         """
         self._lock, self._only, self._recorded = threading.RLock(), run, recorded
+        self._evaluation: dict[str, Any] | None = None
+        self._evaluating, self._evaluated = False, 0
+        self._seq = 0
         self.clear()
 
     def clear(self) -> None:
@@ -196,7 +199,7 @@ class RunState:
             self._variations.set_quarantine(event["identity"], text if what == "quarantine" else "")
         elif what == "version":
             self._run["version"] = event["version"]
-        elif what in _OVER:
+        elif what in _OVER and what != "evaluating":
             self._run["state"], self._run["ended"] = what, time
         self._event_count += 1
         self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
@@ -212,6 +215,13 @@ class RunState:
     def seq(self) -> int:
         """Number of ticks so far."""
         return self._seq
+
+    def set_evaluation(self, found: dict[str, Any] | None, running: bool) -> None:
+        """Show held-out returns (``monitor.evaluation.held_out``), and whether an evaluation runs; ``clear`` keeps both."""
+        with self._lock:
+            if found != self._evaluation:
+                self._evaluation, self._evaluated = found, self._seq + 1
+            self._evaluating = running
 
     def tick(self, now: float, partial: bool = False) -> None:
         """Advance time: update rates, compute some optima, and remove old beliefs.
@@ -240,24 +250,30 @@ class RunState:
                 run["state"] = "silent"
             began = run.get("began")
             run["elapsed_s"] = max(0.0, run.get("ended", now) - began) if began is not None else None
+            if run["state"] == "finished" and self._evaluating:
+                run["state"] = "evaluating"
             working = run["state"] in ("collecting", "fitting")
             run["eta_s"] = self._rates.eta_s(run) if working else None
             run["stage_eta_s"] = self._rates.stage_eta_s(run) if working else None
             run["silent_s"] = max(0.0, silent_s) if self._last_message > float("-inf") else None
             run["rates"] = dict(self._rates.rates)
+            run["round_text"], run["stage_text"] = headline.round_text(run), headline.stage_text(run)
+            workers = self._workers.rows(now, run["state"] in _OVER, run["version"])
             changed, left_out = self._variations.changed(since)
             return {
                 "epoch": self.epoch,
                 "seq": self._seq,
                 "since": since,
                 "time": now,
+                "headline": headline.headline(run, workers, len(self._alerts), self._evaluation),
                 "run": run,
-                "workers": self._workers.rows(now, run["state"] in _OVER, run["version"]),
+                "workers": workers,
                 "variations": changed,
                 "variation_count": len(self._variations),
                 "variations_left_out": left_out,
                 "averages": self._variations.averages(),
                 "past": self.past,
+                "evaluation": self._evaluation if self._evaluated > since else None,
                 "episodes": self._variations.episodes(since),
                 "series": self._rates.series(since),
                 "events": [event for event in self._events if event["seq"] > since],

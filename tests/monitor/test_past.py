@@ -166,7 +166,12 @@ def test_without_a_request_no_thread_runs_and_a_closed_server_refuses(watched, h
 
 def test_requests_beyond_the_queue_are_refused_and_the_learner_rests_between_answers(watched, hub, monkeypatch):
     link, answered = hub(), []
-    monkeypatch.setattr(Past, "answer", lambda self, payload: (time.sleep(0.05), b"x")[1])
+
+    def slow(self, payload):
+        time.sleep(0.05)
+        return b"x"
+
+    monkeypatch.setattr(Past, "answer", slow)
     server = PastServer(link, StreamKeys("busy"), watched.run, watched.folder, watched.service.store)
     began = time.monotonic()
     for _ in range(20):

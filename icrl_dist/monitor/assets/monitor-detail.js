@@ -72,7 +72,9 @@ export class Detail {
   #show(row) {
     this.row = row;
     byId("detail-facts").replaceChildren(...factsOf(row).map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
-    const trials = [...new Set(row.phases.flatMap((phase) => phase.trials))].sort((one, other) => one - other);
+    const all = row.phases.flatMap((phase) => phase.trials);
+    const [least, most] = [Math.min(...all), Math.max(...all)];
+    const trials = all.length ? Array.from({ length: most - least + 1 }, (_, index) => least + index) : []; // a missing trial is a gap
     const columns = row.phases.map((phase) => {
       const returns = new Map(phase.trials.map((trial, index) => [trial, phase.returns[index]]));
       return trials.map((trial) => returns.get(trial) ?? null);
