@@ -10,23 +10,29 @@ LAST = 5
 
 
 def of_phase(found: Sequence[tuple[Mapping[int, float], float | None]], longest: int) -> dict[str, Any]:
-    """Mean return by episode over the variations that have every episode of the phase so far.
+    """Mean return by episode over the variations that all have the same episodes.
 
     ``found``: for each variation its returns by trial (not empty), and its optimum; ``longest``: number of returns that are
-    kept of one variation, the newest.  If an optimum above 0 is known, returns are divided by it, and variations
-    without one are left out.  A mean over other variations in each episode would rise and fall with them.
+    kept of one variation, the newest.  A mean over other variations in each episode would rise and fall with them, so
+    the mean ends at one episode, which is chosen so that it is over as many returns as possible, and a variation that
+    ends earlier, or that lacks an episode, is left out.  In a finished phase these are all variations.  If an optimum
+    above 0 is known, returns are divided by it, and variations without one are left out.
 
     Returns ``scaled`` (whether returns are divided), ``variations`` (number in the mean), ``of`` (number with returns),
-    ``trials`` (the last trial + 1), ``first`` and ``last``: the mean of the first, and of the last five, of the kept
-    episodes (None without a variation).
+    ``trials`` (the last trial in the mean + 1), ``first`` and ``last``: the mean of the first, and of the last five, of
+    these episodes (None without a variation).
     """
-    last = max(max(returns) for returns, _ in found)
-    begin = max(0, last - longest + 1)
     scaled = any(optimum is not None and optimum > 0 for _, optimum in found)
+    whole = [(max(returns), returns, optimum) for returns, optimum in found if _whole(returns, longest)]
+    whole.sort(key=lambda one: -one[0])
+    begin = max(0, whole[0][0] - longest + 1) if whole else 0
+    counted = [((last - begin + 1) * number, number) for number, (last, _, _) in enumerate(whole, 1)]
+    number = max(counted, key=lambda one: (one[0], one[1]))[1] if counted else 0
+    end = whole[number - 1][0] if number else -1
     used = [
-        (returns, optimum if scaled and optimum is not None else 1.0)
-        for returns, optimum in found
-        if len(returns) == last - begin + 1 and min(returns) == begin and (not scaled or (optimum is not None and optimum > 0))
+        (returns, optimum if scaled and optimum else 1.0)
+        for _, returns, optimum in whole[:number]
+        if not scaled or (optimum is not None and optimum > 0)
     ]
 
     def mean(trials: Sequence[int]) -> float | None:
@@ -37,7 +43,13 @@ def of_phase(found: Sequence[tuple[Mapping[int, float], float | None]], longest:
         "scaled": scaled,
         "variations": len(used),
         "of": len(found),
-        "trials": last + 1,
+        "trials": end + 1,
         "first": mean([begin]),
-        "last": mean(range(max(begin, last - LAST + 1), last + 1)),
+        "last": mean(range(max(begin, end - LAST + 1), end + 1)),
     }
+
+
+def _whole(returns: Mapping[int, float], longest: int) -> bool:
+    """Whether no episode is missing up to the last, among the ``longest`` newest."""
+    last = max(returns)
+    return min(returns) == max(0, last - longest + 1) and len(returns) == min(last + 1, longest)

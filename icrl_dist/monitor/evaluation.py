@@ -33,6 +33,7 @@ def running(folder: Path) -> bool:
 def held_out(folder: Path) -> dict[str, Any] | None:
     """The held-out returns of a run folder for views, as JSON values (docs/monitor.md); None if there are none.
 
+    They are those of the models, of the random policy, and of the references that are given the task.
     Raises ConfigError or StoreError for rows that cannot be shown together.
     """
     if not any((folder / "results").glob("online-*.parquet")):
@@ -52,11 +53,13 @@ def of_rows(frame: pd.DataFrame) -> dict[str, Any] | None:
     levels = []
     for p in dict.fromkeys(one.p for one in found):
         here = [one for one in found if one.p == p]
+        shown = [one for one in here if one.agent.is_model or one.ceiling or one.agent.agent == "random"]
         levels.append(
             {
                 "p": p,
                 "ceiling": next((best[p, one.agent].name for one in here if (p, one.agent) in best), None),
-                "agents": [_agent(one, *estimates[p, one.agent], newest.get(p)) for one in here],
+                "agents": [_agent(one, *estimates[p, one.agent], newest.get(p)) for one in shown],
+                "left_out": len(here) - len(shown),
                 **_gain(here, newest.get(p)),
             }
         )

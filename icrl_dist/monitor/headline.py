@@ -26,10 +26,10 @@ def stage_text(run: Mapping[str, Any]) -> str:
     """What the run does: ``adapt/1: rollouts of T^1``, ``adapt/1: fit T^2``, ``pretrain/0: contexts, D^0``."""
     if "phase" not in run:
         return ""
-    name, version = f"{run['phase']}/{run['round']}", max(run["version"], -1)
+    name, adapts, number = f"{run['phase']}/{run['round']}", run["phase"] == "adapt", run["round"]
     if run["stage"] == "fit":
-        return f"{name}: fit T^{version + 1}"
-    return f"{name}: contexts, D^0" if run["phase"] == "pretrain" else f"{name}: rollouts of T^{version}"
+        return f"{name}: fit T^{number + 1 if adapts else 0}"
+    return f"{name}: rollouts of T^{min(number, run['version'])}" if adapts else f"{name}: contexts, D^0"
 
 
 def headline(

@@ -18,6 +18,15 @@ def test_a_variation_that_is_behind_or_has_a_gap_is_not_in_the_mean():
     assert (found["first"], found["last"], found["scaled"]) == (2.0, 2.0, False), "9.0 would be a peak that never was"
 
 
+def test_the_mean_of_an_unfinished_phase_is_over_as_many_returns_as_possible():
+    ahead, behind = dict.fromkeys(range(12), 9.0), dict.fromkeys(range(6), 1.0)
+    found = of_phase([(ahead, None), *[(behind, None)] * 3], 256)
+    assert (found["variations"], found["trials"], found["last"]) == (4, 6, 3.0)
+    found = of_phase([(ahead, None), *[(dict.fromkeys(range(2), 1.0), None)] * 3], 256)
+    assert (found["variations"], found["trials"], found["last"]) == (1, 12, 9.0)
+    assert of_phase([({1: 1.0}, None)], 256)["last"] is None, "the first episode is missing"
+
+
 def test_with_an_optimum_only_variations_that_have_one_are_in_the_mean():
     found = of_phase([({0: 2.0}, 4.0), ({0: 9.0}, None), ({0: 9.0}, 0.0)], 256)
     assert (found["variations"], found["of"], found["last"], found["scaled"]) == (1, 3, 0.5, True)
@@ -26,7 +35,10 @@ def test_with_an_optimum_only_variations_that_have_one_are_in_the_mean():
 def test_only_the_newest_returns_of_a_long_phase_count():
     long = {t: float(t) for t in range(92, 100)}
     found = of_phase([(long, None), (dict.fromkeys(range(90, 98), 0.0), None)], 8)
-    assert (found["variations"], found["first"], found["last"]) == (1, 92.0, 97.0)
+    assert (found["variations"], found["trials"]) == (2, 98), "trials 92 to 97, which both have"
+    assert (found["first"], found["last"]) == (46.0, 47.5)
+    far = of_phase([(long, None), (dict.fromkeys(range(4), 0.0), None)], 8)
+    assert (far["variations"], far["first"], far["last"]) == (1, 92.0, 97.0), "they have no trial in common"
 
 
 @pytest.mark.parametrize("order", [1, -1])

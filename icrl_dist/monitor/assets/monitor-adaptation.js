@@ -34,11 +34,12 @@ export function drawAdaptation(rows, store) {
   const newest = phases[0];
   const started = rows.filter((row) => row.phases.some((phase) => phase.name === newest && phase.trials.length));
   const known = started.filter((row) => drawable(row, newest, scale));
-  const [begin, last] = [Math.min(...found.map((one) => one.begin)), Math.max(...found.map((one) => one.last))];
+  const [begin, last] = [Math.min(...found.map((one) => one.begin)), Math.max(...found.map((one) => one.reached))];
   const x = Array.from({ length: last - begin + 1 }, (_, index) => begin + index + 1); // consecutive: a missing episode is a gap
   const lines = found.map((one) => x.map((episode) => one.means[episode - 1 - one.begin] ?? null));
   const [low, high] = spread(found[0].rows, newest, scale, x);
-  shown = { rows: sample(known), newest, scale, x, phases, references: scaled ? [] : references(store.evaluation) };
+  const top = sample(known).map((row) => drawable(row, newest, scale)).reduce((most, phase) => Math.max(most, Math.max(...phase.returns) / scale(phase)), 0);
+  shown = { rows: sample(known), newest, scale, x, phases, top, references: scaled ? [] : references(store.evaluation) };
   chart ??= new Chart(byId("adaptation"), options);
   const constant = shown.references.map(({ value }) => x.map(() => value));
   const names = shown.references.map(({ label, value }) => `${label} ${value}`);
@@ -52,20 +53,24 @@ function clear(text) {
 }
 
 /**
- * The variations that have every episode of a phase so far, and their mean return by episode.  A mean over other variations in
- * each episode would rise and fall with them.  `monitor/averages.py` has the same rule.
+ * The variations with the same episodes, and their mean return by episode; `monitor/averages.py` has the same rule and its
+ * reason.  `last`: the last episode in the mean; `reached`: the last one of any variation.
  */
 function common(rows, name, scale) {
-  const started = rows.filter((row) => drawable(row, name, () => 1) && !(row.quarantine && row.phases.at(-1).name === name));
-  const last = started.reduce((most, row) => Math.max(most, drawable(row, name, () => 1).trials.at(-1)), 0);
-  const begin = Math.max(0, last - KEPT + 1);
-  const whole = started.filter((row) => {
-    const trials = drawable(row, name, scale)?.trials;
-    return trials && trials[0] === begin && trials.length === last - begin + 1;
-  });
-  const columns = whole.map((row) => drawable(row, name, scale)).map((phase) => phase.returns.map((value) => value / scale(phase)));
-  const means = columns.length ? columns[0].map((_, index) => mean(columns.map((column) => column[index]))) : [];
-  return { begin, last, rows: whole, means };
+  const one = (row) => drawable(row, name, () => 1);
+  const started = rows.filter((row) => one(row) && !(row.quarantine && row.phases.at(-1).name === name));
+  const whole = started
+    .map((row) => ({ row, trials: one(row).trials, last: one(row).trials.at(-1) }))
+    .filter(({ trials, last }) => trials[0] === Math.max(0, last - KEPT + 1) && trials.length === Math.min(last + 1, KEPT))
+    .sort((a, b) => b.last - a.last);
+  const begin = whole.length ? Math.max(0, whole[0].last - KEPT + 1) : 0;
+  const counts = whole.map(({ last }, index) => (last - begin + 1) * (index + 1));
+  const number = counts.lastIndexOf(Math.max(...counts)) + 1;
+  const last = number ? whole[number - 1].last : begin;
+  const used = whole.slice(0, number).map(({ row }) => row).filter((row) => drawable(row, name, scale));
+  const columns = used.map((row) => drawable(row, name, scale)).map((phase) => new Map(phase.trials.map((trial, index) => [trial, phase.returns[index] / scale(phase)])));
+  const means = columns.length ? Array.from({ length: last - begin + 1 }, (_, index) => mean(columns.map((column) => column.get(begin + index)))) : [];
+  return { begin, last, reached: started.reduce((most, row) => Math.max(most, one(row).trials.at(-1)), last), rows: used, means };
 }
 
 /** Held-out returns of the references at the largest p, for problems without an optimum. */
@@ -99,7 +104,7 @@ function options() {
   );
   const constant = shown.references.map(({ label }, index) => line(label, REFERENCE_INKS[index], { width: 1.5, dash: [2, 3] }));
   return {
-    scales: { x: { time: false, range: (_, low, high) => [low, Math.max(high, low + 1)] }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(high ?? 1, 0.1) * 1.04] } },
+    scales: { x: { time: false, range: (_, low, high) => [low, Math.max(high, low + 1)] }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(high ?? 1, shown.top, 0.1) * 1.04] } },
     axes: [axis({ size: 22, incrs: [1, 2, 5, 10, 20, 50, 100] }), axis()],
     series: [{ label: "episode" }, edge("90%"), edge("10%"), ...constant, ...lines.toReversed()],
     bands: [{ series: [1, 2], fill: faint("--series-1", 0.14) }],
@@ -140,8 +145,8 @@ function describe(found, phases, started, solved, scaled, past) {
   const waiting = scaled && solved < started ? ` (${plural(started - solved, "optimum")} not computed yet)`.replace("optimums", "optima") : "";
   const [{ means, rows }] = found;
   const text = means.length
-    ? `${phases[0]}: ${brief(means[0])} in the first episode, ${brief(mean(means.slice(-5)))} in the last five, mean of ${plural(rows.length, "variation")} that ` +
-      `${rows.length === 1 ? "has" : "have"} every episode so far (n = ${rows.length} of ${started})${waiting}`
-    : `${phases[0]}: no variation has every episode so far (n = 0 of ${started})${waiting}`;
+    ? `${phases[0]}: ${brief(means[0])} in the first episode, ${brief(mean(means.slice(-5)))} in the last five, mean of ${plural(rows.length, "variation")} ` +
+      `in episodes ${found[0].begin + 1} to ${found[0].last + 1} (n = ${rows.length} of ${started})${waiting}`
+    : `${phases[0]}: no variation without missing episodes (n = 0 of ${started})${waiting}`;
   setText(byId("adaptation-summary"), `${text}${ends.length ? "; " + ends.join(", ") : ""}. Shaded: 10% to 90% of them.${PAST[past] ?? ""}`);
 }

@@ -38,13 +38,13 @@ export class HeldOut {
   #show() {
     const { evaluation } = this;
     const level = (this.level = evaluation.levels[Number(byId("heldout-p").value)]);
-    const head = ["Agent", `Return, last ${evaluation.last}`, ...(level.ceiling ? [`Of ${level.ceiling}`] : [])];
+    const head = ["Agent", `Last ${evaluation.last}`, ...(level.ceiling ? [`Of ${level.ceiling}`] : [])];
     const rows = level.agents.map((agent) =>
       el(
         "tr",
         { class: agent.role },
         el("th", { scope: "row" }, agent.name),
-        el("td", { class: "number" }, interval(agent.value, brief)),
+        el("td", { class: "number" }, level.ceiling ? brief(agent.value[0]) : interval(agent.value, brief)),
         ...(level.ceiling ? [el("td", { class: "number" }, interval(agent.share, percent))] : []),
       ),
     );
@@ -52,7 +52,10 @@ export class HeldOut {
     byId("heldout-table").replaceChildren(el("table", {}, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)));
     const newest = level.agents.find((agent) => agent.role === "newest");
     const verdict = level.verdict ? `${newest.name}: ${VERDICTS[level.verdict]} (difference ${interval(level.gain, brief)}). ` : "";
-    setText(byId("heldout-note"), `${verdict}${plural(evaluation.tasks, "task")}, ${plural(evaluation.evaluations, "evaluation")} of each; ${evaluation.over}.`);
+    const more = level.left_out ? ` ${plural(level.left_out, "further reference")} in the run's report.` : "";
+    const beyond = evaluation.trainings === 1 ? "one training: nothing is claimed beyond it" : plural(evaluation.trainings, "training");
+    setText(byId("heldout-note"), `${verdict}95% intervals over ${plural(evaluation.tasks, "task")}, ${plural(evaluation.evaluations, "evaluation")} of each; ${beyond}.${more}`);
+    byId("heldout-note").title = evaluation.over;
     this.chart ??= new Chart(byId("heldout-chart"), () => this.#options());
     const longest = Math.max(...level.agents.map((agent) => agent.episodes.length));
     const x = Array.from({ length: longest }, (_, index) => index + 1);
