@@ -88,9 +88,10 @@ def _agent(one: Returns, value: Interval, share: Interval | None, newest: Return
 
 def _gain(here: list[Returns], newest: Returns | None) -> dict[str, Any]:
     """Newest model less T^0: ``gain``, its interval, and ``verdict``; None where there is no earlier T^0."""
-    first = next((one for one in here if newest and one.agent == newest.agent._replace(agent=key_of(0))), None)
-    if newest is None or first is None or first.agent == newest.agent:
+    firsts = [one for one in here if one.agent.agent == key_of(0)]
+    if newest is None or not firsts or newest.agent.agent == key_of(0):
         return {"gain": None, "verdict": None}
+    first = next((one for one in firsts if one.agent.deployment == newest.agent.deployment), firsts[0])
     mean = comparison.compare(first, newest)[0]
     return {"gain": _numbers(mean.effect), "verdict": mean.verdict}
 
