@@ -94,9 +94,11 @@ def summary(variation: Row) -> Row:
 
 
 def by_episode(trials: list[int], returns: list[float]) -> list[float | None]:
-    """Returns of consecutive episodes, from the first trial to the last; None for one that is missing."""
-    known = dict(zip(trials, returns, strict=True))
-    return [known.get(trial) for trial in range(trials[0], trials[-1] + 1)] if trials else []
+    """Returns in order of trial, with one None where trials are missing, however many these are."""
+    found: list[float | None] = []
+    for before, trial, value in zip([None, *trials], trials, returns, strict=False):
+        found += [value] if before is None or trial == before + 1 else [None, value]
+    return found
 
 
 _COMMON = ("size", "horizon")

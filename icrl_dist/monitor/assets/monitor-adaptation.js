@@ -1,11 +1,12 @@
 // The chart of returns by episode: the mean over variations for each phase, and single variations.
 
 import { Chart, axis, faint, ink, line } from "./monitor-charts.js";
-import { brief, byId, mean, plural, setText } from "./monitor-dom.js";
+import { brief, byId, mean, plural, setText, withGaps } from "./monitor-dom.js";
 import { later } from "./monitor-store.js";
 
 const MAX_DRAWN = 200; // limit on the variations that are drawn and that the quantiles are computed from
 const MAX_PHASES = 3;
+const MAX_EPISODES = 1000; // limit on the episodes on the axis
 const KEPT = 256; // returns that a row has of one phase at most, the newest
 const INKS = ["--series-1", "--series-6", "--series-6"];
 const DASHES = [[], [7, 4], [2, 3]];
@@ -34,12 +35,13 @@ export function drawAdaptation(rows, store) {
   const newest = phases[0];
   const started = rows.filter((row) => row.phases.some((phase) => phase.name === newest && phase.trials.length));
   const known = started.filter((row) => drawable(row, newest, scale));
-  const [begin, last] = [Math.min(...found.map((one) => one.begin)), Math.max(...found.map((one) => one.reached))];
-  const x = Array.from({ length: last - begin + 1 }, (_, index) => begin + index + 1); // consecutive: a missing episode is a gap
+  const drawn = sample(known);
+  const trials = found.flatMap((one) => one.means.map((_, index) => one.begin + index));
+  const x = withGaps([...trials, ...drawn.flatMap((row) => drawable(row, newest, scale).trials)]).slice(-MAX_EPISODES).map((trial) => trial + 1);
   const lines = found.map((one) => x.map((episode) => one.means[episode - 1 - one.begin] ?? null));
   const [low, high] = spread(found[0].rows, newest, scale, x);
-  const top = sample(known).map((row) => drawable(row, newest, scale)).reduce((most, phase) => Math.max(most, Math.max(...phase.returns) / scale(phase)), 0);
-  shown = { rows: sample(known), newest, scale, x, phases, top, references: scaled ? [] : references(store.evaluation) };
+  const top = drawn.map((row) => drawable(row, newest, scale)).reduce((most, phase) => Math.max(most, Math.max(...phase.returns) / scale(phase)), 0);
+  shown = { rows: drawn, newest, scale, x, phases, top, references: scaled ? [] : references(store.evaluation) };
   chart ??= new Chart(byId("adaptation"), options);
   const constant = shown.references.map(({ value }) => x.map(() => value));
   const names = shown.references.map(({ label, value }) => `${label} ${value}`);
@@ -54,7 +56,7 @@ function clear(text) {
 
 /**
  * The variations with the same episodes, and their mean return by episode; `monitor/averages.py` has the same rule and its
- * reason.  `last`: the last episode in the mean; `reached`: the last one of any variation.
+ * reason.  `begin` and `last`: the first and the last trial in the mean.
  */
 function common(rows, name, scale) {
   const one = (row) => drawable(row, name, () => 1);
@@ -70,7 +72,7 @@ function common(rows, name, scale) {
   const used = whole.slice(0, number).map(({ row }) => row).filter((row) => drawable(row, name, scale));
   const columns = used.map((row) => drawable(row, name, scale)).map((phase) => new Map(phase.trials.map((trial, index) => [trial, phase.returns[index] / scale(phase)])));
   const means = columns.length ? Array.from({ length: last - begin + 1 }, (_, index) => mean(columns.map((column) => column.get(begin + index)))) : [];
-  return { begin, last, reached: started.reduce((most, row) => Math.max(most, one(row).trials.at(-1)), last), rows: used, means };
+  return { begin, last, rows: used, means };
 }
 
 /** Held-out returns of the references at the largest p, for problems without an optimum. */
@@ -141,12 +143,14 @@ const PAST = {
 };
 
 function describe(found, phases, started, solved, scaled, past) {
-  const ends = found.slice(1).map(({ means, rows }, index) => `${phases[index + 1]} ended at ${brief(means.length ? mean(means.slice(-5)) : null)} (n = ${rows.length})`);
+  const earlier = found.slice(1).map(({ means, rows }, index) => ({ name: phases[index + 1], end: brief(means.length ? mean(means.slice(-5)) : null), n: rows.length }));
+  const ends = earlier.map(({ name, end }) => `${name} ended at ${end}`);
+  const numbers = earlier.length ? ` n = ${earlier.map(({ name, n }) => `${n} in ${name}`).join(", ")}.` : "";
   const waiting = scaled && solved < started ? ` (${plural(started - solved, "optimum")} not computed yet)`.replace("optimums", "optima") : "";
   const [{ means, rows }] = found;
   const text = means.length
     ? `${phases[0]}: ${brief(means[0])} in the first episode, ${brief(mean(means.slice(-5)))} in the last five, mean of ${plural(rows.length, "variation")} ` +
       `in episodes ${found[0].begin + 1} to ${found[0].last + 1} (n = ${rows.length} of ${started})${waiting}`
     : `${phases[0]}: no variation without missing episodes (n = 0 of ${started})${waiting}`;
-  setText(byId("adaptation-summary"), `${text}${ends.length ? "; " + ends.join(", ") : ""}. Shaded: 10% to 90% of them.${PAST[past] ?? ""}`);
+  setText(byId("adaptation-summary"), `${text}${ends.length ? "; " + ends.join(", ") : ""}. Shaded: 10% to 90% of variations.${numbers}${PAST[past] ?? ""}`);
 }

@@ -72,6 +72,12 @@ export const plural = (count, noun) => `${number(count)} ${noun}${count === 1 ? 
 
 export const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
 
+/** The different trials in order, with one more after each gap, at which nothing has a value, so that no line crosses it. */
+export function withGaps(trials) {
+  const all = [...new Set(trials)].sort((one, other) => one - other);
+  return all.flatMap((trial, index) => (index + 1 < all.length && all[index + 1] > trial + 1 ? [trial, trial + 1] : [trial]));
+}
+
 /** A line over values by trial as an SVG, between `low` and `high`; a missing trial is a gap. */
 export function sparkline(svg, trials, values, low, high) {
   const [width, height] = [110, 22];
