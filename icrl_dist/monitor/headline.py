@@ -1,35 +1,14 @@
-"""Names and the one sentence on top, which every view shows: where the run is, how it is, and what it is worth.
-
-A phase has one name everywhere, that of its identities: ``adapt/1`` is the second round, in which T^1 acts.
-"""
+"""The one sentence on top, which every view shows: where the run is, how it is, and what it is worth."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from icrl_dist.console.phase_names import round_text
+
 _TROUBLE = ("gone", "silent")
 _OVER = {"interrupted": "Interrupted", "failed": "Failed", "finished": "Training finished", "evaluating": "Training finished"}
-
-
-def round_text(run: Mapping[str, Any]) -> str:
-    """``Round 2 of 2 (adapt/1)``, ``Pretraining (pretrain/0), 2 rounds follow``, or empty before the first phase."""
-    if "phase" not in run:
-        return ""
-    name, rounds = f"{run['phase']}/{run['round']}", run.get("rounds", 0)
-    if run["phase"] == "pretrain":
-        return f"Pretraining ({name})" + (f", {_count(rounds, 'round')} follow{'s' if rounds == 1 else ''}" if rounds else "")
-    return f"Round {run['round'] + 1}{f' of {rounds}' if rounds else ''} ({name})"
-
-
-def stage_text(run: Mapping[str, Any]) -> str:
-    """What the run does: ``adapt/1: rollouts of T^1``, ``adapt/1: fit T^2``, ``pretrain/0: contexts, D^0``."""
-    if "phase" not in run:
-        return ""
-    name, adapts, number = f"{run['phase']}/{run['round']}", run["phase"] == "adapt", run["round"]
-    if run["stage"] == "fit":
-        return f"{name}: fit T^{number + 1 if adapts else 0}"
-    return f"{name}: rollouts of T^{min(number, run['version'])}" if adapts else f"{name}: contexts, D^0"
 
 
 def headline(

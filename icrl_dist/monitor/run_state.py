@@ -11,12 +11,14 @@ import uuid
 from collections import Counter, deque
 from typing import Any
 
+from icrl_dist.console import phase_names
 from icrl_dist.monitor import headline, readers, validation
 from icrl_dist.monitor.rates import RateSeries
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.monitor.variations import VariationTable
 from icrl_dist.monitor.workers import WorkerTable
 from icrl_dist.stream import validation as strict
+from icrl_dist.types import STAGES
 
 MAX_BYTES = 1 << 20
 """Larger messages are ignored."""
@@ -174,6 +176,7 @@ class RunState:
             run["state"] = {"collect": "collecting", "fit": "fitting"}[progress["stage"]]
             run.pop("ended", None)
         run.update({name: value for name, value in progress.items() if name != "time"})
+        self._variations.present = STAGES.index(run["phase"]), run["round"]
         self._rates.update(run, now)
 
     def _apply_info(self, info: dict[str, Any]) -> None:
@@ -257,7 +260,7 @@ class RunState:
             run["stage_eta_s"] = self._rates.stage_eta_s(run) if working else None
             run["silent_s"] = max(0.0, silent_s) if self._last_message > float("-inf") else None
             run["rates"] = dict(self._rates.rates)
-            run["round_text"], run["stage_text"] = headline.round_text(run), headline.stage_text(run)
+            run["round_text"], run["stage_text"] = phase_names.round_text(run), phase_names.stage_text(run)
             workers = self._workers.rows(now, run["state"] in _OVER, run["version"])
             changed, left_out = self._variations.changed(since)
             return {

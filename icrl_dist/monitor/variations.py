@@ -85,12 +85,15 @@ class VariationReturns:
         self.dirty = False
         """Whether it changed since then."""
 
-    def phase(self, identity: Identity) -> PhaseReturns:
-        """The phase of ``identity``, added if needed; beyond the limit the oldest round is removed, perhaps this one."""
+    def phase(self, identity: Identity, present: Pair) -> PhaseReturns:
+        """The phase of ``identity``, added if needed.
+
+        Beyond the limit one is removed, perhaps this one: a round after the ``present`` one (it may be wrong), or the oldest.
+        """
         key = _phase_key(identity)
         found = self.phases.setdefault(key, PhaseReturns(f"{identity.stage}/{identity.round}"))
         if len(self.phases) > _MAX_PHASES:
-            del self.phases[min(self.phases)]
+            del self.phases[min(self.phases, key=lambda key: (key <= present, key))]
         return found
 
 
@@ -106,6 +109,8 @@ class VariationTable:
         self._episodes: OrderedDict[Pair, dict[str, Any]] = OrderedDict()
         self._next_seq = 1
         self._averages: list[dict[str, Any]] = []
+        self.present: Pair = len(STAGES), 0
+        """The phase that the learner is in; after all others while it is unknown."""
         self._averaged = True
         """Whether these are the averages of the present returns and optima."""
 
@@ -128,7 +133,7 @@ class VariationTable:
         known = self._variations[key].phases.get(phase_key) if key in self._variations else None
         info = known.info if known is not None and known.info is not None else VariationInfo.from_message(entry)
         variation = self._variation(key)
-        phase = variation.phase(identity)
+        phase = variation.phase(identity, self.present)
         if phase.info is None:
             phase.info = info
             self._unsolved[key, phase_key] = None
@@ -138,7 +143,7 @@ class VariationTable:
             phase.returns[trial] = episode_return
             variation.lineage[phase_key, trial] = phase.name, trial, episode_return, version, digest, worker, time
         for _ in range(len(variation.lineage) - _MAX_LINEAGE):
-            del variation.lineage[min(variation.lineage)]
+            del variation.lineage[min(variation.lineage, key=lambda key: (key[0] <= self.present, key))]
         for _ in range(len(phase.returns) - _MAX_RETURNS):
             del phase.returns[min(phase.returns)]
         self._mark_dirty(variation)
@@ -166,7 +171,7 @@ class VariationTable:
         ``identity`` is any trial of it, which may never have started.  Raises InvalidMessageError.
         """
         variation = self._variation((identity.task, identity.variation))
-        variation.phase(identity).quarantine = cause
+        variation.phase(identity, self.present).quarantine = cause
         self._mark_dirty(variation)
 
     def add_episode(self, identity: Identity, message: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ import pytest
 from icrl_dist.monitor import variations
 from icrl_dist.monitor.averages import of_phase
 from icrl_dist.monitor.run_state import RunState
-from tests.monitor.messages import DIRICHLET, send_trajectories, trajectory
+from tests.monitor.messages import DIRICHLET, progress, send, send_trajectories, trajectory
 
 UNSOLVED = {"adversary": DIRICHLET.replace(alpha=(0.0,) * 5)}
 
@@ -69,3 +69,19 @@ def test_averages_of_many_variations_are_computed_at_some_ticks_only(monkeypatch
         state.tick(float(now))
         seen.append(len(state.snapshot(float(now))["averages"]))
     assert seen[0] == 0 and seen[-1] == 1
+
+
+def test_rounds_that_have_not_begun_do_not_displace_those_that_have():
+    state = RunState("demo")
+    send(state, "learner", progress(phase="adapt", round=1))
+    for number in (7, 8, 9):  # wrong messages
+        send_trajectories(state, *(trajectory(f"adapt/{number}/0/0/{t}", **UNSOLVED) for t in range(20)))
+    for number in (0, 1):
+        send_trajectories(state, *(trajectory(f"adapt/{number}/0/0/{t}", **UNSOLVED) for t in range(20)))
+    detail = state.variation("0/0")
+    assert detail is not None
+    assert [phase["name"] for phase in detail["phases"]] == ["adapt/0", "adapt/1", "adapt/9"]
+    assert {one["identity"].rpartition("/")[0] for one in detail["lineage"]} == {"adapt/0/0/0", "adapt/1/0/0"}
+    send_trajectories(state, trajectory("pretrain/0/0/0/0", **UNSOLVED))
+    detail = state.variation("0/0")
+    assert detail is not None and [phase["name"] for phase in detail["phases"]] == ["pretrain/0", "adapt/0", "adapt/1"]

@@ -5,9 +5,10 @@ import time
 import numpy as np
 import pytest
 
+from icrl_dist.console.phase_names import round_text, stage_text
 from icrl_dist.monitor import evaluation
 from icrl_dist.monitor.feed import LiveFeed, ReplayFeed
-from icrl_dist.monitor.headline import headline, round_text, stage_text
+from icrl_dist.monitor.headline import headline
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.results import rows
 from icrl_dist.storage import files

@@ -13,6 +13,7 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.link import Refused, StreamKeys, Unanswered
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.stream.validation import WireError
+from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry.metrics import Metrics
 from learner import service
 from learner.past import PastServer
@@ -213,3 +214,18 @@ def test_a_lost_answer_is_asked_for_again(hub, watched):
 def test_nobody_answers_without_a_learner(hub):
     with pytest.raises(Unanswered):
         hub().request(StreamKeys("demo").past, past.request(), 1.0)
+
+
+@pytest.mark.integration
+def test_the_past_is_read_between_processes_too(watched):
+    with ZenohLink.listen("tcp/127.0.0.1:0") as learner:
+        server = PastServer(learner, StreamKeys("watched"), watched.run, watched.folder, watched.service.store)
+        with (
+            ZenohLink.connect(learner.endpoints[0], 10.0) as link,
+            LiveFeed(link, "watched") as late,
+            LiveFeed(watched.hub.link(), "watched") as other,
+        ):
+            for feed in (late, other):
+                until(lambda feed=feed: feed.state.snapshot(0.0)["variation_count"] == 21 and not feed.state.past)
+            assert shown(late) == shown(other)
+        server.close()
