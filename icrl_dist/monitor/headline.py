@@ -44,7 +44,7 @@ def _worth(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, over: b
     if evaluation is None:
         if run["state"] == "evaluating":
             return "the held-out evaluation is running"
-        return "no held-out returns here" if over else "held-out returns follow after the training"
+        return "no held-out returns yet" if over else "held-out returns follow after the training"
     level = max(evaluation["levels"], key=lambda one: float(one["p"]))
     agents = {agent["role"]: agent for agent in reversed(level["agents"])}
     first = next((agent for agent in level["agents"] if agent["key"] == "t0"), None)

@@ -211,9 +211,10 @@ class VariationTable:
         return rows, len(self._left_out)
 
     def averages(self) -> list[dict[str, Any]]:
-        """The mean return of each phase over all variations, oldest phase first; see ``averages.of_phase``.
+        """The mean return of the newest phases over all variations, oldest phase first; see ``averages.of_phase``.
 
-        Of many variations they are computed at every eighth tick only.
+        Of older phases some variations have removed their returns.  Of many variations they are computed at every eighth
+        tick only.
         """
         if not self._averaged and (len(self._variations) <= _PROMPT or self._next_seq % 8 == 0):
             self._averaged = True
@@ -222,9 +223,10 @@ class VariationTable:
                 for key, phase in variation.phases.items():
                     if phase.returns and not phase.quarantine:
                         by_phase.setdefault(key, []).append(phase)
+            newest = sorted(by_phase, key=lambda key: (key <= self.present, key))[-_MAX_PHASES:]
             self._averages = [
-                {"name": phases[0].name, **averages.of_phase([(p.returns, p.optimum) for p in phases], _MAX_RETURNS)}
-                for _, phases in sorted(by_phase.items())
+                {"name": found[0].name, **averages.of_phase([(p.returns, p.optimum) for p in found], _MAX_RETURNS)}
+                for found in (by_phase[key] for key in sorted(newest))
             ]
         return self._averages
 

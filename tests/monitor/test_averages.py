@@ -85,3 +85,16 @@ def test_rounds_that_have_not_begun_do_not_displace_those_that_have():
     send_trajectories(state, trajectory("pretrain/0/0/0/0", **UNSOLVED))
     detail = state.variation("0/0")
     assert detail is not None and [phase["name"] for phase in detail["phases"]] == ["pretrain/0", "adapt/0", "adapt/1"]
+
+
+def test_the_average_of_a_finished_round_does_not_change_when_a_later_round_begins():
+    state = RunState("demo")
+    for number in range(3):
+        send_trajectories(
+            state, *(trajectory(f"adapt/{number}/{v}/0/{t}", total=v, **UNSOLVED) for v in range(4) for t in range(6))
+        )
+    before = {one["name"]: one for one in state.snapshot(0.0)["averages"]}
+    send_trajectories(state, trajectory("adapt/3/0/0/0", **UNSOLVED))
+    after = {one["name"]: one for one in state.snapshot(0.0)["averages"]}
+    assert [*after] == ["adapt/1", "adapt/2", "adapt/3"], "of adapt/0 one variation has no returns any more"
+    assert all(after[name] == before[name] for name in ("adapt/1", "adapt/2"))

@@ -72,7 +72,7 @@ def test_the_sentence_names_trouble_and_states():
     assert line(state="waiting") == "Waiting for a learner."
     over = {"state": "evaluating", "elapsed_s": 7200.0, "eta_s": None}
     assert line(**over) == "Training finished after 2.0 h; the held-out evaluation is running."
-    assert line(**over | {"state": "finished"}) == "Training finished after 2.0 h; no held-out returns here."
+    assert line(**over | {"state": "finished"}) == "Training finished after 2.0 h; no held-out returns yet."
     assert line(**over | {"state": "interrupted"}).startswith("Interrupted after 2.0 h, Round 2 of 2 (adapt/1); ")
 
 
