@@ -101,7 +101,7 @@ def _training(view: ViewState, width: int) -> list[Line]:
         return []
     groups: list[Line] = []
     for one in view.averages[-3:]:
-        of = " of the optimum" if one["scaled"] else ""
+        of = f", {one['pending']} optima to compute" if one["pending"] else " of the optimum" if one["scaled"] else ""
         groups.append(
             [
                 (f"  {one['name']} ", DIM),

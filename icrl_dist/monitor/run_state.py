@@ -176,7 +176,8 @@ class RunState:
             run["state"] = {"collect": "collecting", "fit": "fitting"}[progress["stage"]]
             run.pop("ended", None)
         run.update({name: value for name, value in progress.items() if name != "time"})
-        self._variations.present = STAGES.index(run["phase"]), run["round"]
+        present = STAGES.index(run["phase"]), run["round"]
+        self._variations.present, self._variations.collecting = present, present if run["stage"] == "collect" else None
         self._rates.update(run, now)
 
     def _apply_info(self, info: dict[str, Any]) -> None:

@@ -59,12 +59,14 @@ _UNKNOWN = VariationInfo("", {}, {})
 class PhaseReturns:
     """One phase of a variation.  ICAA draws the adversary anew in every round, so the optimum differs by phase."""
 
-    __slots__ = ("info", "name", "optimum", "quarantine", "returns")
+    __slots__ = ("info", "name", "optimum", "pending", "quarantine", "returns")
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.info: VariationInfo | None = None
         self.optimum: float | None = None
+        self.pending = False
+        """Whether the optimum is not computed yet."""
         self.quarantine = ""
         """Why the variation was quarantined in this phase; may be set before any episode arrives."""
         self.returns: dict[int, float] = {}
@@ -111,6 +113,8 @@ class VariationTable:
         self._averages: list[dict[str, Any]] = []
         self.present: Pair = len(STAGES), 0
         """The phase that the learner is in; after all others while it is unknown."""
+        self.collecting: Pair | None = None
+        """The phase whose returns are arriving."""
         self._averaged = True
         """Whether these are the averages of the present returns and optima."""
 
@@ -135,7 +139,7 @@ class VariationTable:
         variation = self._variation(key)
         phase = variation.phase(identity, self.present)
         if phase.info is None:
-            phase.info = info
+            phase.info, phase.pending = info, True
             self._unsolved[key, phase_key] = None
             if len(self._unsolved) > _MAX_PHASES * MAX_VARIATIONS:
                 self._unsolved.popitem(last=False)
@@ -193,14 +197,15 @@ class VariationTable:
     def tick(self, seq: int) -> None:
         """Compute some optima, and make some changes visible to snapshots as of ``seq``."""
         self._next_seq = seq + 1
-        for _ in range(min(_OPTIMA_PER_TICK, len(self._unsolved))):
+        computed = 0
+        while self._unsolved and computed < _OPTIMA_PER_TICK:
             (key, phase_key), _ = self._unsolved.popitem(last=False)
             variation = self._variations[key]
             phase = variation.phases.get(phase_key)
             if phase is not None and phase.info is not None:
-                phase.optimum = drawings.optimum(*phase.info)
-                if phase.optimum is not None:
-                    self._mark_dirty(variation)
+                phase.optimum, phase.pending = drawings.optimum(*phase.info), False
+                computed += 1
+                self._mark_dirty(variation)
         for _ in range(min(_CHANGES_PER_TICK, len(self._dirty))):
             variation = self._dirty.popleft()
             variation.dirty, variation.changed = False, seq
@@ -211,23 +216,12 @@ class VariationTable:
         return rows, len(self._left_out)
 
     def averages(self) -> list[dict[str, Any]]:
-        """The mean return of the newest phases over all variations, oldest phase first; see ``averages.of_phase``.
-
-        Of older phases some variations have removed their returns.  Of many variations they are computed at every eighth
-        tick only.
-        """
+        """See ``averages.of_newest``.  Of many variations they are computed at every eighth tick only."""
         if not self._averaged and (len(self._variations) <= _PROMPT or self._next_seq % 8 == 0):
             self._averaged = True
-            by_phase: dict[Pair, list[PhaseReturns]] = {}
-            for variation in self._variations.values():
-                for key, phase in variation.phases.items():
-                    if phase.returns and not phase.quarantine:
-                        by_phase.setdefault(key, []).append(phase)
-            newest = sorted(by_phase, key=lambda key: (key <= self.present, key))[-_MAX_PHASES:]
-            self._averages = [
-                {"name": found[0].name, **averages.of_phase([(p.returns, p.optimum) for p in found], _MAX_RETURNS)}
-                for found in (by_phase[key] for key in sorted(newest))
-            ]
+            phases = (variation.phases for variation in self._variations.values())
+            limits = _MAX_PHASES, _MAX_RETURNS
+            self._averages = averages.of_newest(phases, self.present, self.collecting, limits)
         return self._averages
 
     def complete(self, expected: int, phases: int) -> bool:
@@ -293,4 +287,11 @@ def _phase_row(phase: PhaseReturns) -> dict[str, Any]:
     trials = sorted(phase.returns)
     returns = [round(phase.returns[trial], 4) for trial in trials]
     adversary = (phase.info or _UNKNOWN).adversary
-    return {"name": phase.name, "adversary": adversary, "optimum": phase.optimum, "trials": trials, "returns": returns}
+    return {
+        "name": phase.name,
+        "adversary": adversary,
+        "optimum": phase.optimum,
+        "pending": phase.pending,
+        "trials": trials,
+        "returns": returns,
+    }

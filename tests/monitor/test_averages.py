@@ -48,7 +48,8 @@ def test_averages_and_lineage_do_not_depend_on_the_order_of_arrival(order):
     for number, variation, trial in every[::order]:
         total = (number + variation + trial) % 5
         send_trajectories(state, trajectory(f"adapt/{number}/0/{variation}/{trial}", total=total, **UNSOLVED))
-    state.tick(1.0)
+    for now in range(9):  # four optima a tick
+        state.tick(float(now))
     shown = state.snapshot(1.0)
     assert [(one["name"], one["variations"], one["of"]) for one in shown["averages"]] == [
         (f"adapt/{n}", 3, 3) for n in (2, 3, 4)
@@ -93,8 +94,24 @@ def test_the_average_of_a_finished_round_does_not_change_when_a_later_round_begi
         send_trajectories(
             state, *(trajectory(f"adapt/{number}/{v}/0/{t}", total=v, **UNSOLVED) for v in range(4) for t in range(6))
         )
+    for now in range(9):  # four optima a tick
+        state.tick(float(now))
     before = {one["name"]: one for one in state.snapshot(0.0)["averages"]}
     send_trajectories(state, trajectory("adapt/3/0/0/0", **UNSOLVED))
     after = {one["name"]: one for one in state.snapshot(0.0)["averages"]}
     assert [*after] == ["adapt/1", "adapt/2", "adapt/3"], "of adapt/0 one variation has no returns any more"
-    assert all(after[name] == before[name] for name in ("adapt/1", "adapt/2"))
+    assert all(after[name] == before[name] and before[name]["last"] is not None for name in ("adapt/1", "adapt/2"))
+
+
+def test_a_finished_round_has_no_mean_until_every_optimum_is_computed():
+    state = RunState("demo")
+    send_trajectories(state, *(trajectory(f"adapt/0/{task}/0/{t}", total=task) for task in range(6) for t in range(3)))
+    shown = []
+    for now in range(3):
+        (one,) = state.snapshot(float(now))["averages"]
+        shown.append((one["pending"], one["variations"], one["last"]))
+        state.tick(float(now))
+    assert shown[:2] == [(6, 0, None), (2, 0, None)] and shown[2][:2] == (0, 6)
+    send(state, "learner", progress())
+    send_trajectories(state, trajectory("adapt/0/7/0/0"))
+    assert state.snapshot(3.0)["averages"][0]["variations"] == 6, "a round that is being collected is shown as it is"

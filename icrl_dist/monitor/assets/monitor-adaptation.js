@@ -31,7 +31,9 @@ export function drawAdaptation(rows, store) {
   phases.sort((one, other) => (one === other ? 0 : later(one, other) === one ? -1 : 1)).splice(MAX_PHASES);
   setText(byId("adaptation-unit"), `${scaled ? "return over the optimal return" : "return"}, by episode; training adversaries`);
   if (!phases.length) return clear(rows.length ? "No return with a known optimum yet." : store.variations.size ? "No variation matches the filters." : "No episode yet.");
-  const found = phases.map((name) => common(rows, name, scale));
+  const { run } = store;
+  const open = run.stage === "collect" ? `${run.phase}/${run.round}` : ""; // the phase whose returns are arriving
+  const found = phases.map((name) => common(rows, name, scale, name === open));
   const newest = phases[0];
   const started = rows.filter((row) => row.phases.some((phase) => phase.name === newest && phase.trials.length));
   const known = started.filter((row) => drawable(row, newest, scale));
@@ -56,9 +58,9 @@ function clear(text) {
 
 /**
  * The variations with the same episodes, and their mean return by episode; `monitor/averages.py` has the same rule and its
- * reason.  `begin` and `last`: the first and the last trial in the mean.
+ * reason: unless its returns are arriving (`open`), a phase has no mean until every optimum is computed.  `begin` and `last`: the first and the last trial in the mean.
  */
-function common(rows, name, scale) {
+function common(rows, name, scale, open) {
   const one = (row) => drawable(row, name, () => 1);
   const started = rows.filter((row) => one(row) && !(row.quarantine && row.phases.at(-1).name === name));
   const whole = started
@@ -69,7 +71,8 @@ function common(rows, name, scale) {
   const counts = whole.map(({ last }, index) => (last - begin + 1) * (index + 1));
   const number = counts.lastIndexOf(Math.max(...counts)) + 1;
   const last = number ? whole[number - 1].last : begin;
-  const used = whole.slice(0, number).map(({ row }) => row).filter((row) => drawable(row, name, scale));
+  const complete = open || !started.some((row) => one(row).pending);
+  const used = complete ? whole.slice(0, number).map(({ row }) => row).filter((row) => drawable(row, name, scale)) : [];
   const columns = used.map((row) => drawable(row, name, scale)).map((phase) => new Map(phase.trials.map((trial, index) => [trial, phase.returns[index] / scale(phase)])));
   const means = columns.length ? Array.from({ length: last - begin + 1 }, (_, index) => mean(columns.map((column) => column.get(begin + index)))) : [];
   return { begin, last, rows: used, means };
@@ -151,6 +154,6 @@ function describe(found, phases, started, solved, scaled, past) {
   const text = means.length
     ? `${phases[0]}: ${brief(means[0])} in the first episode, ${brief(mean(means.slice(-5)))} in the last five, mean of ${plural(rows.length, "variation")} ` +
       `in episodes ${found[0].begin + 1} to ${found[0].last + 1} (n = ${rows.length} of ${started})${waiting}`
-    : `${phases[0]}: no variation without missing episodes (n = 0 of ${started})${waiting}`;
+    : `${phases[0]}: no mean yet (n = 0 of ${started})${waiting}`;
   setText(byId("adaptation-summary"), `${text}${ends.length ? "; " + ends.join(", ") : ""}. Shaded: 10% to 90% of variations.${numbers}${PAST[past] ?? ""}`);
 }
