@@ -13,11 +13,11 @@ LAST = 5
 
 
 def of_newest(
-    variations: Iterable[Mapping[Pair, PhaseReturns]], present: Pair, collecting: Pair | None, limits: tuple[int, int]
+    variations: Iterable[Mapping[Pair, PhaseReturns]], begun: Pair, collecting: Pair | None, limits: tuple[int, int]
 ) -> list[dict[str, Any]]:
     """The averages of the newest phases, oldest phase first, with their ``name``; see ``of_phase``.
 
-    ``variations``: the phases of each, by (stage, round); ``present``: the phase that the run is in; ``collecting``: the
+    ``variations``: the phases of each, by (stage, round); ``begun``: the last phase that may have begun; ``collecting``: the
     phase whose returns are arriving; ``limits``: the number of phases, and of returns in a phase, that are kept of one
     variation.  Older phases are left out, because some variations have removed their returns.
     """
@@ -26,7 +26,7 @@ def of_newest(
         for key, phase in phases.items():
             if phase.returns and not phase.quarantine:
                 found.setdefault(key, []).append(phase)
-    newest = sorted(found, key=lambda key: (key <= present, key))[-limits[0] :]
+    newest = sorted(found, key=lambda key: (key <= begun, key))[-limits[0] :]
     answer = []
     for key in sorted(newest):
         pending = 0 if key == collecting else sum(one.pending for one in found[key])

@@ -176,8 +176,9 @@ class RunState:
             run["state"] = {"collect": "collecting", "fit": "fitting"}[progress["stage"]]
             run.pop("ended", None)
         run.update({name: value for name, value in progress.items() if name != "time"})
-        present = STAGES.index(run["phase"]), run["round"]
-        self._variations.present, self._variations.collecting = present, present if run["stage"] == "collect" else None
+        adapts = run["phase"] == "adapt"
+        self._variations.begun = STAGES.index("adapt"), run["round"] + 1 if adapts else 0  # may begin before the next message
+        self._variations.collecting = (STAGES.index(run["phase"]), run["round"]) if run["stage"] == "collect" else None
         self._rates.update(run, now)
 
     def _apply_info(self, info: dict[str, Any]) -> None:

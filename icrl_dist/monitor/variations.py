@@ -87,15 +87,15 @@ class VariationReturns:
         self.dirty = False
         """Whether it changed since then."""
 
-    def phase(self, identity: Identity, present: Pair) -> PhaseReturns:
+    def phase(self, identity: Identity, begun: Pair) -> PhaseReturns:
         """The phase of ``identity``, added if needed.
 
-        Beyond the limit one is removed, perhaps this one: a round after the ``present`` one (it may be wrong), or the oldest.
+        Beyond the limit one is removed, perhaps this one: a round after ``begun`` (it may be wrong), or the oldest.
         """
         key = _phase_key(identity)
         found = self.phases.setdefault(key, PhaseReturns(f"{identity.stage}/{identity.round}"))
         if len(self.phases) > _MAX_PHASES:
-            del self.phases[min(self.phases, key=lambda key: (key <= present, key))]
+            del self.phases[min(self.phases, key=lambda key: (key <= begun, key))]
         return found
 
 
@@ -111,8 +111,8 @@ class VariationTable:
         self._episodes: OrderedDict[Pair, dict[str, Any]] = OrderedDict()
         self._next_seq = 1
         self._averages: list[dict[str, Any]] = []
-        self.present: Pair = len(STAGES), 0
-        """The phase that the learner is in; after all others while it is unknown."""
+        self.begun: Pair = len(STAGES), 0
+        """The last phase that may have begun; after all others while it is unknown."""
         self.collecting: Pair | None = None
         """The phase whose returns are arriving."""
         self._averaged = True
@@ -137,7 +137,7 @@ class VariationTable:
         known = self._variations[key].phases.get(phase_key) if key in self._variations else None
         info = known.info if known is not None and known.info is not None else VariationInfo.from_message(entry)
         variation = self._variation(key)
-        phase = variation.phase(identity, self.present)
+        phase = variation.phase(identity, self.begun)
         if phase.info is None:
             phase.info, phase.pending = info, True
             self._unsolved[key, phase_key] = None
@@ -147,7 +147,7 @@ class VariationTable:
             phase.returns[trial] = episode_return
             variation.lineage[phase_key, trial] = phase.name, trial, episode_return, version, digest, worker, time
         for _ in range(len(variation.lineage) - _MAX_LINEAGE):
-            del variation.lineage[min(variation.lineage, key=lambda key: (key[0] <= self.present, key))]
+            del variation.lineage[min(variation.lineage, key=lambda key: (key[0] <= self.begun, key))]
         for _ in range(len(phase.returns) - _MAX_RETURNS):
             del phase.returns[min(phase.returns)]
         self._mark_dirty(variation)
@@ -175,7 +175,7 @@ class VariationTable:
         ``identity`` is any trial of it, which may never have started.  Raises InvalidMessageError.
         """
         variation = self._variation((identity.task, identity.variation))
-        variation.phase(identity, self.present).quarantine = cause
+        variation.phase(identity, self.begun).quarantine = cause
         self._mark_dirty(variation)
 
     def add_episode(self, identity: Identity, message: dict[str, Any]) -> None:
@@ -221,7 +221,7 @@ class VariationTable:
             self._averaged = True
             phases = (variation.phases for variation in self._variations.values())
             limits = _MAX_PHASES, _MAX_RETURNS
-            self._averages = averages.of_newest(phases, self.present, self.collecting, limits)
+            self._averages = averages.of_newest(phases, self.begun, self.collecting, limits)
         return self._averages
 
     def complete(self, expected: int, phases: int) -> bool:

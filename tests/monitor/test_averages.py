@@ -115,3 +115,15 @@ def test_a_finished_round_has_no_mean_until_every_optimum_is_computed():
     send(state, "learner", progress())
     send_trajectories(state, trajectory("adapt/0/7/0/0"))
     assert state.snapshot(3.0)["averages"][0]["variations"] == 6, "a round that is being collected is shown as it is"
+
+
+def test_returns_that_arrive_before_the_learner_names_their_round_are_kept():
+    state = RunState("demo")
+    for number in range(3):
+        send(state, "learner", progress(phase="adapt", round=number))
+        send_trajectories(state, trajectory(f"adapt/{number}/0/0/0", **UNSOLVED))
+    send_trajectories(state, trajectory("adapt/3/0/0/0", **UNSOLVED))
+    send(state, "learner", progress(phase="adapt", round=3))
+    send_trajectories(state, trajectory("adapt/3/0/0/1", **UNSOLVED))
+    detail = state.variation("0/0")
+    assert detail is not None and detail["phases"][-1]["trials"] == [0, 1]
