@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from icrl_dist.config.run import Run
+from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.problems import registry
 from icrl_dist.results import plots, summaries
 from icrl_dist.results.returns import Returns, returns
@@ -47,7 +48,7 @@ class Evaluation(JupyterMixin):
         yield from map(Text, self.notes)
 
     def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=120, soft_wrap=True)
+        console = PlainConsole(file=io.StringIO(), width=120, soft_wrap=True)
         with console.capture() as captured:
             console.print(self)
         return captured.get().rstrip("\n")

@@ -14,6 +14,9 @@ from typing import Protocol, Self
 
 _log = logging.getLogger(__name__)
 
+WORKER_TOPICS = ("worker", "trajectories", "episode", "belief")
+"""The topics of the monitor plane on which workers publish, each followed by the worker's name; the learner owns the others."""
+
 
 @dataclass(frozen=True, slots=True)
 class StreamKeys:
@@ -53,6 +56,11 @@ class StreamKeys:
     def past(self) -> str:
         """The learner answers requests of monitors for what the run has done so far here."""
         return f"icrl/{self.run}/mon/past"
+
+    @property
+    def monitor_of_workers(self) -> tuple[str, ...]:
+        """The part of the monitor plane on which workers publish."""
+        return tuple(f"icrl/{self.run}/mon/{topic}/*" for topic in WORKER_TOPICS)
 
     @property
     def heartbeats(self) -> str:

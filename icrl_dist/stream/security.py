@@ -79,7 +79,7 @@ def _access(keys: StreamKeys) -> dict[str, object]:
         "worker receives replies": ("egress", ["reply", "declare_queryable"], requested),
         "worker subscribes to weights": ("ingress", ["declare_subscriber"], [keys.weights]),
         "worker receives weights": ("egress", ["put"], [keys.weights]),
-        "worker publishes to monitors": ("ingress", ["put"], [keys.monitor_all]),
+        "worker publishes to monitors": ("ingress", ["put"], list(keys.monitor_of_workers)),
         "worker learns of subscribers": ("egress", ["declare_subscriber"], monitored),
         "worker holds a liveliness token": ("ingress", ["liveliness_token"], [keys.alive_all]),
         "monitor subscribes": ("ingress", ["declare_subscriber"], monitored),
