@@ -94,6 +94,7 @@ class Service:
             self._broadcast.digest_of,
             self._stored,
             self.fail,
+            registry.of(run).limits,
         )
         closing.callback(self.ingest.close)
         policy_version = lambda job: self._plan.policy_version(job, self.version)  # noqa: E731
