@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Link, Query, StreamKeys
 from icrl_dist.types import Weights
@@ -13,7 +14,7 @@ from icrl_dist.types import Weights
 class Broadcast:
     """Publishes policy versions of T_theta and answers requests for them, also for older ones.
 
-    ``older`` loads a version that was published before; it raises for a version that does not exist.
+    ``older`` loads a version that was published before; it raises StoreError for a version that is lost.
     """
 
     def __init__(self, link: Link, keys: StreamKeys, older: Callable[[int], Weights]) -> None:
@@ -59,6 +60,10 @@ class Broadcast:
                 return
             if 0 <= version < newest:
                 if self._loaded[0] != version:
-                    self._loaded = version, wire.encode_weights(self._older(version))
+                    try:
+                        self._loaded = version, wire.encode_weights(self._older(version))
+                    except StoreError as error:  # ``older`` ends the run
+                        query.refuse(f"lost: {error}")
+                        return
                 payload = self._loaded[1]
         query.reply(payload)

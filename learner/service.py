@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from icrl_dist.collect.checks import Rejected, check_arrays, largest
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
@@ -24,7 +25,7 @@ from icrl_dist.stream.link import Link, StreamKeys
 from icrl_dist.telemetry import provenance
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.types import Identity, Job, Trajectory, Weights
-from learner import checkpoints
+from learner import checkpoints, recovery
 from learner.broadcast import Broadcast
 from learner.fitting import Fitting
 from learner.ingest import Ingest
@@ -67,7 +68,12 @@ class Service:
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
         self._device = _device(run.learner.device)
         self._method = methods.of(run)
-        self._fitting = Fitting(run, folder, self._method, self._spec, self._device, self._threads)
+        notes = list[str]()
+        self._plan = PhasePlan(run, lineage, self._method)
+        found = recovery.intact(folder, run, lineage, self._plan.phases[-1].next_version, notes.append)
+        self._data = recovery.DataCheck(folder, found)
+        self._fitting = Fitting(run, folder, self._method, self._spec, self._device, self._threads, found, notes.append)
+        newest = self._fitting.load()
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
         self._reporter = Reporter(run, folder, link, self._keys, self._metrics, report, lambda: self.version)
@@ -79,11 +85,14 @@ class Service:
         self._error: BaseException | None = None
         self._lag = 0
         self._repairs = 0
-        self.store = Dataset(folder / "dataset")
+        for text in notes:
+            self._note(text)
+        self._fitting.note = self._note
+        self.store = self._plan.store = Dataset(folder / "dataset", check=self._check_stored)
         closing.callback(self.store.close)
         self._report_repairs()
-        self._plan = PhasePlan(run, lineage, self.store, self._method)
-        self._plan.quarantine(checkpoints.quarantined(folder, self.version))
+        self._data.weights(self.store)
+        self._plan.quarantine(dict(found[max(found)].get("quarantined", {})) if found else {})
         self._open_phases: set[Phase] = set()
         self._broadcast = Broadcast(link, self._keys, self._load_weights)
         self.ingest = Ingest(
@@ -103,11 +112,35 @@ class Service:
         self.worker_api = WorkerAPI(run, folder, link, self._keys, self._scheduler, self._lock, report, fail, policy_version)
         closing.callback(self.worker_api.close)
         self._serving = False
-        if newest := self._fitting.resume():
+        if newest is not None:
             self._broadcast.publish(newest)
         made_by = provenance.record(run.problem, run.method, self._threads, self._fitting.device_name)
         if changed := provenance.add_session(folder, self.version, made_by):
-            self._reporter.event({"event": "note", "text": changed})
+            self._note(changed)
+            self._data.excused = changed
+        elif run.stream.staleness:
+            self._data.excused = "rounds overlap (stream.staleness), so other versions may have collected it"
+
+    def _note(self, text: str) -> None:
+        self._reporter.event({"event": "note", "text": text})
+
+    def _check_stored(self, trajectory: Trajectory) -> str:
+        """Why a stored trajectory cannot be used, so that it is collected again; empty if it can.
+
+        Raises StoreError for one that this run did not ask for.
+        """
+        identity = trajectory.identity
+        job = self._plan.job_of(identity)
+        if job is None or trajectory.variation != job.variation(identity):
+            raise files.StoreError(
+                f"{self._folder / 'dataset'}: {identity} is of another run, this one asks for no such trajectory: restore the "
+                "right segment or run.toml, or start a new run with another --out"
+            )
+        try:
+            check_arrays(trajectory, job, self._spec, registry.of(self._run).limits)
+        except Rejected as error:
+            return str(error)
+        return ""
 
     @property
     def version(self) -> int:
@@ -153,8 +186,13 @@ class Service:
             self._changed.set()
 
     def _load_weights(self, version: int) -> Weights:
-        """The weights of an earlier version, from its checkpoint."""
-        return checkpoints.weights_of_file(checkpoint.version_file(self._folder, version), version)
+        """The weights of an earlier version, from its checkpoint.  Ends the run if they are lost."""
+        file = checkpoint.version_file(self._folder, version)
+        try:
+            return checkpoints.weights_of_file(file, version)
+        except files.StoreError as error:
+            self.fail(RunFailed(f"{error}: T^{version} was lost while the run was active; --resume fits it again"))
+            raise
 
     # Called from the thread of ``run``.
 
@@ -177,16 +215,17 @@ class Service:
 
     def _run_phases(self) -> dict[str, Any]:
         self._reporter.describe(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
-        while (phase := self._plan.next(self.version)) is not None:
+        while (phase := self._next_phase()) is not None:
             if phase.next_version <= self.version:
                 jobs = ", ".join(job.label for job in self._plan.incomplete(phase))
-                self._reporter.event({"event": "note", "text": f"trajectories of {jobs} are missing: collecting them again"})
+                self._note(f"trajectories of {jobs} are missing: collecting them again")
+                self._data.collected = True
             try:
                 self._collect(phase)
                 if phase.next_version > self.version:
                     self._fit(phase)
             except Damaged as error:
-                self._reporter.event({"event": "note", "text": str(error)})
+                self._note(str(error))
                 self.store.repair()
                 self._report_repairs()
                 self._plan.recheck()
@@ -207,6 +246,13 @@ class Service:
             "threads": self._threads,
             "instruction_set": torch.backends.cpu.get_cpu_capability(),
         }
+
+    def _next_phase(self) -> Phase | None:
+        """The next phase to collect or fit; compares the data of the fitted versions with their checkpoints when it is complete."""
+        phase = self._plan.next(self.version)
+        if self._data.manifests and (phase is None or phase.next_version > max(self._data.manifests)):
+            self._data.data(self.store, self._plan.quarantined, self._note)
+        return phase
 
     def close(self) -> None:
         """Stop storing trajectories and close all files."""
@@ -260,7 +306,7 @@ class Service:
         if phase.next_version > self.version:
             rated = self._method.label_quality(self._run, phase, self.store)
             quality = training_rows.rate_labels(
-                self._run, self._folder, phase, rated, lambda text: self._reporter.event({"event": "note", "text": text})
+                self._run, self._folder, phase, rated, self._note
             )
             if quality is not None:
                 self._reporter.labels_rated(phase.round, quality)
@@ -275,21 +321,29 @@ class Service:
             if step % 50 == 0 or step == phase.steps:
                 self._metrics.write(step, f"fit/{phase.next_version}", loss=loss)
 
-        loss = self._fitting.fit(phase, draw, report, self._stop, self._check)
+        try:
+            loss = self._fitting.fit(phase, draw, report, self._stop, self._check)
+        except FloatingPointError as error:
+            text = f"the fit of T^{phase.next_version} diverged: {error}"
+            self._reporter.diverged(text)
+            stored = (self.store.read(row.identity) for row in self.store.index)
+            worst = largest(stored, self._spec, lambda t: t.identity.next_version <= phase.next_version)
+            raise RunFailed(f"{text}; the largest values of its data are in {worst}") from None
         self.store.seal()
         weights = self._fitting.save(
+            self._data.accept(self.store),
             loss=loss,
             dataset=self.store.manifest(),
             dataset_digest=self.store.digest(self.version),
             quarantined=self._plan.quarantined,
         )
-        self._broadcast.publish(weights)
+        self._broadcast.publish(self._fitting.load() or weights)
         self._reporter.fitted(loss, time.monotonic() - began)
 
     def _report_repairs(self) -> None:
         """Report the damaged data that was removed when the dataset was opened."""
-        self._repairs += len(self.store.repaired)
-        for note in self.store.repaired:
+        self._repairs += len(self.store.damage)
+        for note in self.store.damage:
             self._reporter.event({"event": "repaired", "text": note})
 
     def _check(self) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
 import os
+import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +16,32 @@ from typing import IO, BinaryIO
 
 class StoreError(RuntimeError):
     """A run folder or a file of it cannot be used; the message says which, why, and the remedy."""
+
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFLNK: "a link",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFBLK: "a device",
+    stat.S_IFCHR: "a device",
+}
+
+
+def require_file(path: Path, follow: bool = True) -> None:
+    """Raises StoreError unless ``path`` is a file, or with ``follow`` a link to one; FileNotFoundError if it does not exist.
+
+    Opening a named pipe would wait for ever.
+    """
+    mode = path.stat().st_mode if follow else path.lstat().st_mode
+    if not stat.S_ISREG(mode):
+        raise StoreError(f"{path}: is {_KINDS.get(stat.S_IFMT(mode), 'no file')}, expected a file: move it away")
+
+
+def require_plain(path: Path) -> None:
+    """Raises StoreError if ``path`` exists and is not a file; a link, which can lead out of the run folder, is refused too."""
+    with contextlib.suppress(FileNotFoundError):
+        require_file(path, follow=False)
 
 
 def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:

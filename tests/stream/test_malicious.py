@@ -255,4 +255,4 @@ def test_a_malicious_dataset(bomb, dataset, what, after_valid):
         return
     with contextlib.closing(dataset):
         assert len(dataset) == (count if after_valid else 0)
-        assert dataset.repaired, "it neither raised an error nor reported a repair"
+        assert dataset.damage, "it neither raised an error nor reported a repair"
