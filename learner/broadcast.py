@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Link, Query, StreamKeys
 from icrl_dist.types import Weights
@@ -14,7 +13,7 @@ from icrl_dist.types import Weights
 class Broadcast:
     """Publishes policy versions of T_theta and answers requests for them, also for older ones.
 
-    ``older`` loads a version that was published before; it raises StoreError for a version that is lost.
+    ``older`` loads a version that was published before; if it raises an error, the run must end.
     """
 
     def __init__(self, link: Link, keys: StreamKeys, older: Callable[[int], Weights]) -> None:
@@ -62,7 +61,7 @@ class Broadcast:
                 if self._loaded[0] != version:
                     try:
                         self._loaded = version, wire.encode_weights(self._older(version))
-                    except StoreError as error:  # ``older`` ends the run
+                    except Exception as error:  # ``older`` has ended the run
                         query.refuse(f"lost: {error}")
                         return
                 payload = self._loaded[1]

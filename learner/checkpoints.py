@@ -15,7 +15,7 @@ from icrl_dist.agent.loading import spec_from
 from icrl_dist.config.run import ConfigError, Run, dumps
 from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.problems import registry
-from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_format, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, DamagedCheckpoint, load_checkpoint, require_format, save_checkpoint
 from icrl_dist.stream import wire
 from icrl_dist.stream.validation import VERSION
 from icrl_dist.telemetry import provenance
@@ -84,3 +84,13 @@ def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping
         raise ConfigError(f"{path}: a checkpoint of another optimizer ({error}): it has the run's optim.muon") from None
     load_weights(model, arrays)
     return checkpoint.manifest
+
+
+def weights_of_file(path: Path, version: int) -> Weights:
+    """The weights in a checkpoint, with their digest.  Raises StoreError for a missing or damaged one."""
+    checkpoint = load_checkpoint(path)
+    arrays = checkpoint.part("model")
+    digest = wire.weights_digest(arrays)
+    if digest != checkpoint.manifest.get("weights_digest", digest):
+        raise DamagedCheckpoint(f"{path}: damaged, its weights do not have the digest that it names")
+    return Weights(version, arrays, digest)

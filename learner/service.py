@@ -193,6 +193,9 @@ class Service:
         except files.StoreError as error:
             self.fail(RunFailed(f"{error}: T^{version} was lost while the run was active; --resume fits it again"))
             raise
+        except Exception as error:  # else workers would ask for ever
+            self.fail(error)
+            raise
 
     # Called from the thread of ``run``.
 
