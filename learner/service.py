@@ -18,7 +18,7 @@ from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from icrl_dist.results import training_rows
-from icrl_dist.storage import checkpoint, files
+from icrl_dist.storage import checkpoint, files, layout
 from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.stream.link import Link, StreamKeys
@@ -54,6 +54,7 @@ class Service:
         Raises StoreError if another learner uses the folder, or if its files cannot be used.
         """
         self._run, self._folder, self._link, self._report = run, folder, link, report
+        layout.refuse_odd_files(folder)
         with contextlib.ExitStack() as closing:
             closing.enter_context(files.hold(folder))
             self._open(closing)

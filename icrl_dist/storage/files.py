@@ -44,14 +44,15 @@ def require_plain(path: Path) -> None:
         require_file(path, follow=False)
 
 
-def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
-    """Lock a run folder until the returned file is closed or this process ends.
+def hold(folder: Path, timeout_s: float = 10.0, name: str = ".lock") -> IO[bytes]:
+    """Lock a run folder, by its file ``name``, until the returned file is closed or this process ends.
 
     Another process may move or replace the folder while this one waits, so the lock must be on
     the file that is in the folder afterwards.  Raises StoreError if another process still has the
     lock after ``timeout_s``; a process that was just killed needs a moment to end.
     """
-    path = folder / ".lock"
+    path = folder / name
+    require_plain(path)
     deadline = time.monotonic() + timeout_s
     while True:
         file = path.open("ab")
@@ -67,10 +68,11 @@ def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
         file.close()
 
 
-def held(folder: Path) -> bool:
-    """Whether a process has locked a run folder, as far as this node can see.  Changes nothing."""
+def held(folder: Path, name: str = ".lock") -> bool:
+    """Whether a process has locked a run folder by its file ``name``, as far as this node can see.  Changes nothing."""
     try:
-        with (folder / ".lock").open("rb") as file:
+        require_plain(folder / name)
+        with (folder / name).open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a shared lock, so simultaneous calls do not see each other
     except BlockingIOError:
         return True
