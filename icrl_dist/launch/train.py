@@ -55,7 +55,10 @@ def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple
         StreamKeys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
-    layout.refuse_odd_files(folder)
+    try:
+        layout.refuse_odd_files(folder)
+    except StoreError as error:
+        raise ConfigError(str(error)) from None
     run_folder.recover(folder)
     transaction = FolderTransaction(folder, source[1] if source and not resume else -1)
     if folder.exists() and not resume and any(folder.iterdir()):
