@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Link, Query, StreamKeys
+from icrl_dist.stream.link import LOST, Link, Query, StreamKeys
 from icrl_dist.types import Weights
 
 
@@ -62,7 +62,7 @@ class Broadcast:
                     try:
                         self._loaded = version, wire.encode_weights(self._older(version))
                     except Exception as error:  # ``older`` has ended the run
-                        query.refuse(f"lost: {error}")
+                        query.refuse(f"{LOST}: {error}")
                         return
                 payload = self._loaded[1]
         query.reply(payload)

@@ -12,12 +12,14 @@ import torch
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
 from icrl_dist.agent.trained_model import TrainedModel
-from icrl_dist.config.run import ConfigError, Deployment, parse_written
+from icrl_dist.config.run import ConfigError, Deployment, load_folder, parse_written
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
 from icrl_dist.models.weights import load_weights
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, newest_version, version_file
 from icrl_dist.storage.files import StoreError
+from icrl_dist.storage.fork import Lineage
+from icrl_dist.storage.held import check_weights, hold
 from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist.agent.shipped")))
@@ -41,7 +43,7 @@ def load_agent(
     Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy`` or if ``threads`` is
     below 1, StoreError if the file was not written by this system.  Loading executes no code from the file.
     """
-    checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
+    checkpoint = load_checkpoint(shipped(what)) if what in SHIPPED else open_checkpoint(Path(what))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
     return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
 
@@ -94,6 +96,22 @@ def checkpoint_file(what: Path, version: int | None = None) -> Path:
     if not found.is_file():
         raise ConfigError(f"{what}: holds no {'checkpoint' if version is None else f'version {version}'} yet")
     return found
+
+
+def open_checkpoint(what: Path, version: int | None = None) -> Checkpoint:
+    """The checkpoint at ``checkpoint_file(what, version)``; in a run folder it is held to its run.
+
+    Raises ConfigError if it is missing, StoreError if it is damaged or of another run or version.
+    """
+    path = checkpoint_file(what, version)
+    folder, number = path.absolute().parent.parent, path.stem.removeprefix("version-")
+    checkpoint = load_checkpoint(path)
+    if path.absolute().parent.name == "checkpoints" and number.isdigit() and (folder / "run.toml").is_file():
+        run = load_folder(folder)
+        hold(checkpoint, path, int(number), Lineage.of(folder, run).run_of(int(number)))
+    else:
+        check_weights(checkpoint, path)
+    return checkpoint
 
 
 def trained(checkpoint: Checkpoint) -> TrainedModel:

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from icrl_dist.agent.loading import SHIPPED, checkpoint_file, shipped
+from icrl_dist.agent.loading import SHIPPED, open_checkpoint, shipped
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
-from icrl_dist.storage.checkpoint import load_checkpoint
 
 Suite = Literal["online", "offline", "posterior"]
 Prior = Literal["uniform", "unseen"]
@@ -53,7 +52,7 @@ def evaluate(
     for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
         if value is not None and value not in get_args(choices):
             raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
-    run = parse_written(str(load_checkpoint(checkpoint_file(source)).manifest.get("run", "")), str(source))
+    run = parse_written(str(open_checkpoint(source).manifest.get("run", "")), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,

@@ -72,10 +72,15 @@ def hold(checkpoint: Checkpoint, path: Path, version: int, run: Run) -> None:
             f"{path}: is of a run with other settings, {', '.join(differing[:5])}: restore run.toml if it was changed, "
             f"else {remedy}"
         )
+    check_weights(checkpoint, path)
+
+
+def check_weights(checkpoint: Checkpoint, path: Path) -> None:
+    """Raises DamagedCheckpoint unless all arrays are finite and the weights have the digest that the manifest names."""
     for name, array in checkpoint.arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise DamagedCheckpoint(f"{path}: damaged, {name} holds a value that is infinite or not a number")
-    digest = manifest.get("weights_digest")
+    digest = checkpoint.manifest.get("weights_digest")
     if digest is not None and wire.weights_digest(checkpoint.part("model")) != digest:
         raise DamagedCheckpoint(f"{path}: damaged, its weights do not have the digest that it names ({str(digest)[:16]})")
 
