@@ -26,6 +26,17 @@ EXPLODED = 10.0
 """A fit has diverged if its last mean loss is more than this many times its first loss, or than 1 if that is more."""
 
 
+class RunFailed(RuntimeError):  # noqa: N818
+    """The run cannot continue; the message is one line for the user."""
+
+
+def device_of(name: str) -> torch.device:
+    """The device of ``learner.device``.  Raises RunFailed if it is ``cuda`` and torch finds no GPU."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise RunFailed("learner.device = 'cuda': torch finds no GPU; use auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
 class Fitting:
     """Trains the newest policy version of a run; continues a fit that was interrupted."""
 

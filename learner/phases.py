@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from icrl_dist.collect.checks import Rejected, check_arrays
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Method, Phase
+from icrl_dist.problems import registry
 from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import StoreError
 from icrl_dist.storage.fork import Lineage
-from icrl_dist.types import Identity, Job
+from icrl_dist.types import Identity, Job, Trajectory
 
 
 class PhasePlan:
@@ -21,6 +24,7 @@ class PhasePlan:
         self.phases = self.method.phases(run)
         self.quarantined: dict[str, str] = {}
         """The cause of each quarantined variation, by its name, such as ``adapt/0/3/1``."""
+        self._problem = registry.of(run)
         self._staleness, self._lineage = run.stream.staleness, lineage
         self._complete: set[Phase] = set()
         self._jobs: dict[Phase, tuple[Job, ...]] = {}
@@ -40,6 +44,24 @@ class PhasePlan:
                 self.ask(phase)
         job = self._job_of.get(identity[:4])
         return job if job is not None and identity.trial < job.trials else None
+
+    def refusal(self, trajectory: Trajectory) -> str:
+        """Why a stored trajectory cannot be used, so that it is collected again; empty if it can.
+
+        Raises StoreError for one that this run did not ask for.
+        """
+        identity = trajectory.identity
+        job = self.job_of(identity)
+        if job is None or trajectory.variation != job.variation(identity):
+            raise StoreError(
+                f"dataset: {identity} is of another run, this one asks for no such trajectory: restore the right segment or "
+                "run.toml, or start a new run with another --out"
+            )
+        try:
+            check_arrays(trajectory, job, self._problem.spec, self._problem.limits)
+        except Rejected as error:
+            return str(error)
+        return ""
 
     def next(self, version: int) -> Phase | None:
         """The first phase that is not fitted, or whose data is not complete; ``version``: the newest one."""

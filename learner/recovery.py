@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from icrl_dist.collect.checks import largest
 from icrl_dist.config.run import Run
 from icrl_dist.storage.checkpoint import Checkpoint, DamagedCheckpoint, load_checkpoint, newest_version, require_format
 from icrl_dist.storage.checkpoint import version_file as file_of
@@ -19,7 +20,7 @@ from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError, require_plain
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.storage.held import differences, hold
-from icrl_dist.types import Weights
+from icrl_dist.types import Spec, Weights
 
 Note = Callable[[str], None]
 
@@ -64,7 +65,7 @@ def _origin(folder: Path) -> str:
 
 
 def continues(path: Path, run: Run, version: int, note: Note) -> bool:
-    """Whether ``path`` is a checkpoint of the unfinished fit of T^(version + 1) that can be used; a broken one is expendable."""
+    """Whether ``path`` holds an unfinished fit of T^(version + 1) that can be continued; a broken one is expendable."""
     if not path.exists():
         return False
     try:
@@ -78,6 +79,12 @@ def continues(path: Path, run: Run, version: int, note: Note) -> bool:
         note(f"{error}: the fit of T^{version + 1} starts at its beginning")
         return False
     return True
+
+
+def largest_values(store: Dataset, spec: Spec, version: int) -> str:
+    """Where the largest values of the data of T^version are, for the message about a fit that diverged."""
+    found = largest((store.read(row.identity) for row in store.index), spec, lambda t: t.identity.next_version <= version)
+    return f"; the largest values of its data are in {found}" if found else ""
 
 
 @dataclasses.dataclass
@@ -98,8 +105,8 @@ class DataCheck:
             known = self.manifests.get(version, {}).get("weights_digest", digest)
             if known != digest:
                 raise StoreError(
-                    f"{store.folder}: {identity} was made by weights {digest[:16]}, but T^{version} has {known[:16]}: its dataset "
-                    "or its checkpoint is of another run; restore the right one, or start a new run with another --out"
+                    f"{store.folder}: {identity} was made by weights {digest[:16]}, but T^{version} has {known[:16]}: its "
+                    "dataset or its checkpoint is of another run; restore the right one, or start a new run with another --out"
                 )
 
     def accept(self, store: Dataset) -> Callable[[Weights], None]:
@@ -109,8 +116,8 @@ class DataCheck:
             for version, digest, identity in store.index.made_by():
                 if version == weights.version and digest != weights.digest:
                     raise StoreError(
-                        f"{self.folder}: T^{version} is lost; fitted again it has weights {weights.digest[:16]}, but {identity} was "
-                        f"made by {digest[:16]}: use the software and hardware of the run's start, or a copy of the checkpoint"
+                        f"{self.folder}: T^{version} is lost; fitted again it has weights {weights.digest[:16]}, but {identity} "
+                        f"was made by {digest[:16]}: use the software and hardware of the run's start, or a copy of the checkpoint"
                     )
 
         return accept
@@ -122,7 +129,9 @@ class DataCheck:
         wanted, found = manifest.get("dataset_digest"), store.digest(version)
         if wanted in (None, found):
             return
-        about = f"{store.folder}: the data of T^{version} has the digest {found[:16]}, its checkpoint was fitted to {wanted[:16]}"
+        about = (
+            f"{store.folder}: the data of T^{version} has the digest {found[:16]}, its checkpoint was fitted to {wanted[:16]}"
+        )
         excused = self.excused if self.collected else ""
         if set(quarantined) != set(manifest.get("quarantined", {})):
             excused = "a variation is quarantined now"

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from icrl_dist.collect.checks import Rejected, check_arrays, largest
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
@@ -27,18 +26,16 @@ from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.types import Identity, Job, Trajectory, Weights
 from learner import checkpoints, recovery
 from learner.broadcast import Broadcast
-from learner.fitting import Fitting
+from learner.fitting import Fitting, RunFailed, device_of
 from learner.ingest import Ingest
 from learner.phases import PhasePlan
 from learner.reporter import Reporter
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 
+__all__ = ["Interrupted", "RunFailed", "Service"]
+
 Report = Callable[[dict[str, Any]], None]
-
-
-class RunFailed(RuntimeError):  # noqa: N818
-    """The run cannot continue; the message is one line for the user."""
 
 
 class Interrupted(Exception):  # noqa: N818
@@ -67,7 +64,7 @@ class Service:
         self._spec = registry.of(run).spec
         lineage = Lineage.of(folder, run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
-        self._device = _device(run.learner.device)
+        self._device = device_of(run.learner.device)
         self._method = methods.of(run)
         notes = list[str]()
         self._plan = PhasePlan(run, lineage, self._method)
@@ -89,7 +86,7 @@ class Service:
         for text in notes:
             self._note(text)
         self._fitting.note = self._note
-        self.store = self._plan.store = Dataset(folder / "dataset", check=self._check_stored)
+        self.store = self._plan.store = Dataset(folder / "dataset", check=self._plan.refusal)
         closing.callback(self.store.close)
         self._report_repairs()
         self._data.weights(self.store)
@@ -124,24 +121,6 @@ class Service:
 
     def _note(self, text: str) -> None:
         self._reporter.event({"event": "note", "text": text})
-
-    def _check_stored(self, trajectory: Trajectory) -> str:
-        """Why a stored trajectory cannot be used, so that it is collected again; empty if it can.
-
-        Raises StoreError for one that this run did not ask for.
-        """
-        identity = trajectory.identity
-        job = self._plan.job_of(identity)
-        if job is None or trajectory.variation != job.variation(identity):
-            raise files.StoreError(
-                f"{self._folder / 'dataset'}: {identity} is of another run, this one asks for no such trajectory: restore the "
-                "right segment or run.toml, or start a new run with another --out"
-            )
-        try:
-            check_arrays(trajectory, job, self._spec, registry.of(self._run).limits)
-        except Rejected as error:
-            return str(error)
-        return ""
 
     @property
     def version(self) -> int:
@@ -252,7 +231,7 @@ class Service:
         }
 
     def _next_phase(self) -> Phase | None:
-        """The next phase to collect or fit; compares the data of the fitted versions with their checkpoints when it is complete."""
+        """The next phase to collect or fit; compares the data of fitted versions with their checkpoints once it is complete."""
         phase = self._plan.next(self.version)
         if self._data.manifests and (phase is None or phase.next_version > max(self._data.manifests)):
             self._data.data(self.store, self._plan.quarantined, self._note)
@@ -309,9 +288,7 @@ class Service:
         self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         if phase.next_version > self.version:
             rated = self._method.label_quality(self._run, phase, self.store)
-            quality = training_rows.rate_labels(
-                self._run, self._folder, phase, rated, self._note
-            )
+            quality = training_rows.rate_labels(self._run, self._folder, phase, rated, self._note)
             if quality is not None:
                 self._reporter.labels_rated(phase.round, quality)
 
@@ -330,9 +307,7 @@ class Service:
         except FloatingPointError as error:
             text = f"the fit of T^{phase.next_version} diverged: {error}"
             self._reporter.diverged(text)
-            stored = (self.store.read(row.identity) for row in self.store.index)
-            worst = largest(stored, self._spec, lambda t: t.identity.next_version <= phase.next_version)
-            raise RunFailed(f"{text}; the largest values of its data are in {worst}") from None
+            raise RunFailed(text + recovery.largest_values(self.store, self._spec, phase.next_version)) from None
         self.store.seal()
         weights = self._fitting.save(
             self._data.accept(self.store),
@@ -374,10 +349,3 @@ class Service:
             **values,
         }
         self._reporter.progress(fields, force, self.worker_api.totals)
-
-
-def _device(name: str) -> torch.device:
-    """The device of ``learner.device``.  Raises RunFailed if it is ``cuda`` and torch finds no GPU."""
-    if name == "cuda" and not torch.cuda.is_available():
-        raise RunFailed("learner.device = 'cuda': torch finds no GPU; use auto or cpu")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -34,7 +34,7 @@ class ExplainArguments:
 
 
 def explain(arguments: ExplainArguments, console: Console) -> int:
-    """Print the origin of one trajectory, or of all and then every damaged file.  Returns FAILED if a stored byte has changed."""
+    """Print the origin of one trajectory, or of all and each damaged file.  Returns FAILED if a stored byte has changed."""
     from icrl_dist.diagnostics import explain as origin
 
     if arguments.identity is None:

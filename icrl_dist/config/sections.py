@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
 
-from icrl_dist.config.ranges import NotNegative, NotNegativeFloat, Positive, PositiveFloat, Probability, Rate, Rounds, Share
+from icrl_dist.config.ranges import NotNegative, Positive, PositiveFloat, Probability, Rate, Rounds, Share
 from icrl_dist.stream.schema import Remedy
 
 Deployment = Literal["paper", "committed"]

@@ -14,8 +14,8 @@ from icrl_dist.collect import kinds
 from icrl_dist.config.run import ConfigError, Run, load_folder
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
-from icrl_dist.storage.checkpoint import newest_version
 from icrl_dist.storage import layout
+from icrl_dist.storage.checkpoint import newest_version
 from icrl_dist.storage.dataset import Dataset, segments
 from icrl_dist.storage.files import StoreError, held
 from icrl_dist.storage.fork import Lineage

@@ -9,10 +9,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from icrl_dist.config.run import ConfigError, Run, parse_written
+from icrl_dist.config.sac import SACConfig
 from icrl_dist.storage.checkpoint import Checkpoint, DamagedCheckpoint, load_checkpoint, version_file
 from icrl_dist.storage.files import StoreError, require_plain
 from icrl_dist.storage.fork import Lineage
@@ -20,7 +22,7 @@ from icrl_dist.stream import wire
 
 _FREE: Mapping[str, tuple[str, ...] | None] = {
     "stream": ("job_tasks", "staleness"),
-    "sac": tuple(field.name for field in dataclasses.fields(Run().sac) if field.name != "cache"),
+    "sac": tuple(field.name for field in dataclasses.fields(SACConfig) if field.name != "cache"),
     **dict.fromkeys(("learner", "evaluate", "alerts"), ()),
 }
 """Sections on whose other fields no digest depends; each with the fields on which one does."""
@@ -36,7 +38,8 @@ def _differences(run: Run, other: Run) -> Iterator[tuple[str, object, object]]:
         if getattr(run, name) != getattr(other, name):
             yield name, getattr(run, name), getattr(other, name)
     for field in dataclasses.fields(run):
-        part, another = getattr(run, field.name), getattr(other, field.name, None)
+        part: Any = getattr(run, field.name)
+        another: Any = getattr(other, field.name, None)
         if not dataclasses.is_dataclass(part) or type(another) is not type(part):
             continue
         compared = _FREE.get(field.name)
@@ -83,4 +86,3 @@ def check_weights(checkpoint: Checkpoint, path: Path) -> None:
     digest = checkpoint.manifest.get("weights_digest")
     if digest is not None and wire.weights_digest(checkpoint.part("model")) != digest:
         raise DamagedCheckpoint(f"{path}: damaged, its weights do not have the digest that it names ({str(digest)[:16]})")
-

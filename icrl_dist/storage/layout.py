@@ -17,7 +17,8 @@ NAMES = {
     "report": _REPORTS,
     "results": r"(online|offline|posterior|label_quality|experts)-[0-9a-f]{8}-\d{8}T\d{6}\.\d{6}Z\.parquet",
     "tensorboard": r"events\.out\.tfevents\..+",
-    "": r"(run\.toml|(env|fork|result)\.json|metrics\.jsonl|agent\.npz|learner\.(log|err)|endpoint|\.lock|\.replacement|\.beginning)",
+    "": r"(run\.toml|(env|fork|result)\.json|metrics\.jsonl|agent\.npz|learner\.(log|err)|endpoint"
+    r"|\.(lock|replacement|beginning))",
 }
 """The folders within a run folder, the deepest first, each with a pattern of the file names that this program writes."""
 
@@ -54,9 +55,9 @@ def refuse_odd_files(folder: Path) -> None:
         if not directory.is_dir():
             raise StoreError(f"{directory}: is no folder: move it away")
         try:
-            names = sorted(os.listdir(directory))
+            paths = sorted(directory.iterdir())
         except OSError as error:
             raise StoreError(f"{directory}: cannot be read ({error.strerror}): make it readable") from None
-        for name in names:
-            if owned(place, name):
-                require_plain(directory / name)
+        for path in paths:
+            if owned(place, path.name):
+                require_plain(path)

@@ -11,7 +11,7 @@ import pytest
 
 from icrl_dist import load_agent
 from icrl_dist.cli import main
-from icrl_dist.config.run import dumps, override
+from icrl_dist.config.run import Run, dumps, override
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import segment_path
 from icrl_dist.storage.files import StoreError
@@ -56,7 +56,10 @@ DAMAGE = {
     "a bit of a segment is flipped": (lambda f: flip(segment_path(f / "dataset", 1), 9000), "segment-000001.frames: a damaged"),
     "a bit of a checkpoint is flipped": (lambda f: flip(version_file(f, 1), 3000), "version-0001.npz: not a checkpoint"),
     "a checkpoint is missing": (lambda f: version_file(f, 0).unlink(), "version-0000.npz: no such checkpoint"),
-    "a checkpoint is a copy": (lambda f: shutil.copy(version_file(f, 1), version_file(f, 2)), "version-0002.npz: holds T^1, not"),
+    "a checkpoint is a copy": (
+        lambda f: shutil.copy(version_file(f, 1), version_file(f, 2)),
+        "version-0002.npz: holds T^1, not",
+    ),
     "env.json is garbage": (lambda f: (f / "env.json").write_text("{"), "env.json: damaged"),
 }
 
@@ -85,7 +88,7 @@ def test_explain_refuses_an_odd_file_by_name(damaged, capsys, kind):
     assert code != 0 and str(path) in err[0] and len(err) == 1
 
 
-def other_seed(folder: Path, run) -> None:
+def other_seed(folder: Path, run: Run) -> None:
     (folder / "run.toml").write_text(dumps(override(run, ["seed=5"], "--set")))
 
 

@@ -21,6 +21,7 @@ pytestmark = pytest.mark.integration
 
 __all__ = ["no_tensorboard", "parent"]
 
+
 @pytest.fixture(scope="module", params=["new", "fork"])
 def beginnings(request, parent, tmp_path_factory):
     """The folder of run folders that kills left, how many, the run, and the source of the fork."""
@@ -30,7 +31,9 @@ def beginnings(request, parent, tmp_path_factory):
 def left_by_kills(parent, folder, what, is_fork):
     (folder / "small.toml").write_text(dumps(parent[2]))
     arguments = [str(folder), str(folder / "small.toml"), what, *([str(parent[0])] if is_fork else [])]
-    done = subprocess.run([sys.executable, "-m", "tests.launch.killed", *arguments], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.launch.killed", *arguments], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     return folder, int(done.stdout), parent[2], (parent[0], 1) if is_fork else None
 
@@ -79,7 +82,7 @@ def test_after_a_kill_at_any_operation_the_command_begins_the_run(beginnings, tm
 
 
 def test_after_a_kill_in_the_beginning_of_a_replacement_the_old_run_is_restored(parent, tmp_path):
-    folder_of_all, count, run, source = left_by_kills(parent, tmp_path, "overwrite", True)
+    folder_of_all, count, run, _ = left_by_kills(parent, tmp_path, "overwrite", True)
     assert count > 15
     for operation in range(count):
         folder = folder_of_all / str(operation) / "run"
@@ -120,7 +123,11 @@ def test_parts_of_interrupted_writes_are_swept_and_those_of_active_processes_sta
     for name in ("checkpoints", "dataset"):
         (folder / name).mkdir()
     dead, active = 2**22 + 1, os.getpid()
-    swept = [f".run.toml.{dead}.part", f"checkpoints/.version-0000.npz.{dead}.part", f"dataset/.segment-000000.frames.{dead}.part"]
+    swept = [
+        f".run.toml.{dead}.part",
+        f"checkpoints/.version-0000.npz.{dead}.part",
+        f"dataset/.segment-000000.frames.{dead}.part",
+    ]
     kept = [f"checkpoints/.partial.npz.{active}.part", f".notes.md.{dead}.part"]
     for name in (*swept, *kept):
         (folder / name).touch()

@@ -77,7 +77,7 @@ DAMAGE = {
 @pytest.mark.parametrize("version", [0, 1, 2])
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_checkpoint_is_fitted_again_to_the_same_weights(parent, damaged, version, damage):
-    if damage == "missing" and version == 2 or (damage not in ("a flipped bit", "missing") and version == 1):
+    if (damage == "missing" and version == 2) or (damage not in ("a flipped bit", "missing") and version == 1):
         return  # without its newest checkpoint a run is one that was interrupted
     before = [load_checkpoint(version_file(damaged, v)).manifest["weights_digest"] for v in range(3)]
     DAMAGE[damage](version_file(damaged, version))
@@ -192,7 +192,9 @@ def test_a_changed_run_file_is_refused(parent, damaged):
 
 
 def test_settings_on_which_no_digest_depends_are_not_compared(parent, damaged):
-    run = override(parent[2], ["evaluate.episodes=4", "learner.cache_mb=1", "stream.lease_s=70.0", "alerts.labels=0.1"], "--set")
+    run = override(
+        parent[2], ["evaluate.episodes=4", "learner.cache_mb=1", "stream.lease_s=70.0", "alerts.labels=0.1"], "--set"
+    )
     (damaged / "run.toml").write_text(dumps(run))
     assert same(resumed(damaged, run)[0], parent[1])
 
@@ -231,8 +233,10 @@ def odd(kind: str, path: Path, outside: Path) -> None:
 @pytest.mark.parametrize("kind", ["pipe", "folder", "link"])
 @pytest.mark.parametrize(
     "name",
-    ["dataset/segment-000001.frames", "checkpoints/version-0000.npz", "checkpoints/partial.npz", "metrics.jsonl", ".lock"]
-    + ["env.json", "run.toml", "learner.log", "endpoint", "fork.json"],
+    [
+        *("dataset/segment-000001.frames", "checkpoints/version-0000.npz", "checkpoints/partial.npz", "metrics.jsonl", ".lock"),
+        *("env.json", "run.toml", "learner.log", "endpoint", "fork.json"),
+    ],
 )
 def test_an_odd_file_is_refused_by_name_and_nothing_is_written_through_a_link(parent, damaged, tmp_path, kind, name):
     odd(kind, damaged / name, tmp_path / "outside")
