@@ -116,8 +116,9 @@ class DataCheck:
             for version, digest, identity in store.index.made_by():
                 if version == weights.version and digest != weights.digest:
                     raise StoreError(
-                        f"{self.folder}: T^{version} is lost; fitted again it has weights {weights.digest[:16]}, but {identity} "
-                        f"was made by {digest[:16]}: use the software and hardware of the run's start, or a copy of the checkpoint"
+                        f"{self.folder}: T^{version} is lost; fitted again it has weights {weights.digest[:16]}, but "
+                        f"{identity} was made by {digest[:16]}: use the software and hardware of the run's start, "
+                        "or a copy of the checkpoint"
                     )
 
         return accept
