@@ -82,7 +82,7 @@ def check_weights(checkpoint: Checkpoint, path: Path) -> None:
     """Raises DamagedCheckpoint unless all arrays are finite and the weights have the digest that the manifest names."""
     for name, array in checkpoint.arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DamagedCheckpoint(f"{path}: damaged, {name} holds a value that is infinite or not a number")
+            raise DamagedCheckpoint(f"{path}: {name} are no finite numbers, so it is damaged or its training diverged")
     digest = checkpoint.manifest.get("weights_digest")
     if digest is not None and wire.weights_digest(checkpoint.part("model")) != digest:
         raise DamagedCheckpoint(f"{path}: damaged, its weights do not have the digest that it names ({str(digest)[:16]})")
