@@ -115,7 +115,7 @@ class Metrics:
 
 def end_half_line(path: Path) -> None:
     """Cut off a last line without its end, which a kill or a full disk leaves, so that the next row has a line of its own."""
-    if not path.exists():
+    if not path.is_file():
         return
     with path.open("r+b") as file:
         end = at = file.seek(0, 2)
