@@ -18,6 +18,7 @@ from actors.cluster import Cluster, brief
 from actors.placement import EndedWorker, Node, Placement, check_cores
 from actors.ray_actor import WorkerActor
 from icrl_dist.config.run import ConfigError
+from icrl_dist.diagnostics import ray_job
 
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -303,15 +304,16 @@ def _connected(address: str | None, actors: int | None, note: Callable[[str], No
     """Ray, started on this machine for ``actors`` workers or connected to the cluster at ``address``; as ``Fleet``."""
     import ray
 
+    job = ray_job.job_config(ray)
     if address is None:
-        options = {"num_cpus": actors, "object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
+        options = {"job_config": job, "num_cpus": actors, "object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
         try:
             local.start_ray(ray, note, stopped, **options)
         except RuntimeError as error:
             raise FleetFailed(str(error)) from error
     else:
         try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+            ray.init(address=address, job_config=job, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ray.exceptions.AuthenticationError) as error:
             raise ConfigError(f"--address {address}: {error}; `ray status` there shows whether a cluster is up") from None
     return ray

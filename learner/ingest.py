@@ -76,7 +76,7 @@ class Ingest:
 
     def _refuse(self, query: Query, error: wire.WireError | Rejected) -> None:
         self.drops[error.reason] += 1
-        _log.warning("refused a message: %s", error)
+        _log.warning("refused a message: %s", str(error))  # the error itself would keep the message
         query.refuse(str(error))
 
     def close(self) -> None:

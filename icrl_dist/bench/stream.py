@@ -11,7 +11,6 @@ import logging
 import queue
 import statistics
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -20,10 +19,12 @@ from typing import Any
 import numpy as np
 
 from actors import local
+from icrl_dist.diagnostics import ray_job
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 
 _log = logging.getLogger(__name__)
@@ -165,8 +166,8 @@ class _Stream:
 @contextlib.contextmanager
 def _stream() -> Iterator[_Stream]:
     with ZenohLink.listen("tcp/127.0.0.1:0") as link:
-        command = [sys.executable, "-c", "import sys; from icrl_dist.bench.stream import work; work(sys.argv[1])"]
-        with subprocess.Popen([*command, link.endpoints[0]]) as worker:
+        command = processes.python("-c", "import sys; from icrl_dist.bench.stream import work; work(sys.argv[1])")
+        with subprocess.Popen([*command, link.endpoints[0]], env=processes.environment()) as worker:
             try:
                 stream = _Stream(link, worker)
                 yield stream
@@ -218,7 +219,7 @@ def local_ray() -> Iterator[Any]:
 
     if ray.is_initialized():
         raise RuntimeError("Ray is already initialized in this process: run this benchmark in a new process")
-    local.start_ray(ray, _log.warning, address="local", num_cpus=2, configure_logging=False)
+    local.start_ray(ray, _log.warning, address="local", job_config=ray_job.job_config(ray), num_cpus=2, configure_logging=False)
     try:
         yield ray
     finally:

@@ -1,9 +1,10 @@
-"""The eight faults: each strikes one training, waits for its end, and returns the evidence that it landed."""
+"""The faults: each strikes one training, waits for its end, and returns the evidence that it landed."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from icrl_dist.storage import segment
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import endpoints
 
+STRANGERS = 1500
+"""Connections of a flood; the learner admits fewer."""
 STOP_S, CUT_S = 15.0, 12.0
 """Durations of a stopped learner and of a cut link, longer than ``stream.reply_timeout_s``."""
 
@@ -202,6 +205,23 @@ def full_disk(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     )
 
 
+def strangers(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """A flood of connections that send nothing, held until the run ends."""
+    training.start()
+    where, made = _reach(training, strike), 0
+    target = training.target()
+    if target is None:
+        raise Missed("the learner had ended")
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(TimeoutError):
+            for made in range(STRANGERS):  # noqa: B007
+                held.enter_context(socket.create_connection(target, timeout=0.5))
+        result = training.result()
+    return Struck(
+        where, made >= 64, f"{made} connections held, then {'no' if made + 1 < STRANGERS else 'any'} more admitted", result
+    )
+
+
 FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
     "kill-worker": kill_worker,
     "kill-learner": kill_learner,
@@ -211,6 +231,7 @@ FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
     "torn-tail": torn_tail,
     "flip-byte": flip_byte,
     "full-disk": full_disk,
+    "strangers": strangers,
 }
 
 

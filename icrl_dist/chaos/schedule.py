@@ -18,6 +18,7 @@ FAULTS = {
     "torn-tail": "kill-tree, and the newest segment ends in half a frame",
     "flip-byte": "a byte of a sealed segment changes, after kill-tree or during the run",
     "full-disk": "a disk too small for the run, enlarged, then --resume",
+    "strangers": "1,500 connections to the learner's port that send nothing",
 }
 """Every fault with its description."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.stream import monitor_messages, security, wire
 from icrl_dist.stream.link import LinkError, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
 _POLL_S = 0.02
@@ -50,7 +50,7 @@ class Training:
         """Words before the command, for a run folder that is visible at ``view`` (see ``Disk``)."""
         self.log = folder.with_name(f"{folder.name}.log")
         words = [name, *(word for setting in settings for word in ("--set", setting))]
-        self._command = [sys.executable, "-m", "icrl_dist.cli", "train", *words, "--out", str(folder), "--actors", str(actors)]
+        self._command = processes.python("-m", "icrl_dist.cli", "train", *words, "--out", str(folder), "--actors", str(actors))
         self._process: subprocess.Popen[bytes] | None = None
         self._seen: set[psutil.Process] = set()
 
@@ -66,7 +66,8 @@ class Training:
             command = [*self.prefix, *self._command, *options]
             log.write(f"$ {' '.join(command)}\n".encode())
             log.flush()
-            self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            environment = processes.environment()
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
         self._deadline = time.monotonic() + self._limit_s
         self._listed = 0.0
 

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from icrl_dist.interfaces import Limits
+from icrl_dist.stream.excerpts import show
+from icrl_dist.stream.messages import is_name
 from icrl_dist.types import NULL, Job, Spec, Trajectory
 
 _ROUNDING = 1e-3
@@ -30,6 +32,8 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, weights_digest: str, lim
     """Raises Rejected if the trajectory does not match its job, the spec or the weights of the job's policy version."""
     check_arrays(trajectory, job, spec, limits)
     identity = trajectory.identity
+    if not is_name(trajectory.worker):
+        raise Rejected("spec", f"{identity}: its worker's name {show(trajectory.worker)} is not one")
     if trajectory.variation != job.variation(identity):
         raise Rejected("unexpected", f"{identity}: its variation is not the one of its job")
     if (trajectory.policy_version, trajectory.weights_digest) != (job.policy_version, weights_digest):

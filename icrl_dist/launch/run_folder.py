@@ -28,6 +28,9 @@ from icrl_dist.storage.layout import NAMES, owned
 WAIT_S = 10.0
 """Seconds to wait for the processes of a killed run to end before its folder counts as in use."""
 
+LONGEST_NAME, LONGEST_PATH = 240, 4095 - 300
+"""Bytes of a run folder's name and path.  File systems allow 255 and 4,095; ``.NAME.replaced`` and reports are longer."""
+
 _TOKEN = ".replacement"
 """In a replaced run and in the run that replaces it: a random text that only these two folders hold."""
 _BEGINNING = ".beginning"
@@ -43,11 +46,12 @@ def beginning(folder: Path) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with hold(folder, 0.0, _BEGINNING):
-            yield
-            (folder / _BEGINNING).unlink(missing_ok=True)
+        lock = hold(folder, 0.0, _BEGINNING)
     except StoreError:
         raise ConfigError(f"--out {folder}: another command begins a run in this folder; use another --out") from None
+    with lock:
+        yield
+        (folder / _BEGINNING).unlink(missing_ok=True)
 
 
 def _sweep_beginning(folder: Path) -> None:
@@ -98,7 +102,7 @@ def remove(folder: Path) -> None:
         return
     if folder.is_symlink():
         raise ConfigError(f"{folder}: is a symbolic link, which is never removed; remove it yourself, or use another --out")
-    _require_owned(folder)
+    require_owned(folder)
     (folder / "run.toml").unlink(missing_ok=True)
     for place in NAMES:
         directory = folder / place
@@ -110,7 +114,13 @@ def remove(folder: Path) -> None:
             directory.rmdir()  # fails if another file has appeared meanwhile
 
 
-def _require_owned(folder: Path) -> None:
+def unused(folder: Path) -> bool:
+    """Whether a folder is empty, or holds only what a killed start of a run leaves: a lock, and parts of files."""
+    return all(path.name == ".lock" or (path.suffix == ".part" and owned("", path.name)) for path in folder.iterdir())
+
+
+def require_owned(folder: Path) -> None:
+    """Raise ConfigError with their names if a folder contains files that this program does not write."""
     if others := foreign(folder):
         names = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
         raise ConfigError(f"{folder}: holds {names}, not written by icrl-dist: move that away, or use another --out")
@@ -127,6 +137,11 @@ def check_place(folder: Path, source: Path | None = None) -> None:
         real, current = folder.resolve(), Path.cwd().resolve()
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"--out {folder}: {error}; {remedy}") from None
+    if len(os.fsencode(real)) > LONGEST_PATH or len(os.fsencode(real.name)) > LONGEST_NAME:
+        limits = (
+            f"a folder's name may have {LONGEST_NAME} bytes and its path {LONGEST_PATH}, because longer names are made in it"
+        )
+        raise ConfigError(f"--out {real.name[:40]}...: too long ({len(os.fsencode(real))} bytes); {limits}")
     if folder.is_symlink():
         raise ConfigError(f"--out {folder}: is a symbolic link; name the folder itself, {real}")
     if folder.name == "..":
@@ -253,7 +268,7 @@ class FolderTransaction:
         folder contains no run or other files, or if a run is active in it.
         """
         folder = self._folder
-        _require_owned(folder)
+        require_owned(folder)
         if not all((folder / name).is_file() for name in ("run.toml", "env.json")):
             raise ConfigError(f"--overwrite: {folder} holds no run; empty it, or use another --out")
         lock = take(folder)
