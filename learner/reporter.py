@@ -94,6 +94,12 @@ class Reporter:
         self._metrics.write(version, "version", loss=loss, seconds=seconds)
         self.log("version", f"T^{version} is fitted: loss {loss:.3f}, {seconds:.0f} s", version=version)
 
+    def diverged(self, text: str) -> None:
+        """Report as an alert that a fit diverged; the run ends."""
+        self._report({"event": "alert", "text": f"ALERT: {text}"})
+        self._rows.append((time.time(), "alert", {"what": "diverged", "active": True, "text": text}))
+        self._publish("event", "event", what="alert", alert="diverged", active=True, text=text)
+
     def labels_rated(self, round: int, quality: LabelQuality) -> None:
         """Report the quality of a round's self-made labels."""
         fields = dataclasses.asdict(quality)

@@ -38,6 +38,7 @@ def example(trial: int = 0) -> Trajectory:
     """A trajectory of the size of a walker episode: H = 200, S = 24, A = 6, and 30 labels; about 24 KB."""
     steps, observation, actions, queries = 200, 24, 6, 30
     rng = np.random.default_rng(0)
+    labels = rng.random((queries, actions), np.float32)
     return Trajectory(
         identity=Identity("adapt", 0, 0, 0, trial),
         variation=Variation(Task.of("dmc", problem="walker-run", mass=5.0), Adversary.of("force", strength=1.0)),
@@ -49,7 +50,7 @@ def example(trial: int = 0) -> Trajectory:
         rewards=rng.random(steps, np.float32),
         adversary=np.full(steps, -1, np.int16),
         queries=rng.normal(size=(queries, observation)).astype(np.float32),
-        labels=rng.random((queries, actions), np.float32),
+        labels=labels / labels.sum(axis=1, keepdims=True),
         prev_actions=np.zeros(0, np.int16),
         prev_rewards=np.zeros(0, np.float32),
         origin="heuristic",

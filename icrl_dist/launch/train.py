@@ -25,7 +25,8 @@ from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.storage.files import atomic_write
+from icrl_dist.storage import layout
+from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
@@ -68,6 +69,10 @@ def prepare(
         StreamKeys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
+    try:
+        layout.refuse_odd_files(folder)
+    except StoreError as error:
+        raise ConfigError(str(error)) from None
     run_folder.recover(folder)
     resume = resume or (resume_or_begin and (folder / "run.toml").is_file())
     transaction = FolderTransaction(folder, source[1] if source and not resume else -1)
@@ -98,20 +103,28 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
             f"as `icrl-dist train --resume {folder}` does, or use another --out"
         )
     if resume:
-        run_folder.take(folder).close()
+        with run_folder.take(folder):
+            layout.sweep(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if source is not None and not resume:
-            _fork(*source, run, folder)
         if before is None:
-            file.write_text(dumps(run))
-        elif before != run:
+            with run_folder.beginning(folder):
+                atomic_write(file, lambda to: to.write(dumps(run).encode()))
+                provenance.create(folder)
+                if source is not None:
+                    _fork(*source, run, folder)
+            return
+        if before != run:
             status = file.stat()
             atomic_write(file, lambda to: to.write(dumps(run).encode()))
             os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))  # its time is the start of the run
         provenance.create(folder)
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+    except StoreError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+        cause = error.__cause__.strerror
+        raise ConfigError(f"--out {folder}: cannot be written ({cause}); choose another folder") from None
 
 
 def _fork(source: Path, version: int, run: Run, folder: Path) -> None:
