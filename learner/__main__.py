@@ -75,7 +75,13 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
             service.worker_api.finish()  # not earlier: a worker that ends before the run counts as lost
             service.worker_api.wait_until_gone()
         except Interrupted:
-            report({"event": "interrupted", "text": f"a checkpoint is in {folder / 'checkpoints'}"})
+            checkpoints = folder / "checkpoints"
+            text = (
+                f"a checkpoint is in {place}"
+                if any(place.glob("*.npz"))
+                else "nothing was fitted yet, so there is no checkpoint"
+            )
+            report({"event": "interrupted", "text": text})
             return INTERRUPTED
         finally:
             endpoint_file.unlink(missing_ok=True)

@@ -75,7 +75,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
             out = arguments.out if arguments.out is not None else whole_run.default_folder(arguments.run, arguments.source)
             made = whole_run.train(run, out, **given, progress=display.report)
     except TrainInterrupted as error:
-        text = f"`{_resume_command(arguments.given)}` continues from the checkpoint" if error.resumable else str(error)
+        text = f"`{_resume_command(arguments.given)}` continues from {error.kept}" if error.resumable else str(error)
         console.print(f"interrupted; {text}", highlight=False, markup=False, soft_wrap=True)
         return INTERRUPTED
     result = made.result

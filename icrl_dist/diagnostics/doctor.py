@@ -26,6 +26,7 @@ from packaging.specifiers import SpecifierSet
 from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import cluster_file, cluster_nodes, node_facts
 from icrl_dist.diagnostics.checks import Check
+from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.stream import endpoints
 
@@ -218,6 +219,7 @@ def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Che
     except ValueError as error:
         raise ConfigError(f"--endpoint {endpoint}: {error}") from None
     require_ray_token(address)
+    require_cluster(address)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ray.exceptions.AuthenticationError) as error:
