@@ -76,11 +76,8 @@ def _serve(folder: Path, endpoint: str, report: Any) -> int:
             service.worker_api.wait_until_gone()
         except Interrupted:
             checkpoints = folder / "checkpoints"
-            text = (
-                f"a checkpoint is in {place}"
-                if any(place.glob("*.npz"))
-                else "nothing was fitted yet, so there is no checkpoint"
-            )
+            missing = "nothing was fitted yet, so there is no checkpoint"
+            text = f"a checkpoint is in {checkpoints}" if any(checkpoints.glob("*.npz")) else missing
             report({"event": "interrupted", "text": text})
             return INTERRUPTED
         finally:
