@@ -90,12 +90,14 @@ class Session:
                         **self._options,
                     )
             except (Exception, SystemExit) as error:  # Ray raises no specific type
-                logs = self._end(keep_logs=True)
-                if isinstance(error, SystemExit):  # raised by the handler of SIGTERM that Ray sets while it starts
+                terminated = isinstance(error, SystemExit)  # raised by the handler of SIGTERM that Ray sets while it starts
+                last = not terminated and (_final(error) or number == TRIES)
+                logs = self._end(keep_logs=last and not self._stopped())
+                if terminated:
                     signal.raise_signal(signal.SIGTERM)
                 cause = str(error).splitlines()[0] if str(error) else type(error).__name__
                 text = f"Ray did not start on this machine ({cause})"
-                if _final(error) or self._stopped() or number == TRIES:
+                if last or terminated or self._stopped():
                     where = f"its logs are in {logs}" if logs else "`icrl-dist doctor` checks this machine"
                     times = "once" if number == 1 else f"{number} times"
                     raise SessionFailed(f"{text}, tried {times}; {where}") from error

@@ -222,7 +222,7 @@ def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Che
     require_cluster(address)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(
             f"--address {address}: {error}; `ray status` on the head shows whether a cluster is running"
         ) from None

@@ -101,10 +101,12 @@ def test_ray_is_started_again_and_only_the_processes_of_failed_starts_are_ended(
 )
 def test_an_error_that_may_pass_is_tried_three_times_and_a_final_one_once(fake_ray, error, stopped, tries):
     ray = fake_ray(3, error)
-    with pytest.raises(SessionFailed, match=rf"\(timed out\), tried {tries}; its logs are in /") as caught:
+    with pytest.raises(SessionFailed, match=rf"\(timed out\), tried {tries}; ") as caught:
         Session(ray, lambda text: None, lambda: stopped, num_cpus=2)
-    logs = Path(str(caught.value).rpartition(" ")[2])
-    assert (logs / "raylet.out").read_text() == "cause\n", "the message names the logs, so they are kept"
+    kept = [folder.with_name(folder.name.replace("ray-", "ray-logs-")) for folder in ray.folders]
+    assert [folder.exists() for folder in kept] == [False] * (len(kept) - 1) + [not stopped]
+    assert stopped or str(caught.value).endswith(f"its logs are in {kept[-1]}"), "the message names the logs, so they are kept"
+    assert stopped or (kept[-1] / "raylet.out").read_text() == "cause\n"
     assert not any(ray.alive()) and not any(folder.exists() for folder in ray.folders)
 
 
@@ -205,3 +207,16 @@ def test_a_running_time_does_not_count_a_stop(monkeypatch):
     for step, expected in ((1.0, 1.0), (0.5, 1.5), (3600.0, 1.5 + running_time.GAP_S), (1.0, 2.5 + running_time.GAP_S)):
         now += step
         assert clock() == expected
+
+
+@pytest.mark.integration
+def test_sigterm_while_ray_starts_reaches_the_handler_of_the_program_and_leaves_nothing(fake_ray):
+    ray, received = fake_ray(1, SystemExit(1)), list[int]()
+    before = signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
+    try:
+        with pytest.raises(SessionFailed):
+            Session(ray, lambda text: None, num_cpus=2)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert received == [signal.SIGTERM] and not any(ray.alive())
+    assert not any(path.exists() for folder in ray.folders for path in folder.parent.glob(f"*{folder.name[-8:]}"))
