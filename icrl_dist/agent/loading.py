@@ -7,11 +7,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
+from icrl_dist.agent.threads import torch_threads, whole_or_none
 from icrl_dist.agent.trained_model import TrainedModel
+from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
@@ -37,13 +40,20 @@ def load_agent(
     ``threads``: CPU threads of torch while the agent acts and observes; None: the number that torch is set to.  More
     than one helps large batches on idle cores.  On busy cores threads that wait for each other can take a hundred
     times as long (docs/decisions/073-openmp-wait-policy.md).  Outside these calls the process's own number holds.
+    With one thread an agent also acts in a forked process; torch's threads do not survive a fork.
 
     Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy`` or if ``threads`` is
-    below 1, StoreError if the file was not written by this system.  Loading executes no code from the file.
+    below 1 or ``seed`` below 0, StoreError if the file was not written by this system or its weights are no finite numbers.
+    Loading executes no code from the file.
     """
-    checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
+    path = shipped(what) if what in SHIPPED else checkpoint_file(path_of("what", what))
+    threads = whole_or_none("threads", threads, 1)
+    checkpoint = agent_checkpoint(path)
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
+    if broken := [name for name, array in checkpoint.part("model").items() if not np.isfinite(array).all()]:
+        raise StoreError(f"{what}: weights {broken[0]} are no finite numbers, so its training diverged; load another version")
+    with torch_threads(threads):  # a forked process cannot use the threads that this one started
+        return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
 
 
 def shipped(name: str | Path) -> Path:
@@ -94,6 +104,16 @@ def checkpoint_file(what: Path, version: int | None = None) -> Path:
     if not found.is_file():
         raise ConfigError(f"{what}: holds no {'checkpoint' if version is None else f'version {version}'} yet")
     return found
+
+
+def agent_checkpoint(path: Path) -> Checkpoint:
+    """Read the checkpoint of an agent.  Raises StoreError as ``load_checkpoint``, and for a file that holds no agent."""
+    checkpoint = load_checkpoint(path)
+    if missing := [name for name in ("run", "spec") if name not in checkpoint.manifest]:
+        raise StoreError(
+            f"{path}: holds no agent: its manifest has no {', '.join(missing)}; name a run folder or an agent file"
+        )
+    return checkpoint
 
 
 def trained(checkpoint: Checkpoint) -> TrainedModel:

@@ -8,6 +8,7 @@ the run's seed only, so the expert is the same in every job.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import time
@@ -30,7 +31,10 @@ from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Job, Trajectory, Variation
 
 if TYPE_CHECKING:
+    import torch
+
     from icrl_dist.experts.sac.batched import Backend, SACBatch
+    from icrl_dist.experts.sac.stacked import Shape
 
 _log = logging.getLogger(__name__)
 
@@ -162,17 +166,20 @@ def _mean_actions(histories: Sequence[History], config: SACConfig) -> Act:
     """The mean actions of the experts of these histories."""
     import torch
 
-    from icrl_dist.experts.sac.stacked import Shape, outputs
+    from icrl_dist.experts.sac.stacked import Shape
 
     first = histories[0]
     sizes = first.observations.shape[-1], *config.hidden, 2 * first.actions.shape[-1]
-    shape, actors = Shape(sizes), torch.from_numpy(np.stack([history.actor for history in histories]))
+    return functools.partial(_mean, Shape(sizes), torch.from_numpy(np.stack([history.actor for history in histories])))
 
-    def act(states: np.ndarray) -> np.ndarray:
-        mean: np.ndarray = outputs(shape, actors, torch.from_numpy(states.copy()))[..., : sizes[-1] // 2].tanh().numpy()
-        return mean
 
-    return act
+def _mean(shape: Shape, actors: torch.Tensor, states: np.ndarray) -> np.ndarray:
+    import torch
+
+    from icrl_dist.experts.sac.stacked import outputs
+
+    mean: np.ndarray = outputs(shape, actors, torch.from_numpy(states.copy()))[..., : shape.sizes[-1] // 2].tanh().numpy()
+    return mean
 
 
 class ExpertPolicy:

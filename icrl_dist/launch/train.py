@@ -44,6 +44,9 @@ class TrainInterrupted(Exception):  # noqa: N818
         self.kept = "the last checkpoint"
         """What it would continue from."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.resumable)
+
 
 def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> FolderTransaction:
     """Create or check the run folder: ``run.toml``, ``env.json``, and for a fork the data and weights of ``source``.

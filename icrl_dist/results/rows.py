@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from icrl_dist.config.paths import folder_of
 from icrl_dist.config.run import ConfigError
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.telemetry import provenance
@@ -225,9 +226,8 @@ def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = Fal
     import pandas as pd
 
     frames = []
-    for folder in dict.fromkeys(Path(one) for one in ([runs] if isinstance(runs, str | Path) else runs)):
-        if not folder.is_dir():
-            raise ConfigError(f"{folder}: no such run folder; `icrl-dist train demo` makes one in runs/demo")
+    listed = runs if isinstance(runs, Iterable) and not isinstance(runs, str | bytes) else [runs]
+    for folder in dict.fromkeys(folder_of("runs", one) for one in listed):
         if not unfinished and is_unfinished(folder):
             raise ConfigError(
                 f"{folder}: this run is not finished: continue it with `icrl-dist train RUN --out {folder} --resume`, "

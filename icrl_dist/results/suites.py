@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from icrl_dist.agent.loading import SHIPPED, checkpoint_file, shipped
+from icrl_dist.agent.loading import SHIPPED, agent_checkpoint, checkpoint_file, shipped
+from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
-from icrl_dist.storage.checkpoint import load_checkpoint
 
 Suite = Literal["online", "offline", "posterior"]
 Prior = Literal["uniform", "unseen"]
@@ -27,7 +27,7 @@ def evaluate(
     deploy: Deployment | None = None,
     episodes: int | None = None,
     seeds: int | None = None,
-    p: Sequence[float] | None = None,
+    p: Sequence[float] | float | None = None,
     prior: Prior | None = None,
     progress: Show = False,
 ) -> Evaluation:
@@ -53,11 +53,11 @@ def evaluate(
     for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
         if value is not None and value not in get_args(choices):
             raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
-    run = parse_written(str(load_checkpoint(checkpoint_file(source)).manifest.get("run", "")), str(source))
+    run = parse_written(str(agent_checkpoint(checkpoint_file(source)).manifest["run"]), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,
-        "p": None if p is None else tuple(map(float, p)),
+        "p": None if p is None else _numbers("p", p),
         "prior": prior,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -83,9 +83,18 @@ def evaluate(
     return dataclasses.replace(found, summary=answer | found.summary)
 
 
+def _numbers(name: str, value: Sequence[float] | float) -> tuple[float, ...]:
+    """Several numbers, or a single one."""
+    listed = value if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
+    try:
+        return tuple(map(float, listed))
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} = {value!r}: expected a number or a list of numbers") from None
+
+
 def _source_and_output(what: str | Path) -> tuple[Path, Path]:
     """The run folder or checkpoint to evaluate, and the folder that its report and result rows are written below."""
     if what in SHIPPED:
         return shipped(what), Path("runs") / f"{what}-pretrained"
-    source = Path(what)
+    source = path_of("what", what)
     return source, source if source.is_dir() else source.parent

@@ -14,6 +14,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from icrl_dist.copies import NotCopied
 from icrl_dist.storage import segment
 from icrl_dist.storage.files import StoreError, atomic_write, sync_folder, unwritten
 from icrl_dist.storage.index import Index, Row
@@ -27,12 +28,14 @@ class Damaged(StoreError):  # noqa: N818
     """Bytes changed after they were written; ``Dataset.repair`` removes them."""
 
 
-class Dataset:
+class Dataset(NotCopied):
     """A run's dataset: one process appends to it, and trajectories are durable when ``append`` returns.
 
     Unless it is opened ``readonly``, damage by a crash or a disk is removed on opening;
     ``repaired`` lists what was removed.
     """
+
+    instead = "it holds open files; open its folder a second time with readonly=True"
 
     def __init__(self, folder: Path, seal_bytes: int = 256 << 20, durable: bool = True, readonly: bool = False) -> None:
         """``readonly`` changes nothing on disk; ``durable=False`` omits the fsync, to measure its cost.

@@ -16,6 +16,7 @@ import numpy as np
 from dm_control.utils.rewards import tolerance
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from icrl_dist.arrays import short
 from icrl_dist.types import Spec
 
 Array = Float64[np.ndarray, "B ..."]
@@ -222,5 +223,5 @@ def check_step(problem: str, spec: Spec, batch: int, done: int, actions: Float32
     """Raises RuntimeError if ``done`` steps reach the horizon, ValueError for actions outside [-1, 1]."""
     if done >= spec.horizon:
         raise RuntimeError(f"{problem}: stepped past the horizon of {spec.horizon}; call reset first")
-    if actions.shape != (batch, spec.actions) or not np.abs(actions).max() <= 1:
-        raise ValueError(f"{problem}: actions {actions}: expected {batch} x {spec.actions} numbers in [-1, 1]")
+    if actions.shape != (batch, spec.actions) or actions.dtype.kind != "f" or not np.abs(actions).max() <= 1:
+        raise ValueError(f"{problem}: actions {short(actions)}: expected {batch} x {spec.actions} numbers in [-1, 1]")
