@@ -130,14 +130,21 @@ class Session:
 
     def _list(self) -> None:
         """Note the processes of the session: they cannot be found after the end of their parents."""
+        if self._folder is None:  # the session has ended
+            return
         self._family |= {process for process in psutil.Process().children() if str(self._folder) in _command_line(process)}
         for process in self._vital:
             with contextlib.suppress(psutil.NoSuchProcess):
                 self._family |= set(process.children(recursive=True))
 
     def restart(self) -> None:
-        """End all processes of the session and start a new one.  Raises SessionFailed as the constructor."""
+        """End all processes of the session and start a new one.
+
+        Raises SessionFailed as the constructor, and if ``stopped()`` is true.
+        """
         self._end()
+        if self._stopped():
+            raise SessionFailed("Ray is not started again, because the run was interrupted")
         self._start()
 
     def close(self) -> None:

@@ -220,3 +220,17 @@ def test_sigterm_while_ray_starts_reaches_the_handler_of_the_program_and_leaves_
         signal.signal(signal.SIGTERM, before)
     assert received == [signal.SIGTERM] and not any(ray.alive())
     assert not any(path.exists() for folder in ray.folders for path in folder.parent.glob(f"*{folder.name[-8:]}"))
+
+
+@pytest.mark.integration
+def test_an_interrupted_run_starts_no_new_session_and_ends_no_process_of_another(fake_ray):
+    ray, interrupted = fake_ray(0), list[bool]()
+    made = Session(ray, print, lambda: bool(interrupted), num_cpus=2)
+    interrupted.append(True)
+    with pytest.raises(SessionFailed, match="interrupted"):
+        made.restart()
+    with subprocess.Popen([sys.executable, "-c", "input()", "None"], stdin=subprocess.PIPE) as other:
+        made.close()  # the session has no folder any more
+        assert other.poll() is None
+        other.communicate(b"\n")
+    assert ray.alive() == [[]] and not any(folder.exists() for folder in ray.folders)
