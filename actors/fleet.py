@@ -123,6 +123,8 @@ class Fleet:
         self._folder: str | None = None
         self._clock = RunningTime()
         self._without_nodes_since: float | None = None
+        self.ray_restarts = 0
+        """Number of times that Ray was started again on this machine."""
         self._restarts_left, self._progress_at_restart = restarts, -1
 
     def gather(
@@ -275,6 +277,7 @@ class Fleet:
             self._session.restart()
         except SessionFailed as error:
             raise FleetFailed(f"{cause}; {error}") from error
+        self.ray_restarts += 1
 
     def _remove_workers_of_lost_nodes(self) -> None:
         lost = {work: one for work, one in self._running.items() if one[2] not in self._placement.nodes}

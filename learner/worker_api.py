@@ -62,6 +62,7 @@ class WorkerAPI:
         self._jobs: dict[str, Job] = {}
         self._reported: set[tuple[str, int, int, int]] = set()
         self._finished = threading.Event()
+        self._closed = False
         self._delayed = Dispatcher("crash records")
         link.serve(keys.work, self._on_request)
         link.subscribe(keys.heartbeats, lambda _, payload: self._on_heartbeat(payload))
@@ -118,10 +119,13 @@ class WorkerAPI:
             self._report({"event": "released", "identity": name, "text": text})
 
     def close(self) -> None:
-        """Write no more crash records; the link stays open."""
+        """Write no more crash records, and report no more workers that end; the link stays open."""
+        self._closed = True
         self._delayed.close()
 
     def _on_liveliness(self, worker: str, alive: bool) -> None:
+        if self._closed:
+            return
         if alive:
             self._connected(worker)
         else:

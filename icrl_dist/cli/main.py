@@ -7,7 +7,6 @@ checkpoint written.
 from __future__ import annotations
 
 import os
-import select
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,11 +14,12 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, train
-from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, streams, train
+from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
-from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_type, with_problem
+from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_folder_of, run_type, with_problem
+from icrl_dist.console.signals import interruptible
 from icrl_dist.storage.fork import parse_source
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
@@ -57,7 +57,10 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     found: Any = tyro.cli(kind, prog=prog, args=list(words))
     if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
-        base = load(found.run) if found.run else load_folder(parse_source(found.source or "")[0])
+        folder = run_folder_of(found.run) if found.resume or found.resume_or_begin else None
+        if not found.run:
+            folder = parse_source(found.source or "")[0]
+        base = load(found.run) if folder is None else load_folder(folder)
         if "--problem" in (word.partition("=")[0] for word in words):
             base = with_problem(base, found.config.problem)
         _check_settings(words, type(base), base.problem)
@@ -85,22 +88,14 @@ def main(words: Sequence[str] | None = None) -> int:
 
     If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
     """
+    streams.prepare()
     try:
         try:
             return _run(list(sys.argv[1:] if words is None else words))
         finally:
             sys.stdout.flush()  # else Python would find a closed pipe only when it exits
     except BrokenPipeError:
-        if not _output_is_closed():
-            raise  # another pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at exit
-        return BROKEN_PIPE
-
-
-def _output_is_closed() -> bool:
-    poll = select.poll()
-    poll.register(sys.stdout.fileno(), 0)
-    return any(event & select.POLLERR for _, event in poll.poll(0))
+        return streams.end_of_output()
 
 
 def _run(words: list[str]) -> int:
@@ -120,8 +115,11 @@ def _run(words: list[str]) -> int:
         print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE
     try:
-        return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
+        with interruptible():
+            return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
     except KeyboardInterrupt:
+        if words[0] == "train":  # before the run began, or after it ended
+            console.print("interrupted", highlight=False)
         return INTERRUPTED
     except Exception as error:
         from icrl_dist.storage.files import explained

@@ -49,6 +49,7 @@ __all__ = [
     "override",
     "parse",
     "parse_written",
+    "run_folder_of",
     "validate",
 ]
 
@@ -125,7 +126,7 @@ def load(name_or_path: str) -> Run:
     if name_or_path.startswith("experts-"):
         return replace(load(name_or_path.removeprefix("experts-")), method="experts")
     path = Path(name_or_path)
-    if path.suffix == ".toml" or "/" in name_or_path:
+    if path.suffix == ".toml" or "/" in name_or_path or run_folder_of(name_or_path) is not None:
         written = path.name == _RUN_FILE and (path.parent / "env.json").is_file()  # the program writes both
         return (parse_written if written else parse)(_text(path, name_or_path), name_or_path)
     runs = _packaged()
@@ -165,7 +166,19 @@ def load_folder(folder: Path) -> Run:
     return parse_written(_text(path, str(path)), str(path))
 
 
+def run_folder_of(what: str | Path) -> Path | None:
+    """The run folder that RUN names: ``runs/demo`` or ``runs/demo/run.toml``; None if it names a run file or a packaged run."""
+    if not str(what) or str(what) in _packaged():
+        return None
+    path = Path(what)
+    if (path / _RUN_FILE).is_file():
+        return path
+    return path.parent if path.name == _RUN_FILE and (path.parent / "env.json").is_file() else None
+
+
 def _text(path: Path, name: str) -> str:
+    if (path / _RUN_FILE).is_file():
+        raise ConfigError(f"{name} is a run folder: `icrl-dist train --resume {name}` continues its run")
     if not path.is_file():
         raise ConfigError(f"run file {name!r}: no such file")
     try:

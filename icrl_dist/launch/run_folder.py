@@ -88,7 +88,7 @@ def remove(folder: Path) -> None:
         return
     if folder.is_symlink():
         raise ConfigError(f"{folder}: is a symbolic link, which is never removed; remove it yourself, or use another --out")
-    _require_owned(folder)
+    require_owned(folder)
     (folder / "run.toml").unlink(missing_ok=True)
     for place in _NAMES:
         directory = folder / place
@@ -100,7 +100,13 @@ def remove(folder: Path) -> None:
             directory.rmdir()  # fails if another file has appeared meanwhile
 
 
-def _require_owned(folder: Path) -> None:
+def unused(folder: Path) -> bool:
+    """Whether a folder is empty, or holds only what a killed start of a run leaves: a lock, and parts of files."""
+    return all(path.name == ".lock" or (path.suffix == ".part" and owned("", path.name)) for path in folder.iterdir())
+
+
+def require_owned(folder: Path) -> None:
+    """Raise ConfigError with their names if a folder contains files that this program does not write."""
     if others := foreign(folder):
         names = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
         raise ConfigError(f"{folder}: holds {names}, not written by icrl-dist: move that away, or use another --out")
@@ -241,7 +247,7 @@ class FolderTransaction:
         folder contains no run or other files, or if a run is active in it.
         """
         folder = self._folder
-        _require_owned(folder)
+        require_owned(folder)
         if not all((folder / name).is_file() for name in ("run.toml", "env.json")):
             raise ConfigError(f"--overwrite: {folder} holds no run; empty it, or use another --out")
         lock = take(folder)

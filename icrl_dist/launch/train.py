@@ -7,15 +7,17 @@ and Zenoh.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from actors.running_time import RunningTime
 from icrl_dist.config import plugins
+from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.signals import on_signals
@@ -35,7 +37,7 @@ FINISH_S = 10.0
 
 
 class TrainInterrupted(Exception):  # noqa: N818
-    """The run was interrupted by SIGINT or SIGTERM; the message says what its folder holds now."""
+    """The run was interrupted by a signal (``console.signals``); the message says what its folder holds now."""
 
     def __init__(self, text: str = "its checkpoint is written", resumable: bool = True) -> None:
         super().__init__(text)
@@ -48,25 +50,37 @@ class TrainInterrupted(Exception):  # noqa: N818
         return type(self), (str(self), self.resumable)
 
 
-def prepare(run: Run, folder: Path, resume: bool, overwrite: bool, source: tuple[Path, int] | None = None) -> FolderTransaction:
+def prepare(
+    run: Run,
+    folder: Path,
+    resume: bool,
+    overwrite: bool,
+    source: tuple[Path, int] | None = None,
+    resume_or_begin: bool = False,
+) -> FolderTransaction:
     """Create or check the run folder: ``run.toml``, ``env.json``, and for a fork the data and weights of ``source``.
 
-    Train within the returned context; it removes or restores a run that is overwritten.  Raises
-    ConfigError if the folder cannot be a run folder, if it exists and neither ``resume`` nor
-    ``overwrite`` is set, if a run is active in it, or if ``resume`` has other settings than the run.
-    Only the endpoints and certificates of the stream may differ, because a resumed run may have
-    another head node.
+    ``resume_or_begin``: resume the run in the folder if there is one.  Train within the returned context; it
+    removes or restores a run that is overwritten.  Raises ConfigError if the folder cannot be a run folder, if it
+    exists and none of the three is set, if two are, if a run is active in it, or if the run that is to be resumed has
+    other settings; only those in ``config.resuming.FREE`` may differ.
     """
-    if resume and overwrite:
-        raise ConfigError(f"--resume --overwrite: one continues the run in {folder}, the other replaces it; leave one out")
+    flags = {"--resume": resume, "--resume-or-begin": resume_or_begin, "--overwrite": overwrite}
+    if sum(flags.values()) > 1:
+        named = " ".join(flag for flag, given in flags.items() if given)
+        raise ConfigError(f"{named}: these contradict each other about the run in {folder}; give one of them")
     run_folder.check_place(folder, source[0] if source else None)
     try:
         StreamKeys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
     run_folder.recover(folder)
+    resume = resume or (resume_or_begin and (folder / "run.toml").is_file())
     transaction = FolderTransaction(folder, source[1] if source and not resume else -1)
-    if folder.exists() and not resume and any(folder.iterdir()):
+    if folder.exists() and not resume and not run_folder.unused(folder):
+        if resume_or_begin:
+            run_folder.require_owned(folder)
+            raise ConfigError(f"--resume-or-begin: {folder} holds files of a run, but no run.toml: use another --out")
         if not overwrite:
             raise ConfigError(f"{folder} exists: use --resume to continue the run, --overwrite to replace it, or another --out")
         transaction.set_aside()
@@ -83,9 +97,11 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
     if resume and not file.exists():
         raise ConfigError(f"--resume: {folder} holds no run; leave --resume out to start one")
     before = load_folder(folder) if resume else None
-    if before is not None and _with_endpoints_of(before, run) != run:
+    if before is not None and (changed := differences(before, run)):
+        named = ", ".join(f"{name} = {old!r} there and {new!r} here" for name, old, new in changed)
         raise ConfigError(
-            f"--resume: {file} has other settings than this command; resume without overrides, or use another --out"
+            f"--resume: {file} has other settings than this command: {named}; resume with the values there, "
+            f"as `icrl-dist train --resume {folder}` does, or use another --out"
         )
     if resume:
         run_folder.take(folder).close()
@@ -102,12 +118,6 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
         provenance.create(folder)
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
-
-
-def _with_endpoints_of(run: Run, other: Run) -> Run:
-    """``run`` with the endpoints and certificates of ``other``: they belong to the head node and change no result."""
-    fields = {name: getattr(other.stream, name) for name in ("endpoint", "connect", "certificates")}
-    return dataclasses.replace(run, stream=dataclasses.replace(run.stream, **fields))
 
 
 def _fork(source: Path, version: int, run: Run, folder: Path) -> None:
@@ -127,7 +137,10 @@ def check_security(run: Run, address: str | None) -> None:
 
 
 def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
-    """Run the learner in this process with one worker on a thread.  Returns the learner's result."""
+    """Run the learner in this process with one worker on a thread.  Returns the learner's result.
+
+    An error of ``report`` ends the run like a signal, with a checkpoint, and is raised then.
+    """
     import torch
 
     from actors.worker import Worker
@@ -135,9 +148,22 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
     from learner.service import Interrupted, RunFailed, Service
 
     hub = MemoryHub()
+    service: Service | None = None
+    errors: list[BaseException] = []
+
+    def receive(event: dict[str, Any]) -> None:
+        if service is None:
+            report(event)
+        elif not errors:
+            try:
+                report(event)
+            except BaseException as error:
+                errors.append(error)
+                service.stop()
+
     with _torch_unchanged(), hub.link() as learner_link, hub.link() as worker_link:
         try:
-            service = Service(run, folder, learner_link, report)
+            service = Service(run, folder, learner_link, receive)
         except RunFailed as error:
             raise TrainFailed(str(error)) from None
         worker = Worker(worker_link, folder.name, "w0")
@@ -155,15 +181,18 @@ def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
             try:
                 result = service.run()
                 service.worker_api.finish()
-                return result
             except Interrupted:
-                raise TrainInterrupted from None
+                if not errors:
+                    raise TrainInterrupted from None
             except RunFailed as error:
                 raise TrainFailed(str(error)) from None
             finally:
                 worker.stop()
                 thread.join(timeout=30)
                 service.close()
+    if errors:
+        raise errors[0]
+    return result
 
 
 @contextlib.contextmanager
@@ -216,13 +245,15 @@ def train_ray(
             learner = stack.enter_context(learner_process.running(run, folder))
         result: dict[str, Any] | None = None
         started = False
-        stored = quarantined = 0
+        stored = quarantined = ray_restarts = 0
         failure: Exception | None = None
         clock, patience_s = RunningTime(), 0.0
         while True:
             for event in learner.events():
                 report(event)
                 if event["event"] == "listening" and not started:
+                    if address is None:
+                        learner.end_after_driver(psutil.Process().children(recursive=True))
                     fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
                 elif event["event"] == "progress":
@@ -249,6 +280,9 @@ def train_ray(
                 except FleetFailed as error:
                     failure = error
                 learner.excuse(fleet.lost)
+                if fleet.ray_restarts != ray_restarts:
+                    ray_restarts = fleet.ray_restarts
+                    learner.end_after_driver(psutil.Process().children(recursive=True))
     if interrupted.is_set():  # during the shutdown
         raise TrainInterrupted
     return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
@@ -266,16 +300,7 @@ def _true_end(folder: Path, interrupted: threading.Event) -> Iterator[None]:
         raise
     except FleetFailed as error:
         empty, kept = remove_if_empty(folder), holdings(folder)
-        if interrupted.is_set():
+        if interrupted.is_set():  # the signal reached Ray's processes too
             raise TrainInterrupted from None
-        how = f"the same command with --resume continues from {kept}" if kept else "nothing has been stored yet"
-        raise TrainFailed(f"{error}; {how}{'' if kept or empty else f', see {folder}'}") from None
-
-
-def interruptible() -> contextlib.AbstractContextManager[object]:
-    """A context in which SIGINT and SIGTERM raise TrainInterrupted, for work that can be repeated."""
-
-    def interrupt() -> None:
-        raise TrainInterrupted
-
-    return on_signals(interrupt)
+        nothing = f"; nothing has been stored yet{'' if empty else f', see {folder}'}"
+        raise TrainFailed(f"{error}{'' if kept else nothing}") from None

@@ -230,7 +230,7 @@ def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = Fal
     for folder in dict.fromkeys(folder_of("runs", one) for one in listed):
         if not unfinished and is_unfinished(folder):
             raise ConfigError(
-                f"{folder}: this run is not finished: continue it with `icrl-dist train RUN --out {folder} --resume`, "
+                f"{folder}: this run is not finished: continue it with `icrl-dist train --resume {folder}`, "
                 "or read what there is with read_results(..., unfinished=True)"
             )
         found = sorted((folder / "results").glob("*.parquet"), key=lambda path: path.stem.rsplit("-", 1)[-1])

@@ -174,7 +174,7 @@ def started(tmp_path, run):
 
 def test_resume_and_overwrite_contradict_each_other(tmp_path, module_run):
     folder, before = started(tmp_path, module_run)
-    with pytest.raises(ConfigError, match="leave one out"):
+    with pytest.raises(ConfigError, match=r"--resume --overwrite: .* give one of them"):
         launch.prepare(module_run, folder, resume=True, overwrite=True)
     assert files(folder) == before
 

@@ -13,7 +13,7 @@ from actors import fleet
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.launch import learner_process, train
 from icrl_dist.launch.learner_process import TrainFailed
-from learner.__main__ import _read_lost_workers
+from learner.__main__ import _read_driver
 from learner.service import Service
 
 
@@ -40,25 +40,25 @@ def test_a_learner_receives_the_workers_lost_with_a_node_and_a_restarted_one_rec
     received = tmp_path / "received"
     for workers in ([], ["w0"], ["w0"], ["w0", "w1", "w2"]):
         learner.excuse(workers)
-    until(lambda: received.exists() and received.read_text() == '["w0"]\n["w1", "w2"]\n')
+    until(lambda: received.exists() and received.read_text() == '{"lost": ["w0"]}\n{"lost": ["w1", "w2"]}\n')
     learner._process.kill()
     learner._process.wait()
     learner.excuse(["w0", "w1", "w2", "w3"])  # the process is dead
     learner.watch(lambda event: None)
-    until(lambda: received.read_text().endswith('\n["w0", "w1", "w2", "w3"]\n'))
+    until(lambda: received.read_text().endswith('\n{"lost": ["w0", "w1", "w2", "w3"], "processes": []}\n'))
 
 
-def test_workers_lost_with_nodes_reach_the_worker_api():
-    received, (read, write) = list[list[str]](), os.pipe()
-    os.write(write, b'["w0"]\n["w1", "w2"]\n')
+def test_what_the_driver_sends_reaches_the_learner():
+    received, processes, (read, write) = list[list[str]](), list[tuple[int, float]](), os.pipe()
+    os.write(write, b'{"lost": ["w0"]}\n{"processes": [[1, 2.5]]}\n{"lost": ["w1", "w2"], "processes": []}\n')
     os.close(write)
     service = SimpleNamespace(worker_api=SimpleNamespace(lost_with_node=received.append))
-    _read_lost_workers(cast(Service, service), read)
+    _read_driver(cast(Service, service), processes, read)
     os.close(read)
-    assert received == [["w0"], ["w1", "w2"]]
+    assert received == [["w0"], ["w1", "w2"]] and processes == [(1, 2.5)]
 
 
-def test_a_run_resumes_with_another_endpoint_but_with_no_other_setting(small_run, tmp_path):
+def test_a_run_resumes_with_another_endpoint_but_not_with_another_seed(small_run, tmp_path):
     folder = tmp_path / "run"
     train.prepare(small_run, folder, resume=False, overwrite=False)
     file = folder / "run.toml"
@@ -68,8 +68,6 @@ def test_a_run_resumes_with_another_endpoint_but_with_no_other_setting(small_run
     assert load(str(file)) == moved and file.stat().st_mtime == 1e9
     with pytest.raises(ConfigError, match="has other settings"):
         train.prepare(override(moved, ["seed=7"], "--set"), folder, resume=True, overwrite=False)
-    with pytest.raises(ConfigError, match="has other settings"):
-        train.prepare(override(moved, ["stream.credits=3"], "--set"), folder, resume=True, overwrite=False)
 
 
 def test_an_absent_cluster_leaves_no_run_folder(small_run, tmp_path, monkeypatch):
@@ -97,7 +95,7 @@ class FakeLearner:
     def watch(self, report):
         pass
 
-    excuse = watch
+    excuse = end_after_driver = watch
 
 
 @pytest.fixture
@@ -107,7 +105,7 @@ def run_with(small_run, tmp_path, monkeypatch):
 
     def run(outcome, *looks, files=()):
         class Fleet:
-            deaths, lost = 0, ()
+            deaths, ray_restarts, lost = 0, 0, ()
 
             def __init__(self, *_):
                 if outcome == "does not start":
@@ -151,8 +149,8 @@ def test_a_run_whose_workers_all_ended_fails_if_its_learner_does_not_finish(run_
 @pytest.mark.parametrize(
     ("files", "end", "kept"),
     [
-        ([("checkpoints/version-0000.npz", b"x")], "; the same command with --resume continues from the last checkpoint", True),
-        ([("checkpoints/partial.npz", b"x")], "; the same command with --resume continues from the last checkpoint", True),
+        ([("checkpoints/version-0000.npz", b"x")], "", True),
+        ([("checkpoints/partial.npz", b"x")], "", True),
         ([("learner.log", b"a line\n"), ("learner.err", b"")], "; nothing has been stored yet", False),
         ([("learner.err", b"a cause\n")], "; nothing has been stored yet, see {folder}", True),
         ([("dataset/segment-000000.frames", b"damaged")], "; nothing has been stored yet, see {folder}", True),

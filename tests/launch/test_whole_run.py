@@ -23,9 +23,11 @@ from actors import fleet, local
 from actors.session import SessionFailed
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps
-from icrl_dist.launch import learner_process, whole_run
+from icrl_dist.console.signals import SIGNALS, interruptible
+from icrl_dist.launch import learner_process, resuming, whole_run
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout, reports
+from learner import checkpoints, reporter
 from tests.actors.fake_ray import FakeRay
 from tests.learner.test_service import no_tensorboard
 from tests.results.row_blocks import block, frame
@@ -97,7 +99,7 @@ def test_a_handler_that_python_cannot_set_again_is_not_replaced(monkeypatch):
     """``signal.getsignal`` gives None for a handler of an extension, and ``signal.signal`` refuses None."""
     get, was = signal.getsignal, signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(signal, "getsignal", lambda number: None if number == signal.SIGTERM else get(number))
-    with launch.interruptible():
+    with interruptible():
         assert get(signal.SIGTERM) is was and get(signal.SIGINT) is not signal.default_int_handler
     assert (get(signal.SIGINT), get(signal.SIGTERM)) == (signal.default_int_handler, was)
 
@@ -232,6 +234,44 @@ def test_an_interrupted_run_says_what_its_folder_holds(made, module_run, tmp_pat
     assert not error.resumable and str(error).endswith("run is as it was before") and (folder / "run.toml").exists()
 
 
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("moment", ["before the folder", "at the start", "after the training", "at the last file"])
+def test_a_signal_at_any_moment_ends_a_run_in_order(module_run, tmp_path, monkeypatch, moment, number):
+    def signalled(*_, **__):
+        signal.raise_signal(number)
+        pytest.fail("the signal was ignored")
+
+    def trained(run, folder, report):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "version-0000.npz").touch()
+        return {}
+
+    monkeypatch.setattr(launch, "train_inline", trained)
+    monkeypatch.setattr(whole_run, "_evaluate", lambda *_: SimpleNamespace(summary={}))
+    owner, name = {
+        "before the folder": (launch, "prepare"),
+        "at the start": (launch, "train_inline"),
+        "after the training": (whole_run, "hold"),
+        "at the last file": (whole_run, "write_json"),
+    }[moment]
+    monkeypatch.setattr(owner, name, signalled)
+    with pytest.raises(icrl_dist.TrainInterrupted) as stopped:
+        icrl_dist.train(module_run, tmp_path / "run", engine="inline")
+    assert stopped.value.resumable or moment in ("before the folder", "at the start")
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError, ZeroDivisionError])
+def test_a_receiver_of_events_that_fails_ends_the_run_with_a_checkpoint_of_the_fit(module_run, tmp_path, monkeypatch, error):
+    def receive(event):
+        if event.get("stage") == "fit" and event["step"] == 3:
+            raise error("the output is closed")
+
+    monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
+    with pytest.raises(error, match="the output is closed"):
+        icrl_dist.train(module_run, tmp_path / "run", engine="inline", progress=receive)
+    assert checkpoints.read_manifest(tmp_path / "run" / "checkpoints" / checkpoints.PARTIAL)["step"] == 3
+
+
 def test_quarantined_variations_are_in_the_result_and_give_exit_code_1(module_run, tmp_path, monkeypatch, capsys):
     left_out = [{"variation": "adapt/0/1/1", "cause": "worker w0 died"}]
     produced = {"dataset_digest": "d", "weights_digest": "w", "trajectories": 3, "quarantined": left_out}
@@ -258,8 +298,8 @@ def test_load_run_takes_names_files_and_folders(made, module_run, tmp_path):
 
 def test_the_default_folder_is_named_after_the_run(made):
     names = {"demo": "demo", "mine/small.toml": "small", "experts-dmc": "experts-dmc"}
-    assert {name: whole_run.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
-    assert whole_run.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
+    assert {name: resuming.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
+    assert resuming.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
 
 
 def test_an_evaluation_is_shown_by_print_and_by_a_notebook(module_run, tmp_path):
