@@ -21,6 +21,7 @@ from typing import IO, Any
 import psutil
 
 from actors.running_time import RunningTime
+from icrl_dist.diagnostics import ray_job
 from icrl_dist.storage.files import held, hold
 
 TRIES = 3
@@ -82,6 +83,7 @@ class Session:
                 with _on_loopback(self._ray), _sigterm_unchanged():
                     self._ray.init(
                         address="local",
+                        job_config=ray_job.job_config(self._ray),
                         _node_ip_address="127.0.0.1",
                         _temp_dir=str(self._folder),
                         include_dashboard=False,

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import logging
 import os
 import select
 import signal
@@ -29,8 +28,10 @@ from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.console.signals import on_signals
 from icrl_dist.storage.files import StoreError, explained
 from icrl_dist.stream import security
+from icrl_dist.stream.credit import REQUEST_BYTES
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry.budget import log_to
 from learner.service import Interrupted, RunFailed, Service
 
 DONE, FAILED, BAD_CONFIG, INTERRUPTED = 0, 1, 2, 130
@@ -48,7 +49,7 @@ def main() -> int:
         "--driver", type=int, default=os.getppid(), help="process that the learner ends with; default: its parent"
     )
     arguments = parser.parse_args()
-    logging.basicConfig(filename=arguments.folder / "learner.log", level=logging.INFO, format="%(asctime)s %(message)s")
+    log_to(str(arguments.folder / "learner.log"))
     os.set_inheritable(arguments.events, False)
     report = _Events(arguments.events)
     try:
@@ -83,7 +84,8 @@ class _Events:
 
 def _serve(folder: Path, endpoint: str, report: _Events, driver: int) -> int:
     run = load_folder(folder)
-    with ZenohLink.listen(endpoint, security.learner(run.stream.certificates, folder.name)) as link:
+    settings = security.learner(run.stream.certificates, folder.name)
+    with ZenohLink.listen(endpoint, settings, run.stream.max_message_bytes + 2 * REQUEST_BYTES) as link:
         service = Service(run, folder, link, report)
         with on_signals(service.stop):
             signal.signal(signal.SIGTERM, lambda *_: service.stop())  # the driver's, also where it was ignored at the start

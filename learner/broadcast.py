@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Link, Query, StreamKeys
+from icrl_dist.stream.validation import integer
 from icrl_dist.types import Weights
 
 
@@ -48,9 +49,9 @@ class Broadcast:
         version = -1
         if query.payload:
             try:
-                version = int(wire.decode_message(query.payload)[1]["version"])
-            except (wire.WireError, KeyError, TypeError, ValueError) as error:
-                query.refuse(f"schema: {error}")
+                version = integer(wire.decode_message(query.payload)[1].get("version"), "version", -1)
+            except wire.WireError as error:
+                query.refuse(f"schema: {error.detail}")
                 return
         with self._lock:
             newest, payload = self._newest

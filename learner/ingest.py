@@ -18,7 +18,9 @@ import numpy as np
 
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import batching, wire
+from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.link import Query
+from icrl_dist.stream.messages import is_name
 from icrl_dist.types import Identity, Job, Spec, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -51,6 +53,8 @@ def check(trajectory: Trajectory, job: Job, spec: Spec, weights_digest: str) -> 
             raise Rejected("spec", f"{identity}: an action lies outside {low}..{high}")
     if not all(map(_finite, trajectory.arrays().values())):
         raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
+    if not is_name(trajectory.worker):
+        raise Rejected("spec", f"{identity}: its worker's name {show(trajectory.worker)} is not one")
     if trajectory.variation != job.variation(identity):
         raise Rejected("unexpected", f"{identity}: its variation is not the one of its job")
     if (trajectory.policy_version, trajectory.weights_digest) != (job.policy_version, weights_digest):
@@ -112,7 +116,7 @@ class Ingest:
 
     def _refuse(self, query: Query, error: wire.WireError | Rejected) -> None:
         self.drops[error.reason] += 1
-        _log.warning("refused a message: %s", error)
+        _log.warning("refused a message: %s", str(error))  # the error itself would keep the message
         query.refuse(str(error))
 
     def close(self) -> None:

@@ -198,7 +198,7 @@ class Service:
             "version": self.version,
             "trajectories": len(self.store),
             "drops": dict(self.ingest.drops),
-            "resent": self.worker_api.resent,
+            "resent": self.worker_api.known.resent,
             "repaired": self._repairs,
             "quarantined": [{"variation": name, "cause": cause} for name, cause in self._plan.quarantined.items()],
             "staleness": self._run.stream.staleness,
@@ -308,13 +308,13 @@ class Service:
             "steps": total,
             "version": self.version,
             "trajectories": len(self.store),
-            "workers": sum(self.worker_api.workers.values()),
+            "workers": sum(self.worker_api.known.alive.values()),
             "lag": self._lag,
             "drops": dict(self.ingest.drops),
-            "doing": self.worker_api.long_work,
+            "doing": self.worker_api.known.long_work,
             **values,
         }
-        self._reporter.progress(fields, force, self.worker_api.totals)
+        self._reporter.progress(fields, force, self.worker_api.known.totals)
 
 
 def _device(name: str) -> torch.device:

@@ -11,7 +11,6 @@ import logging
 import queue
 import statistics
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from icrl_dist.stream import batching, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.types import Adversary, Identity, Task, Trajectory, Variation
 
 _log = logging.getLogger(__name__)
@@ -164,8 +164,8 @@ class _Stream:
 @contextlib.contextmanager
 def _stream() -> Iterator[_Stream]:
     with ZenohLink.listen("tcp/127.0.0.1:0") as link:
-        command = [sys.executable, "-c", "import sys; from icrl_dist.bench.stream import work; work(sys.argv[1])"]
-        with subprocess.Popen([*command, link.endpoints[0]]) as worker:
+        command = processes.python("-c", "import sys; from icrl_dist.bench.stream import work; work(sys.argv[1])")
+        with subprocess.Popen([*command, link.endpoints[0]], env=processes.environment()) as worker:
             try:
                 stream = _Stream(link, worker)
                 yield stream

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from icrl_dist.storage import segment
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import endpoints
 
+STRANGERS = 1500
+"""Connections of a flood; the learner admits fewer."""
 STOP_S, CUT_S = 15.0, 12.0
 """Durations of a stopped learner and of a cut link, longer than ``stream.reply_timeout_s``."""
 
@@ -203,6 +206,23 @@ def full_disk(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     )
 
 
+def strangers(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """A flood of connections that send nothing, held until the run ends."""
+    training.start()
+    where, made = _reach(training, strike), 0
+    target = training.target()
+    if target is None:
+        raise Missed("the learner had ended")
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(TimeoutError):
+            for made in range(STRANGERS):  # noqa: B007
+                held.enter_context(socket.create_connection(target, timeout=0.5))
+        result = training.result()
+    return Struck(
+        where, made >= 64, f"{made} connections held, then {'no' if made + 1 < STRANGERS else 'any'} more admitted", result
+    )
+
+
 def stop_run(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """SIGSTOP of the command's process group for 15 s; the learner and the workers, in groups of their own, go on."""
     training.start()
@@ -260,6 +280,7 @@ FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
     "torn-tail": torn_tail,
     "flip-byte": flip_byte,
     "full-disk": full_disk,
+    "strangers": strangers,
     "stop-run": stop_run,
     "kill-raylet": kill_raylet,
     "kill-gcs": kill_gcs,

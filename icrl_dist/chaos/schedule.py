@@ -18,6 +18,7 @@ FAULTS = {
     "torn-tail": "kill-tree, and the newest segment ends in half a frame",
     "flip-byte": "a byte of a sealed segment changes, after kill-tree or during the run",
     "full-disk": "a disk too small for the run, enlarged, then --resume",
+    "strangers": "1,500 connections to the learner's port that send nothing",
     "stop-run": "SIGSTOP of the command and of Ray for 15 s, as Ctrl-Z does",
     "kill-raylet": "SIGKILL of Ray's raylet and of all workers",
     "kill-gcs": "SIGKILL of Ray's GCS",

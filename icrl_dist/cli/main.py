@@ -6,9 +6,11 @@ checkpoint written.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -20,7 +22,9 @@ from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
 from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_folder_of, run_type, with_problem
 from icrl_dist.console.signals import interruptible
+from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.storage.fork import parse_source
+from icrl_dist.stream.excerpts import plain
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "train": (train.TrainArguments, train.train),
@@ -78,7 +82,7 @@ def _check_settings(words: Sequence[str], kind: type[Run], problem: str = "") ->
             former_names.check({section: {key: None}}, names_of(kind), problem, flag)
 
 
-class _Console(Console):
+class _Console(PlainConsole):
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError  # for ``main``; rich would exit with code 1
 
@@ -89,6 +93,7 @@ def main(words: Sequence[str] | None = None) -> int:
     If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
     """
     streams.prepare()
+    _write_any_text()
     try:
         try:
             return _run(list(sys.argv[1:] if words is None else words))
@@ -98,8 +103,17 @@ def main(words: Sequence[str] | None = None) -> int:
         return streams.end_of_output()
 
 
+def _write_any_text() -> None:
+    """Let the streams write names that their encoding lacks as escapes: with LANG=C, and file names that are not UTF-8."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
 def _run(words: list[str]) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: decision 073
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without UTF-8 cannot show every printable character
+        sys.stdout.reconfigure(errors="backslashreplace")
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = _Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
@@ -115,6 +129,11 @@ def _run(words: list[str]) -> int:
         print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE
     try:
+        Path.cwd()
+    except OSError as error:
+        print(f"icrl-dist: the current folder cannot be used ({error.strerror}): change to another one", file=sys.stderr)
+        return USAGE
+    try:
         with interruptible():
             return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
     except KeyboardInterrupt:
@@ -128,7 +147,7 @@ def _run(words: list[str]) -> int:
         code = _code(explanation)
         if code is None:
             raise
-        print(f"icrl-dist: {' '.join(str(explanation).split())}", file=sys.stderr)
+        print(f"icrl-dist: {plain(' '.join(str(explanation).split()), 4_000)}", file=sys.stderr)
         return code
 
 

@@ -43,8 +43,8 @@ class TrainArguments:
     address: str | None = None
     """Address of a Ray cluster that runs the workers.  Without it, Ray starts on this machine."""
     actors: int | None = None
-    """Number of workers.  Default: 2 on this machine; on a cluster one for each core, including the cores of
-    nodes that join later."""
+    """Number of workers.  Default: 2 on this machine, or 1 on a single core; on a cluster one for each core,
+    including the cores of nodes that join later."""
     min_actors: int | None = None
     """On a cluster: start with this many workers after one minute, even if other nodes have not joined."""
     oversubscribe: bool = False

@@ -11,6 +11,9 @@ from typing import Any, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from icrl_dist.console.terminal import PlainConsole
+from icrl_dist.stream.excerpts import plain
+
 ReportEvent = Callable[[dict[str, Any]], None]
 """Shows one event of a run, such as ``{"event": "note", "text": ...}``."""
 Show = bool | ReportEvent
@@ -31,12 +34,12 @@ class Display:
         self._bars: dict[str, TaskID] = {}
         self._printed: dict[str, tuple[float, bool]] = {}
         columns = (
-            TextColumn("{task.description:<26}"),
+            TextColumn("{task.description:<26}", markup=False),
             BarColumn(24),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TimeRemainingColumn(compact=True, elapsed_when_finished=False),
-            TextColumn("{task.fields[info]}"),
+            TextColumn("{task.fields[info]}", markup=False),
         )
         self._progress = Progress(*columns, console=console)
 
@@ -63,13 +66,12 @@ class Display:
         elif kind == "listening":
             where = f"learner on {event['host']} ({event['device']})"
             text = f"{where} listens at {event['endpoint']}, policy version {event['version']}"
-            self.console.print(text, highlight=False, markup=False)
+            self.console.print(plain(text, 2_000), highlight=False, markup=False)
         elif kind in ("note", "worker", "alert", "crash", "quarantine", "released", "repaired", "interrupted"):
-            self.console.print(event["text"], highlight=False, markup=False)
+            self.console.print(plain(event["text"], 2_000), highlight=False, markup=False)
 
     def _stage(self, event: dict[str, Any]) -> None:
-        name = _name(event)
-        info = _info(event)
+        name, info = plain(_name(event)), plain(_info(event), 2_000)
         done, total = event["step"], event["steps"]
         if self.console.is_terminal:
             if name not in self._bars:
@@ -80,7 +82,7 @@ class Display:
         if not ended and (done == total or time.monotonic() - printed_at >= _PERIOD_S or name not in self._printed):
             self._printed[name] = (time.monotonic(), done == total)
             if done or event.get("doing"):
-                self.console.print(f"{name:<26} {done:>7}/{total:<7} {info}", highlight=False)
+                self.console.print(f"{name:<26} {done:>7}/{total:<7} {info}", highlight=False, markup=False)
 
 
 @contextlib.contextmanager
@@ -89,7 +91,7 @@ def reporting(progress: Show) -> Iterator[ReportEvent]:
     if callable(progress):
         yield progress
     elif progress:
-        with Display(Console(soft_wrap=True)) as display:
+        with Display(PlainConsole(soft_wrap=True)) as display:
             yield display.report
     else:
         yield lambda event: None

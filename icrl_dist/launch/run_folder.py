@@ -28,6 +28,9 @@ from icrl_dist.storage.files import StoreError, held, hold
 WAIT_S = 10.0
 """Seconds to wait for the processes of a killed run to end before its folder counts as in use."""
 
+LONGEST_NAME, LONGEST_PATH = 240, 4095 - 300
+"""Bytes of a run folder's name and path.  File systems allow 255 and 4,095; ``.NAME.replaced`` and reports are longer."""
+
 _REPORTS = r"(online|posterior)-(.+-)?T\d+-[0-9a-f]*-.+\.(json|png)|(online|posterior)\.json|(adaptation|posterior)\.png"
 _NAMES = {
     "checkpoints/report": _REPORTS,
@@ -123,6 +126,11 @@ def check_place(folder: Path, source: Path | None = None) -> None:
         real, current = folder.resolve(), Path.cwd().resolve()
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"--out {folder}: {error}; {remedy}") from None
+    if len(os.fsencode(real)) > LONGEST_PATH or len(os.fsencode(real.name)) > LONGEST_NAME:
+        limits = (
+            f"a folder's name may have {LONGEST_NAME} bytes and its path {LONGEST_PATH}, because longer names are made in it"
+        )
+        raise ConfigError(f"--out {real.name[:40]}...: too long ({len(os.fsencode(real))} bytes); {limits}")
     if folder.is_symlink():
         raise ConfigError(f"--out {folder}: is a symbolic link; name the folder itself, {real}")
     if folder.name == "..":

@@ -21,6 +21,7 @@ from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.signals import on_signals
+from icrl_dist.diagnostics.modules import hidden_packages
 from icrl_dist.diagnostics.ray_token import require_ray_token
 from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.holdings import holdings, remove_if_empty
@@ -139,9 +140,13 @@ def check_security(run: Run, address: str | None) -> None:
 def train_inline(run: Run, folder: Path, report: ReportEvent) -> dict[str, Any]:
     """Run the learner in this process with one worker on a thread.  Returns the learner's result.
 
+    Raises ConfigError if a file of the user hides the package ``learner`` in this process.
     An error of ``report`` ends the run like a signal, with a checkpoint, and is raised then.
     """
     import torch
+
+    for name, file in hidden_packages().items():
+        raise ConfigError(f"{file} hides the package {name!r}, a part of icrl-dist: rename that file, or use engine 'ray'")
 
     from actors.worker import Worker
     from icrl_dist.stream.memory_link import MemoryHub

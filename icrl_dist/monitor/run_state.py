@@ -73,7 +73,10 @@ class RunState:
         try:
             message = strict.unpack(payload, MAX_BYTES)
             kind = validation.text(message.get("kind"), 32)
-            run = validation.text(key.partition("/")[2].partition("/")[0], 200)
+            _, run, _, topic = (*key.split("/"), "", "", "", "")[:4]
+            if topic != kind:  # the access rules decide who may publish on a topic, so a kind has a topic of its own
+                raise InvalidMessageError("wrong topic")
+            run = validation.text(run, 200)
             with self._lock:
                 self._apply(run, kind, message, now)
         except strict.WireError as error:

@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from prometheus_client import CollectorRegistry, Gauge, start_http_server
+from prometheus_client import CollectorRegistry, Gauge
 
 from icrl_dist.storage.files import unwritten
 from icrl_dist.stream.link import LinkError
+from icrl_dist.telemetry.exporter import MetricsServer
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard.writer import SummaryWriter
@@ -124,7 +125,7 @@ class _Exporter:
             for name, text in {**names, "step": STAGES[stage].partition("`step` is ")[2]}.items()
         }
         try:
-            self._server, self._thread = start_http_server(int(port), host.strip("[]"), registry)
+            self._server = MetricsServer(host.strip("[]"), int(port), registry)
         except OSError as error:
             raise LinkError(
                 f"learner.prometheus = {endpoint!r}: cannot listen there ({error.strerror}); free that port or choose another"
@@ -135,9 +136,7 @@ class _Exporter:
             self._gauges[stage, name].set(value)
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        self._server.close()
 
 
 @contextlib.contextmanager

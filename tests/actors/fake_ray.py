@@ -15,12 +15,18 @@ LOOPBACK = "tcp/127.0.0.1:0"
 OWN_FACTS = node_facts.facts()
 
 
+class FakeJobConfig:
+    def __init__(self, _py_driver_sys_path):
+        pass
+
+
 class FakeRay:
     """A cluster of nodes with ``cores`` each; ``answers`` change the facts that a node returns, or are raised."""
 
     exceptions = SimpleNamespace(
         AuthenticationError=PermissionError, RayActorError=ChildProcessError, RayTaskError=ModuleNotFoundError
     )
+    job_config = SimpleNamespace(JobConfig=FakeJobConfig)
     util = SimpleNamespace(
         scheduling_strategies=SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, soft: (node, soft))
     )

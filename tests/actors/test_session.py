@@ -14,6 +14,7 @@ import pytest
 
 from actors import local, running_time, session
 from actors.session import Session, SessionFailed
+from icrl_dist.diagnostics import ray_job
 
 CHILD = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import time; time.sleep(600)'])"
 
@@ -60,6 +61,7 @@ def fake_ray(monkeypatch, tmp_path):
         made.append(FakeRay(*arguments))
         return made[-1]
 
+    monkeypatch.setattr(ray_job, "job_config", lambda ray: None)
     monkeypatch.setattr(session, "_VITAL", (psutil.Process().name(), "python", "python3"))
     yield make
     for ray in made:

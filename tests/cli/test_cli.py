@@ -290,3 +290,13 @@ def test_a_reader_that_closes_the_pipe_ends_a_command_without_a_message(small_ru
     script = f"{command} > >(exec 0<&-); echo $?"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=120)
     assert (done.stdout, done.stderr) == ("141\n", "")
+
+
+def test_a_current_folder_that_was_deleted_is_named(tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main.main(["doctor"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "the current folder cannot be used (No such file or directory): change to another one" in line

@@ -76,7 +76,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
 def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("HOME", str(tmp_path / "file"))
-    assert check_named("home").ok is False
+    assert check_named("home").ok is None
 
 
 def test_a_library_too_old_and_one_missing(monkeypatch: pytest.MonkeyPatch) -> None:

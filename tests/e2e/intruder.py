@@ -90,6 +90,16 @@ def forge_the_monitor_key(scene):
     return scene.succeeds(lambda: scene.intruder.put(KEYS.monitor("learner"), b"forged"))
 
 
+def delete_the_monitor_key(scene):
+    scene.monitor.subscribe(KEYS.monitor_all, scene.record)
+    return scene.succeeds(lambda: scene.intruder.delete(KEYS.monitor("worker/w0")))
+
+
+def forge_a_heartbeat(scene):
+    scene.learner.subscribe(KEYS.heartbeats, scene.record)
+    return scene.succeeds(lambda: scene.intruder.put(KEYS.monitor("worker/w0"), b"forged"))
+
+
 def forge_another_run(scene):
     scene.monitor.subscribe("icrl/*/mon/**", scene.record)
     return scene.succeeds(lambda: scene.intruder.put(StreamKeys("other").monitor("learner"), b"forged"))
@@ -171,7 +181,8 @@ def list_the_workers(scene):
 
 BOTH_ROLES = [forge_weights, delete_weights, read_the_data_of_others, serve_the_weights, serve_everything, read_everything]
 BOTH_ROLES += [ask_for_anything, forge_another_run, watch_the_workers, list_the_workers]
-MONITOR_ONLY = [forge_the_monitor_key, read_the_weights, ask_for_work, send_data, ask_for_the_weights, pose_as_a_worker]
+BOTH_ROLES += [forge_the_monitor_key, delete_the_monitor_key]
+MONITOR_ONLY = [forge_a_heartbeat, read_the_weights, ask_for_work, send_data, ask_for_the_weights, pose_as_a_worker]
 FORBIDDEN = [("worker", action) for action in [*BOTH_ROLES, read_the_monitor_key]] + [
     ("monitor", action) for action in [*BOTH_ROLES, *MONITOR_ONLY]
 ]

@@ -461,3 +461,10 @@ def test_the_lock_is_taken_on_the_file_that_is_in_the_folder_now(tmp_path, monke
     monkeypatch.setattr(fcntl, "flock", late)
     with hold(folder) as file:
         assert replaced and os.path.samestat(os.fstat(file.fileno()), (folder / ".lock").stat())
+
+
+@pytest.mark.parametrize("out", ["y" * 241, "/".join(["x" * 200] * 19)])
+def test_a_path_too_long_for_the_names_in_a_run_folder_is_refused(tmp_path, out):
+    with pytest.raises(ConfigError, match=r"too long \(\d+ bytes\); a folder's name may have 240 bytes"):
+        run_folder.check_place(tmp_path / out)
+    run_folder.check_place(tmp_path / ("y" * 240))

@@ -21,7 +21,7 @@ from learner.service import Service
 def learner(tmp_path, monkeypatch):
     """A learner process that copies its standard input to the file ``received``."""
     program = tmp_path / "program"
-    program.write_text('#!/bin/sh\nwhile read line; do echo "$line" >> "$3/received"; done\n')
+    program.write_text('#!/bin/sh\nwhile read line; do echo "$line" >> "$4/received"; done\n')
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
     process = learner_process.LearnerProcess(tmp_path, "tcp/127.0.0.1:0", 1)

@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import errno
+import fcntl
 import inspect
 import json
 import os
@@ -29,6 +31,7 @@ from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout, reports
 from learner import checkpoints, reporter
 from tests.actors.fake_ray import FakeRay
+from tests.calls import failing
 from tests.learner.test_service import no_tensorboard
 from tests.results.row_blocks import block, frame
 
@@ -172,7 +175,7 @@ def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
 def test_the_learner_process_has_the_waiting_policy_also_without_the_command_line(monkeypatch, tmp_path):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     program = tmp_path / "program"
-    program.write_text('#!/bin/sh\necho "$OMP_WAIT_POLICY" > "$3/policy"\n')
+    program.write_text('#!/bin/sh\necho "$OMP_WAIT_POLICY" > "$4/policy"\n')
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
     process = learner_process.LearnerProcess(tmp_path, "tcp/127.0.0.1:0", 0)
@@ -307,3 +310,12 @@ def test_an_evaluation_is_shown_by_print_and_by_a_notebook(module_run, tmp_path)
     for text in (str(found), found._repr_mimebundle_([], [])["text/plain"]):
         assert "Return by online episode" in text and "T^0" in text and "figure" in text
     assert repr(found) == "Evaluation()"
+
+
+@pytest.mark.integration
+def test_a_run_on_a_file_system_without_locks_goes_on_with_one_warning(module_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(fcntl, "flock", failing(OSError(errno.ENOLCK, "No locks available")))
+    events = list[dict[str, object]]()
+    whole_run.train(module_run, tmp_path / "run", engine="inline", progress=events.append)
+    (warning,) = [str(event["text"]) for event in events if "No locks available" in str(event.get("text"))]
+    assert warning.startswith(f"{tmp_path / 'run'}: its file system has no locks")

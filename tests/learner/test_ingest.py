@@ -133,6 +133,8 @@ def invalid(trajectory):
         ("spec", changed(prev_actions=np.full(2, 5, np.int16), prev_rewards=np.zeros(2, np.float32))),
         ("spec", changed(prev_actions=np.full(2, -1, np.int16), prev_rewards=np.zeros(2, np.float32))),
         ("not-finite", changed(prev_actions=np.zeros(2, np.int16), prev_rewards=np.full(2, np.inf, np.float32))),
+        ("spec", changed(worker="\x1b[2J")),
+        ("spec", changed(worker="w" * 10_000)),
         ("unexpected", changed(identity=Identity("adapt", 7, 0, 0, 0))),
         (
             "unexpected",

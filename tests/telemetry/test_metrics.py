@@ -1,8 +1,10 @@
 """Metrics in the file, in TensorBoard and at the Prometheus endpoint, by one list of names."""
 
+import contextlib
 import json
 import re
 import socket
+import threading
 import urllib.request
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 
 from icrl_dist.config.run import ConfigError, parse
 from icrl_dist.stream.link import LinkError
-from icrl_dist.telemetry import metrics
+from icrl_dist.telemetry import exporter, metrics
 from icrl_dist.telemetry.metrics import NAMES, STAGES, Metrics
 
 
@@ -42,6 +44,23 @@ def test_a_number_goes_to_the_file_and_to_prometheus(tmp_path):
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [(row["stage"], row["step"], row.get("loss")) for row in rows[:2]] == [("fit/3", 50, 0.25), ("fit/3", 100, 0.125)]
     assert rows[2] == {"time": 12.0, "stage": "alert", "step": 2, "what": "zero", "active": True, "text": "stuck"}
+
+
+def test_bare_connections_to_the_prometheus_port_use_one_descriptor_and_one_thread(tmp_path, monkeypatch):
+    monkeypatch.setattr(exporter._Handler, "timeout", 0.05)
+    where = ("127.0.0.1", free_port())
+    written = Metrics(tmp_path, tensorboard=False, prometheus=f"127.0.0.1:{where[1]}")
+    try:
+        threads, ends = threading.active_count(), contextlib.ExitStack()
+        with ends, contextlib.suppress(TimeoutError):
+            for _ in range(50):
+                ends.enter_context(socket.create_connection(where, timeout=0.1))
+            assert threading.active_count() == threads
+        with urllib.request.urlopen(f"http://127.0.0.1:{where[1]}/metrics", timeout=10) as page:
+            assert b"icrl_fit_loss" in page.read()
+        assert threading.active_count() == threads
+    finally:
+        written.close()
 
 
 def test_a_number_that_is_not_in_the_list_is_refused(tmp_path):
