@@ -99,7 +99,7 @@ class Reporter:
         fields = dataclasses.asdict(quality)
         self._metrics.write(round, "labels", **fields)
         optimal = f"{quality.agreement:.0%} optimal"
-        text = f"labels of round {round}: {optimal}; return {quality.label_return:.1f} in the labeling trials"
+        text = f"labels of adapt/{round}: {optimal}; return {quality.label_return:.1f} in the labeling trials"
         self._report({"event": "labels", "round": round, **fields})
         self.log("labels", text)
         with self._lock:

@@ -28,6 +28,7 @@ from learner import checkpoints
 from learner.broadcast import Broadcast
 from learner.fitting import Fitting
 from learner.ingest import Ingest
+from learner.past import PastServer
 from learner.phases import PhasePlan
 from learner.reporter import Reporter
 from learner.scheduler import LeaseScheduler
@@ -101,6 +102,7 @@ class Service:
         report = self._reporter.event
         self.worker_api = WorkerAPI(run, folder, link, self._keys, self._scheduler, self._lock, report, fail, policy_version)
         closing.callback(self.worker_api.close)
+        closing.callback(PastServer(link, self._keys, run, folder, self.store).close)
         self._serving = False
         if newest := self._fitting.resume():
             self._broadcast.publish(newest)

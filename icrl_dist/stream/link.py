@@ -53,6 +53,11 @@ class StreamKeys:
         return f"icrl/{self.run}/mon/**"
 
     @property
+    def past(self) -> str:
+        """The learner answers requests of monitors for what the run has done so far here."""
+        return f"icrl/{self.run}/mon/past"
+
+    @property
     def monitor_of_workers(self) -> tuple[str, ...]:
         """The part of the monitor plane on which workers publish."""
         return tuple(f"icrl/{self.run}/mon/{topic}/*" for topic in WORKER_TOPICS)

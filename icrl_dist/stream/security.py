@@ -84,6 +84,8 @@ def _access(keys: StreamKeys) -> dict[str, object]:
         "worker holds a liveliness token": ("ingress", ["liveliness_token"], [keys.alive_all]),
         "monitor subscribes": ("ingress", ["declare_subscriber"], monitored),
         "monitor receives messages": ("egress", ["put"], monitored),
+        "monitor asks for the past": ("ingress", ["query"], ["icrl/*/mon/past"]),
+        "monitor receives the past": ("egress", ["reply", "declare_queryable"], ["icrl/*/mon/past"]),
     }
     roles = ("worker", "monitor")
     return {
