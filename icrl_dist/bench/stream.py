@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from actors import local
-from icrl_dist.diagnostics import ray_job
+from actors.session import Session
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query, StreamKeys
@@ -219,8 +218,8 @@ def local_ray() -> Iterator[Any]:
 
     if ray.is_initialized():
         raise RuntimeError("Ray is already initialized in this process: run this benchmark in a new process")
-    local.start_ray(ray, _log.warning, address="local", job_config=ray_job.job_config(ray), num_cpus=2, configure_logging=False)
+    session = Session(ray, _log.warning, num_cpus=2, configure_logging=False)
     try:
         yield ray
     finally:
-        ray.shutdown()
+        session.close()

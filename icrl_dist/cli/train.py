@@ -94,7 +94,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
         with Display(console) as display:
             made = whole_run.train(run, out, **given, progress=display.report)
     except TrainInterrupted as error:
-        text = f"`{command}` continues from the checkpoint" if error.resumable else str(error)
+        text = f"`{command}` continues from {error.kept}" if error.resumable else str(error)
         console.print(f"interrupted; {text}", highlight=False, markup=False, soft_wrap=True)
         return INTERRUPTED
     except BrokenPipeError:

@@ -233,12 +233,17 @@ def test_a_stopped_evaluation_prints_the_command_that_resumes(monkeypatch, tmp_p
         signal.raise_signal(getattr(signal, name))
         pytest.fail("the signal was ignored")
 
-    monkeypatch.setattr(train, "train_inline", lambda *_: {})
+    def trained(run, folder, report):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "version-0000.npz").touch()
+        return {}
+
+    monkeypatch.setattr(train, "train_inline", trained)
     monkeypatch.setattr(heldout, "save_calibrated", stopped)
     assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
     assert (
-        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the checkpoint"
+        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the last checkpoint"
         in printed
     )
     assert (tmp_path / "run" / "run.toml").exists()
