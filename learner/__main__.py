@@ -101,7 +101,10 @@ def _serve(folder: Path, endpoint: str, report: _Events, driver: int) -> int:
                 service.worker_api.finish()  # not earlier: a worker that ends before the run counts as lost
                 service.worker_api.wait_until_gone()
             except Interrupted:
-                report({"event": "interrupted", "text": f"a checkpoint is in {folder / 'checkpoints'}"})
+                checkpoints = folder / "checkpoints"
+                missing = "nothing was fitted yet, so there is no checkpoint"
+                text = f"a checkpoint is in {checkpoints}" if any(checkpoints.glob("*.npz")) else missing
+                report({"event": "interrupted", "text": text})
                 return INTERRUPTED
             finally:
                 endpoint_file.unlink(missing_ok=True)

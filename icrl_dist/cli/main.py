@@ -10,6 +10,7 @@ import io
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -92,6 +93,7 @@ def main(words: Sequence[str] | None = None) -> int:
     If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
     """
     streams.prepare()
+    _write_any_text()
     try:
         try:
             return _run(list(sys.argv[1:] if words is None else words))
@@ -99,6 +101,13 @@ def main(words: Sequence[str] | None = None) -> int:
             sys.stdout.flush()  # else Python would find a closed pipe only when it exits
     except BrokenPipeError:
         return streams.end_of_output()
+
+
+def _write_any_text() -> None:
+    """Let the streams write names that their encoding lacks as escapes: with LANG=C, and file names that are not UTF-8."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _run(words: list[str]) -> int:
@@ -118,6 +127,11 @@ def _run(words: list[str]) -> int:
         return OK
     if words[0] not in COMMANDS:
         print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
+        return USAGE
+    try:
+        Path.cwd()
+    except OSError as error:
+        print(f"icrl-dist: the current folder cannot be used ({error.strerror}): change to another one", file=sys.stderr)
         return USAGE
     try:
         with interruptible():

@@ -43,8 +43,8 @@ class TrainArguments:
     address: str | None = None
     """Address of a Ray cluster that runs the workers.  Without it, Ray starts on this machine."""
     actors: int | None = None
-    """Number of workers.  Default: 2 on this machine; on a cluster one for each core, including the cores of
-    nodes that join later."""
+    """Number of workers.  Default: 2 on this machine, or 1 on a single core; on a cluster one for each core,
+    including the cores of nodes that join later."""
     min_actors: int | None = None
     """On a cluster: start with this many workers after one minute, even if other nodes have not joined."""
     oversubscribe: bool = False
@@ -94,7 +94,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
         with Display(console) as display:
             made = whole_run.train(run, out, **given, progress=display.report)
     except TrainInterrupted as error:
-        text = f"`{command}` continues from the checkpoint" if error.resumable else str(error)
+        text = f"`{command}` continues from {error.kept}" if error.resumable else str(error)
         console.print(f"interrupted; {text}", highlight=False, markup=False, soft_wrap=True)
         return INTERRUPTED
     except BrokenPipeError:

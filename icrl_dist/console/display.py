@@ -11,6 +11,7 @@ from typing import Any, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from icrl_dist.console.phase_names import stage_text
 from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.stream.excerpts import plain
 
@@ -59,7 +60,7 @@ class Display:
             self._stage(event)
         elif kind == "labels":
             self.console.print(
-                f"  labels of round {event['round']}: {event['agreement']:.0%} optimal; return {event['label_return']:.1f}"
+                f"  labels of adapt/{event['round']}: {event['agreement']:.0%} optimal; return {event['label_return']:.1f}"
                 f" in the label trials, {event['context_return']:.1f} in the context trials, {event['optimum']:.1f} optimal",
                 highlight=False,
             )
@@ -100,9 +101,7 @@ def reporting(progress: Show) -> Iterator[ReportEvent]:
 def _name(event: dict[str, Any]) -> str:
     if event["stage"] == "evaluate":
         return str(event["phase"])
-    if event["stage"] == "fit":
-        return f"fit T^{event['version'] + 1}"
-    return "contexts, D^0" if event["phase"] == "pretrain" else f"round {event['round']}: T^{event['version']} rolls out"
+    return stage_text(event)
 
 
 def _info(event: dict[str, Any]) -> str:

@@ -7,7 +7,6 @@ import json
 import os
 import queue
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,6 +17,7 @@ import psutil
 
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
+from icrl_dist.telemetry import processes
 
 CHECKPOINT_S = 60.0
 """Seconds that a learner has to write its checkpoint when the run ends."""
@@ -53,10 +53,9 @@ class LearnerProcess:
 
     def _start(self) -> None:
         self._log = (self._folder / "learner.err").open("ab")
-        environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}  # idle torch threads sleep: decision 073
         events, write_end = os.pipe()
         try:
-            command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
+            command = processes.python("-m", "learner", str(self._folder), "--endpoint", self.endpoint)
             command += ["--events", str(write_end), "--driver", str(os.getpid())]
             self._process = subprocess.Popen(
                 command,
@@ -65,7 +64,7 @@ class LearnerProcess:
                 stderr=self._log,
                 pass_fds=(write_end,),
                 start_new_session=True,
-                env=environment,
+                env=processes.environment(),
             )
         except BaseException:
             os.close(events)

@@ -10,24 +10,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from actors import local
-from actors.placement import check_cores
+from actors.placement import check_cores, local_actors
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, override, run_folder_of
 from icrl_dist.console.display import ReportEvent, Show, reporting
 from icrl_dist.console.signals import interruptible
 from icrl_dist.launch import train as launch
+from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.resuming import place
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.storage.files import hold, write_json
+from icrl_dist.storage.files import hold, without_locks, write_json
 from icrl_dist.storage.fork import parse_source
 from icrl_dist.stream.schema import as_data
+from icrl_dist.telemetry.processes import import_torch
 
 if TYPE_CHECKING:
     from icrl_dist.results.reports import Evaluation
 
-LOCAL_ACTORS = 2
-"""Default number of workers without a cluster."""
 Engine = Literal["ray", "inline"]
 
 
@@ -69,7 +69,8 @@ def train(
     ``run``: a ``Run`` (``icrl_dist.load_run``), the name of a packaged run, or the path of a run file; None with
     ``source``: the settings of that run.  ``out``: the run folder; None: runs/NAME of the packaged run or the file.
     ``engine``: ``ray`` for a learner process and Ray workers, ``inline`` for everything in this process.
-    ``address``: of a Ray cluster; ``actors``: number of workers, by default 2, on a cluster one for each core;
+    ``address``: of a Ray cluster; ``actors``: number of workers, by default 2 (1 on a single core), on a cluster one
+    for each core;
     ``min_actors``: on a cluster, start with this many after one minute; ``oversubscribe``: allow more workers than cores.
     ``source``: ``"RUN_DIR@ROUND"``, to start from T^ROUND of another run and its data.
     ``resume``: continue the run in the folder; then ``run`` may also be that run folder.  ``resume_or_begin``: the same
@@ -95,20 +96,23 @@ def train(
     for option, value in (("--actors", actors), ("--min-actors", min_actors)):
         if value is not None and value < 1:
             raise ConfigError(f"{option} {value}: at least 1 worker is needed")
-    count = LOCAL_ACTORS if actors is None and address is None else actors
+    count = local_actors() if actors is None and address is None else actors
     if engine == "ray":
         local.refuse_running_session()
         if address is None and not oversubscribe:
-            check_cores(count or LOCAL_ACTORS)
+            check_cores(count or 1)
         launch.check_security(settings, address)
     transaction: FolderTransaction | None = None
     try:
         with interruptible(), reporting(progress) as show, contextlib.ExitStack() as locks:
             transaction = launch.prepare(settings, folder, resume, overwrite, parent, resume_or_begin)
             started = time.monotonic()
+            if warning := without_locks(folder):
+                show({"event": "note", "text": warning})
             with transaction:
                 report = transaction.commit_at_checkpoint(show)
                 if engine == "inline":
+                    import_torch()
                     result = launch.train_inline(settings, folder, report)
                 else:
                     result = launch.train_ray(settings, folder, count, address, report, oversubscribe, min_actors)
@@ -145,6 +149,7 @@ def _folder(run: Run | str | Path | None, out: str | Path | None, source: str | 
 
 
 def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
+    import_torch()
     from icrl_dist.results import heldout, reports  # they import torch, so they come after the training
 
     if not plugins.find("methods", run.method).trains:
@@ -158,9 +163,14 @@ def _interrupted(folder: Path, transaction: FolderTransaction | None) -> launch.
     """The exception that says what the folder of an interrupted run holds."""
     if transaction is not None and transaction.rolled_back:
         return launch.TrainInterrupted(f"{folder} is as it was before", resumable=False)
-    if not (folder / "run.toml").is_file():
+    if remove_if_empty(folder) or not (folder / "run.toml").is_file():
         return launch.TrainInterrupted("nothing had been done yet", resumable=False)
-    return launch.TrainInterrupted(f"{folder} holds the checkpoint: resume=True, or --resume, continues from it")
+    kept = holdings(folder)
+    if not kept:
+        return launch.TrainInterrupted(f"{folder} holds nothing to continue from", resumable=False)
+    error = launch.TrainInterrupted(f"resume=True, or --resume, continues from {kept} in {folder}")
+    error.kept = kept
+    return error
 
 
 _PRODUCED = ("dataset_digest", "weights_digest", "version", "trajectories")

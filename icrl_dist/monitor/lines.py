@@ -53,6 +53,16 @@ def spread(left: Line, right: Line, width: int) -> Line:
     return [*left, (" " * gap, PLAIN), *right] if gap > 0 else left
 
 
+def flow(head: Line, groups: Sequence[Line], width: int) -> list[Line]:
+    """``head`` and groups of parts on lines of at most ``width`` cells; a group is not divided."""
+    lines = [list(head)]
+    for group in groups:
+        if width_of(lines[-1]) + width_of(group) > width:
+            lines.append([])
+        lines[-1] += group
+    return lines
+
+
 @dataclass(frozen=True)
 class Column:
     """A column of a table."""

@@ -7,9 +7,11 @@ inside functions, because workers and most commands need neither.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -103,17 +105,50 @@ def append(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) 
     existing file is replaced.  Raises StoreError if the file cannot be written, ConfigError for a return that is no finite
     number.
     """
+    path, table = _made(folder, suite, settings, blocks)
+    _write(path, table)
+    return path
+
+
+def record(
+    folder: Path, suite: str, settings: object, blocks: Sequence[Block], unstored: list[StoreError] | None = None
+) -> pd.DataFrame:
+    """Write the rows of one evaluation as ``append`` does; returns them as ``read`` does.
+
+    A StoreError is added to ``unstored`` if that is given, and the rows are returned all the same.
+    """
+    path, table = _made(folder, suite, settings, blocks)
+    with keeping(unstored):
+        _write(path, table)
+    return _frame([table])
+
+
+def _made(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) -> tuple[Path, pa.Table]:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     now = datetime.now(UTC)
-    while (path := folder / f"{suite}-{digest}-{now:%Y%m%dT%H%M%S.%f}Z.parquet").exists():
+    while os.path.lexists(path := folder / f"{suite}-{digest}-{now:%Y%m%dT%H%M%S.%f}Z.parquet"):
         now += timedelta(microseconds=1)
     fixed = {"format": FORMAT, "evaluation": path.stem, "written": now.isoformat(), "suite": suite}
-    table = pa.concat_tables([_table({**block, **fixed, **_made_by(block)}) for block in blocks])
+    return path, pa.concat_tables([_table({**block, **fixed, **_made_by(block)}) for block in blocks])
+
+
+def _write(path: Path, table: pa.Table) -> None:
+    import pyarrow.parquet as pq
+
     atomic_write(path, lambda file: pq.write_table(table, file, compression="zstd"))
-    return path
+
+
+@contextlib.contextmanager
+def keeping(unstored: list[StoreError] | None) -> Iterator[None]:
+    """Add the StoreError of a file that cannot be written to ``unstored``, so that results are shown anyway; None: raise it."""
+    try:
+        yield
+    except StoreError as error:
+        if unstored is None:
+            raise
+        unstored.append(error)
 
 
 def _made_by(block: Block) -> dict[str, Any]:
@@ -161,9 +196,12 @@ def read(files: Iterable[Path]) -> pd.DataFrame:
 
     Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
     """
+    return _frame([_read(path) for path in files])
+
+
+def _frame(tables: Sequence[pa.Table]) -> pd.DataFrame:
     import pyarrow as pa
 
-    tables = [_read(path) for path in files]
     frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
     frame["split_seed"] = frame["split_seed"].astype("Int64")
     return frame

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from icrl_dist.agent.loading import SHIPPED, agent_checkpoint, checkpoint_file, shipped
+from icrl_dist.agent.loading import SHIPPED, open_checkpoint, shipped
 from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
@@ -15,6 +15,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
+from icrl_dist.storage.files import StoreError
 
 Suite = Literal["online", "offline", "posterior"]
 Prior = Literal["uniform", "unseen"]
@@ -35,7 +36,8 @@ def evaluate(
 
     ``what``: a run folder, a checkpoint file, or the name of an agent of the package (``"darkroom"``; ``"./darkroom"``
     is a folder of that name).  The new rows are also written to ``results/`` of the run, the numbers and the figure to
-    its ``report/``; for an agent of the package to runs/NAME-pretrained.
+    its ``report/``; for an agent of the package to runs/NAME-pretrained.  If a file cannot be written, for example in a
+    folder that can only be read, the result is returned all the same, and one of its ``notes`` says so.
 
     ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
     of a random or an expert episode; ``posterior`` for the distance to the exact posterior.
@@ -53,7 +55,7 @@ def evaluate(
     for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
         if value is not None and value not in get_args(choices):
             raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
-    run = parse_written(str(agent_checkpoint(checkpoint_file(source)).manifest["run"]), str(source))
+    run = parse_written(str(open_checkpoint(source).manifest["run"]), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,
@@ -69,16 +71,18 @@ def evaluate(
     rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)
     report = folder / "report" / heldout.report_name(run, source, suite, rule)
     results = (heldout.run_folder(source) or folder) / "results"  # rows of a checkpoint in a run folder belong to that run
+    unstored: list[StoreError] = []
     with reporting(progress) as show:
         if source.is_dir() and is_unfinished(source):
             text = f"{source}: this run is not finished; the newest version so far is evaluated"
             show({"event": "note", "text": text})
         if suite == "online":
-            found = reports.online(run, report, heldout.online(run, source, results, show, deploy))
+            rows = heldout.online(run, source, results, show, deploy, unstored)
+            found = reports.online(run, report, rows, unstored)
         elif suite == "offline":
-            found = reports.offline(run, heldout.offline(run, source, results, deploy))
+            found = reports.offline(run, heldout.offline(run, source, results, deploy, unstored), unstored)
         else:
-            found = reports.posterior(run, report, *heldout.posterior(run, source, results, show))
+            found = reports.posterior(run, report, *heldout.posterior(run, source, results, show, unstored), unstored)
     answer = {"suite": suite, "deploy": rule, "what": str(source)}
     return dataclasses.replace(found, summary=answer | found.summary)
 

@@ -74,6 +74,7 @@ class Metrics:
         self._rows, self._events = folder / "metrics.jsonl", folder / "tensorboard"
         self._exporter = _Exporter(prometheus, folder.name) if prometheus else None
         with _writing(self._rows):
+            end_half_line(self._rows)
             self._file = self._rows.open("a", buffering=1)
         self._tensorboard: SummaryWriter | None = None
         if tensorboard:
@@ -111,6 +112,20 @@ class Metrics:
         if self._tensorboard is not None:
             with _writing(self._events):
                 self._tensorboard.close()
+
+
+def end_half_line(path: Path) -> None:
+    """Cut off a last line without its end, which a kill or a full disk leaves, so that the next row has a line of its own."""
+    if not path.is_file():
+        return
+    with path.open("r+b") as file:
+        end = at = file.seek(0, 2)
+        tail = b""
+        while at and b"\n" not in tail:
+            at = max(0, at - 4096)
+            file.seek(at)
+            tail = file.read(min(4096, end - at)) + tail
+        file.truncate(at + tail.rfind(b"\n") + 1)
 
 
 class _Exporter:

@@ -114,8 +114,8 @@ def test_a_learner_reports_a_full_disk_with_the_remedy_and_other_errors_with_a_t
     assert fails(errno.ENOSPC) == learner.FAILED
     event = json.loads(capfd.readouterr().out)
     assert event["event"] == "error" and "endpoint: could not be written" in event["text"] and "--resume" in event["text"]
-    with pytest.raises(OSError, match="Input/output error"):
-        fails(errno.EIO)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        fails(errno.EBADF)
 
 
 def test_resuming_does_not_rewrite_the_run_file(tmp_path):

@@ -128,6 +128,8 @@ def test_each_role_may_do_what_it_needs(certified):
         assert worker.has_subscribers(KEYS.monitor("trajectories/w0")) and not worker.has_subscribers(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
         eventually(lambda: worker.has_subscribers(KEYS.monitor("belief/w0")), OPEN_S)
+        learner.serve(KEYS.past, lambda query: query.reply(b"past of " + query.payload))
+        eventually(lambda: answered(monitor, KEYS.past, b"rounds") == b"past of rounds", OPEN_S)
         eventually(lambda: published(learner, KEYS.weights, b"T^1", weights), OPEN_S)
         eventually(lambda: alive == [("w0", True)], OPEN_S)
         assert (KEYS.monitor("trajectories/w0"), b"look") in received and b"T^1" in weights

@@ -11,13 +11,14 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.problems.checks import check_generators
+from icrl_dist.problems.continuous import renderer
 from icrl_dist.problems.continuous.network_adversary import Networks
+from icrl_dist.problems.continuous.renderer import mujoco
 from icrl_dist.problems.dmc.domains import AXES, HORIZON, Preset, check, problem, spec
 from icrl_dist.problems.dmc.suite import BROKEN, DOMAINS, Rows, check_step, observed, rendered
 from icrl_dist.types import Step, Task, Variation
@@ -25,9 +26,9 @@ from icrl_dist.types import Step, Task, Variation
 
 def suite_environment(kind: str) -> Any:
     """dm_control's environment of this problem, with the suite's parameters."""
-    os.environ.setdefault("MUJOCO_GL", "disabled")  # must be set before dm_control is imported, which looks for a display
-    from dm_control import suite
-
+    if not os.environ.get("MUJOCO_GL"):
+        os.environ["MUJOCO_GL"] = "disabled"  # must be set before dm_control is imported, which looks for a display
+    suite = renderer.imported("dm_control.suite")
     one = problem(kind)
     return suite.load(one.domain, one.task, task_kwargs={"random": np.random.RandomState(0)})
 
