@@ -22,9 +22,10 @@ from actors.weight_cache import WeightCache
 from icrl_dist import version as code
 from icrl_dist.collect import kinds
 from icrl_dist.config import plugins
-from icrl_dist.config.run import Run, parse
+from icrl_dist.config.run import ConfigError, Run, parse
 from icrl_dist.interfaces import Problem
 from icrl_dist.methods import registry as methods
+from icrl_dist.models.kernel import require_kernel
 from icrl_dist.problems import registry as problems
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.credit import CreditSender
@@ -74,6 +75,11 @@ class Worker:
         identity = {"version": icrl_dist.__version__, "code": code.digest(), "plugins": sources, "pid": os.getpid()}
         _, hello = self._request("hello", **identity)
         run = parse(read(messages.Welcome, hello, "hello").run, "the learner's run")
+        if run.context.decoder == "kernel":
+            try:
+                require_kernel()
+            except ConfigError as error:
+                raise Refused(str(error)) from None
         problem, method = problems.of(run), methods.of(run)
         weights = WeightCache(self._link, self._keys, method.build(problem.spec, run), run.stream.max_message_bytes)
         sender = CreditSender(self._link, self._keys.data, run.stream.credits, run.stream.reply_timeout_s)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 PACKAGES = ("icrl_dist", "actors", "learner")
-_SUFFIXES = (".py", ".toml")
+_SUFFIXES = (".c", ".py", ".toml")
 
 
 @functools.cache

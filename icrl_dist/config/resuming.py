@@ -29,6 +29,9 @@ digests are equal on machines of one kind only, and a resume on other hardware s
 timing).  The engine, the number of workers and the address of a cluster are no numbers of a run.
 """
 
+AUTO = ("context.decoder", "auto")
+"""The number, with the value by which a resumed run keeps the one that it began with."""
+
 
 class Difference(NamedTuple):
     """A number that two runs have with different values."""
@@ -40,7 +43,7 @@ class Difference(NamedTuple):
 
 
 def differences(before: Run, after: Run) -> list[Difference]:
-    """The numbers that decide a run's dataset and weights and that differ between two runs.
+    """The numbers that decide a run's dataset and weights and that differ between two runs, where ``after`` resumes ``before``.
 
     Of runs with different problems the problem is named, but not the sections that only one of them has.
     """
@@ -52,5 +55,5 @@ def differences(before: Run, after: Run) -> list[Difference]:
         elif type(old) is type(new):
             names = _fields(type(old)) - FREE.get(item.name, frozenset())
             pairs = [(f"{item.name}.{name}", getattr(old, name), getattr(new, name)) for name in sorted(names)]
-            found += [Difference(*pair) for pair in pairs if pair[1] != pair[2]]
+            found += [Difference(*pair) for pair in pairs if pair[1] != pair[2] and pair[::2] != AUTO]
     return found

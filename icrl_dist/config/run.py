@@ -237,6 +237,8 @@ def _from_tables(tables: dict[str, Any], source: str, written: bool = False) -> 
         raise ConfigError(f"{source}: {error}") from None
     if written and isinstance(problem, str):
         tables = former_names.translated(tables, names_of(kind), plugins.find("problems", problem))
+        if isinstance(context := tables.get("context", {}), dict):
+            tables = {**tables, "context": {"decoder": "torch", **context}}  # the only one of versions without the key
     else:
         former_names.check(tables, names_of(kind), problem, source)
     run = cast(Run, build(kind, tables, source))

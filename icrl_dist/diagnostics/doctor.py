@@ -29,6 +29,7 @@ from icrl_dist.diagnostics.modules import check_modules
 from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.diagnostics.surroundings import existing, writable
+from icrl_dist.models.kernel import kinds
 from icrl_dist.stream import endpoints
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
@@ -52,6 +53,7 @@ def diagnose(endpoint: str, folder: Path) -> list[Check]:
         _shared_memory(Path("/dev/shm")),
         _open_files(),
         check_ray_token(),
+        _decoder(),
         _gpu(),
     ]
 
@@ -158,6 +160,14 @@ def _open_files() -> Check:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     ok = True if soft >= 4096 or soft == resource.RLIM_INFINITY else None
     return Check("open files", ok, f"at most {soft} (hard limit {hard})", "" if ok else "ulimit -n 65536 before starting Ray")
+
+
+def _decoder() -> Check:
+    if kinds():
+        return Check("decoder", True, f"compiled, for {' and '.join(kinds())}")
+    return Check(
+        "decoder", None, "not compiled: torch decides, several times as slowly", "install a C compiler, then `make env`"
+    )
 
 
 def _gpu() -> Check:

@@ -10,6 +10,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from icrl_dist.launch import learner_process, run_folder
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
+from icrl_dist.models.kernel import best_decoder
 from icrl_dist.storage import layout
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.fork import fork
@@ -50,6 +52,14 @@ class TrainInterrupted(Exception):  # noqa: N818
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (str(self), self.resumable)
+
+
+def with_decoder(run: Run, folder: Path, resume: bool) -> Run:
+    """The run with its decoder named, where this was ``auto``: the best one here, or, to resume, that of the run there."""
+    if run.context.decoder != "auto":
+        return run
+    there = load_folder(folder).context.decoder if resume and (folder / "run.toml").is_file() else "auto"
+    return replace(run, context=replace(run.context, decoder=best_decoder(run.model) if there == "auto" else there))
 
 
 def prepare(

@@ -1,4 +1,4 @@
-"""What a deployed transformer does, whatever computes it: torch (``models.dpt``) or the kernel (``models.kernel_transformer``)."""
+"""A deployed transformer, computed by torch (``models.dpt``) or by the kernel (``models.kernel_transformer``)."""
 
 from __future__ import annotations
 

@@ -10,13 +10,20 @@ import ctypes
 import functools
 import importlib.util
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, Self
 
 import numpy as np
 from jaxtyping import Float32
 
+from icrl_dist.config.run import ConfigError
+from icrl_dist.config.sections import ModelConfig
+from icrl_dist.copies import CopiedWhole
+
 _LANES, _BLOCKS = 16, 8
 _CHUNK = _LANES * _BLOCKS
+WIDEST = 128
+"""The widest model for which the kernel is faster than torch in every case (docs/results/engine.md)."""
 _NEAR = 1 << 19
 """Bytes of contexts that are taken to stay in the processor's second-level cache from one decision to the next."""
 _KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",)}
@@ -57,7 +64,22 @@ def kinds() -> tuple[str, ...]:
     return () if library is None else _KINDS.get(platform.machine(), ())[: library.icrl_kinds()]
 
 
-class Kernel:
+def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
+    """What ``context.decoder = "auto"`` means here: the kernel if there is one and the model is not too wide."""
+    return "kernel" if kinds() and model.width <= WIDEST else "torch"
+
+
+def require_kernel() -> None:
+    """Raises ConfigError unless the kernel was built and this processor can run it."""
+    if not kinds():
+        why = "was not built" if _library() is None else "does not support this processor"
+        raise ConfigError(
+            f"context.decoder = 'kernel': the compiled decoder {why} on {platform.node()}: install a C compiler and run "
+            "`make env` there, or begin a run with context.decoder = 'torch', which has other digests"
+        )
+
+
+class Kernel(CopiedWhole):
     """The functions of the kernel for one instruction set; None: the widest of this processor.
 
     Raises RuntimeError if the kernel was not built or cannot be used here.
@@ -75,12 +97,17 @@ class Kernel:
         library.icrl_work.restype = ctypes.c_long
         self.work_size = library.icrl_work
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _kernel, (self.kind,)
+
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
         found = getattr(_library(), f"icrl_{name}_{self.kind}")
         found.argtypes, found.restype = arguments, None
         return found
 
-    def linear(self, x: Float32[np.ndarray, "R I"], weight: Float32[np.ndarray, "I C"], bias: Float32[np.ndarray, " C"]) -> np.ndarray:
+    def linear(
+        self, x: Float32[np.ndarray, "R I"], weight: Float32[np.ndarray, "I C"], bias: Float32[np.ndarray, " C"]
+    ) -> np.ndarray:
         """``x @ weight + bias``; each sum over I runs in order, beginning with the bias.  C is a multiple of 16."""
         x = np.ascontiguousarray(x, np.float32)
         to = np.empty((len(x), weight.shape[1]), np.float32)
@@ -91,6 +118,11 @@ class Kernel:
         """The softmax of the first n numbers of each row, in place; C is a multiple of 16."""
         self._softmax(address(x), x.shape[1], n, len(x))
         return x[:, :n]
+
+
+def _kernel(kind: str) -> Kernel:
+    """The kernel for this instruction set, or for one that this processor has: results are equal."""
+    return Kernel(kind if kind in kinds() else None)
 
 
 def address(array: np.ndarray) -> int:
@@ -105,14 +137,16 @@ def padded(array: np.ndarray) -> Float32[np.ndarray, "*N C"]:
     return np.ascontiguousarray(np.pad(np.asarray(array, np.float32), [(0, 0)] * (array.ndim - 1) + [(0, fill)]))
 
 
-class KernelDecoder:
+class KernelDecoder(CopiedWhole):
     """``models.decoder.Decoder`` through the kernel: B growing contexts, float32, one thread.
 
     ``weights``: those of ``models.gpt.GPT``, by their names there.  They are copied.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel) -> None:
-        self._kernel, self._batch, self._width = kernel, batch, len(weights["norm.weight"])
+        self._made_of = weights, heads, batch, kernel
+        self._batch, self._width = batch, len(weights["norm.weight"])
+        self._kernel = kernel
         self._kept: list[np.ndarray] = []
         """What the kernel has pointers to."""
         self._layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
@@ -127,6 +161,9 @@ class KernelDecoder:
         self._chunks: list[np.ndarray] = []
         self.length = 0
         """Tokens in each context."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _decoder, (*self._made_of, self._chunks, self.length)
 
     def _fill(self, layer: _Layer, block: Mapping[str, np.ndarray], heads: int) -> None:
         """The weights of one block, with W_k multiplied into the queries and W_v into the output projection.
@@ -169,13 +206,26 @@ class KernelDecoder:
             while len(self._chunks) * _CHUNK < tokens:
                 # Zeros, because lanes without a token are multiplied by a weight of 0.
                 self._chunks.append(np.zeros((self._layers, self._batch, _BLOCKS, self._width, _LANES), np.float32))
-            self._pointers = self._chunk_pointers(0)
-            self._decoder.chunks = self._pointers
-            self._decoder.far_away = sum(chunk.nbytes for chunk in self._chunks) > _NEAR
+            self._point_to_chunks()
+
+    def _point_to_chunks(self) -> None:
+        self._pointers = self._chunk_pointers(0)
+        self._decoder.chunks = self._pointers
+        self._decoder.far_away = sum(chunk.nbytes for chunk in self._chunks) > _NEAR
+
+    def filled(self, chunks: Sequence[np.ndarray], length: int) -> Self:
+        """This decoder with the contexts of another one."""
+        self._chunks, self.length = [np.array(chunk) for chunk in chunks], length
+        self._point_to_chunks()
+        return self
 
     def _chunk_pointers(self, row: int) -> ctypes.Array[ctypes.c_void_p]:
         """Pointers to the chunks, from context ``row`` on."""
-        places = [address(chunk) + layer * chunk.strides[0] + row * chunk.strides[1] for chunk in self._chunks for layer in range(self._layers)]
+        places = [
+            address(chunk) + layer * chunk.strides[0] + row * chunk.strides[1]
+            for chunk in self._chunks
+            for layer in range(self._layers)
+        ]
         return (ctypes.c_void_p * len(places))(*places)
 
     def append(self, x: Float32[np.ndarray, "B T D"]) -> None:
@@ -187,7 +237,9 @@ class KernelDecoder:
         """Final states of one query token per context, which sees its context and itself."""
         return self._pass(x[:, None], 0)
 
-    def window(self, x: Float32[np.ndarray, "B L D"], arrived: Float32[np.ndarray, "B D"] | None = None) -> Float32[np.ndarray, "B D"]:
+    def window(
+        self, x: Float32[np.ndarray, "B L D"], arrived: Float32[np.ndarray, "B D"] | None = None
+    ) -> Float32[np.ndarray, "B D"]:
         """Final state of the last token of one window per context.
 
         Each token of the window sees its context, the tokens before it in the window, and itself.  A
@@ -207,7 +259,9 @@ class KernelDecoder:
         self._kernel.run(self._address, address(x), address(states), self.length, x.shape[1], first, 0)
         return states
 
-    def query_row(self, row: int, x: Float32[np.ndarray, "Q D"], appended: Float32[np.ndarray, "E D"]) -> Float32[np.ndarray, "Q D"]:
+    def query_row(
+        self, row: int, x: Float32[np.ndarray, "Q D"], appended: Float32[np.ndarray, "E D"]
+    ) -> Float32[np.ndarray, "Q D"]:
         """Final states of Q query tokens, each of which sees the whole of context ``row`` and itself.
 
         They also see the ``appended`` tokens, as if these had joined the context.  The decoder does not change.
@@ -221,3 +275,10 @@ class KernelDecoder:
         self._kernel.run(at, address(appended), address(states), self.length, new, new, 0)
         self._kernel.run(at, address(x), address(states), self.length + new, queries, 0, 1)
         return states
+
+
+def _decoder(
+    weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel, chunks: Sequence[np.ndarray], length: int
+) -> KernelDecoder:
+    """A copy: see ``KernelDecoder.__reduce__``."""
+    return KernelDecoder(weights, heads, batch, kernel).filled(chunks, length)

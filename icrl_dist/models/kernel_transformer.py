@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.special import ndtri
 
 from icrl_dist.config.sections import ModelConfig
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.deployed import Columns, WindowColumns
 from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
 from icrl_dist.models.sampling import sample
 from icrl_dist.types import Spec
 
-if TYPE_CHECKING:
-    from icrl_dist.models.dpt import PretrainedTransformer
-
-WIDEST = 128
-"""The widest model for the kernel: at 256 torch's products are faster (docs/results/engine.md)."""
 FLOOR = 0.05
 """Smallest standard deviation of a Gaussian, as in ``models.heads``."""
 
 
-def usable(model: PretrainedTransformer) -> bool:
-    """Whether the kernel is meant for this model: on a CPU, and not wider than ``WIDEST``."""
-    return model.low.device.type == "cpu" and model.config.width <= WIDEST
-
-
-class KernelTransformer:
+class KernelTransformer(CopiedWhole):
     """``models.deployed.Deployed`` by the kernel.
 
     Every sum over inputs, tokens or actions runs in the kernel and in its order, so the outputs for discrete actions
@@ -42,7 +32,7 @@ class KernelTransformer:
     ) -> None:
         """``weights``: by their names in a checkpoint, without ``model/``."""
         self._spec, self._config, self._kernel = spec, config, kernel or Kernel()
-        trunk = {name.removeprefix("trunk."): value for name, value in weights.items() if name.startswith("trunk.")}
+        trunk = {name.removeprefix("trunk."): np.array(value) for name, value in weights.items() if name.startswith("trunk.")}
         self._decoder = KernelDecoder(trunk, config.heads, batch, self._kernel)
         low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         self._scale, self._shift = 2 / (high - low), -(high + low) / (high - low)

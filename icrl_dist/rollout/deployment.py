@@ -12,8 +12,8 @@ from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.deployed import Columns, Deployed, WindowColumns
 from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer
-from icrl_dist.models.kernel import kinds
-from icrl_dist.models.kernel_transformer import KernelTransformer, usable
+from icrl_dist.models.kernel import best_decoder, require_kernel
+from icrl_dist.models.kernel_transformer import KernelTransformer
 from icrl_dist.models.weights import weights_of
 
 
@@ -176,20 +176,16 @@ class CommittedPolicy(InContextPolicy):
 
 
 def deployed(model: PretrainedTransformer, batch: int, decoder: Decoder = "auto") -> Deployed:
-    """The transformer deployed in B environments by this decoder; ``auto``: the kernel where it can be used, else torch.
+    """The transformer deployed in B environments by this decoder (``config.ContextConfig``); on a GPU by torch.
 
-    The kernel is for models of at most ``kernel_transformer.WIDEST`` on a CPU; others are deployed by torch.  Raises
-    ConfigError for ``kernel`` where this installation has none.
+    Raises ConfigError for ``kernel`` where this installation has none.
     """
-    if decoder != "torch" and usable(model):
-        if kinds():
-            return KernelTransformer(model.spec, model.config, weights_of(model), batch)
-        if decoder == "kernel":
-            raise ConfigError(
-                "context.decoder = 'kernel': this installation has no compiled decoder for this processor; install a C compiler "
-                "and run `make env` again, or choose 'torch', which gives other digests"
-            )
-    return DeployedTransformer(model, batch)
+    if decoder == "auto":
+        decoder = best_decoder(model.config)
+    if decoder == "torch" or model.low.device.type != "cpu":
+        return DeployedTransformer(model, batch)
+    require_kernel()
+    return KernelTransformer(model.spec, model.config, weights_of(model), batch)
 
 
 _RULES: dict[Deployment, type[InContextPolicy]] = {"paper": InContextPolicy, "committed": CommittedPolicy}

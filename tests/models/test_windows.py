@@ -45,7 +45,9 @@ def test_a_change_in_a_window_changes_later_outputs_and_no_earlier_one(column, a
 @torch.no_grad()
 @pytest.mark.parametrize("heads", [1, 2])
 @pytest.mark.parametrize("together", [set(), {0, 7}, {9, 10}], ids=str)
-def test_a_context_that_grows_step_by_step_gives_the_outputs_of_training(heads, together, deploy: Deploy):
+def test_a_context_that_grows_step_by_step_gives_the_outputs_of_training(
+    heads: int, together: set[int], deploy: Deploy
+) -> None:
     """Transitions arrive with a decision, or several at once (``together``)."""
     model, whole, of = build(SPEC, heads), transitions(), part(windows(), slice(None), slice(0, 1))
     deployed, t = deploy(model, B), 0
