@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import logging
 import os
 import signal
 import socket
@@ -24,6 +23,7 @@ from icrl_dist.storage.files import StoreError, explained
 from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry.logs import log_to
 from learner.service import Interrupted, RunFailed, Service
 
 DONE, FAILED, BAD_CONFIG, INTERRUPTED = 0, 1, 2, 130
@@ -37,7 +37,7 @@ def main() -> int:
         "--endpoint", required=True, help="address to listen on, such as tcp/127.0.0.1:7447; port 0 chooses a free port"
     )
     arguments = parser.parse_args()
-    logging.basicConfig(filename=arguments.folder / "learner.log", level=logging.INFO, format="%(asctime)s %(message)s")
+    log_to(arguments.folder / "learner.log")
     lock = threading.Lock()
 
     def report(event: dict[str, Any]) -> None:

@@ -42,6 +42,11 @@ class Fitting:
         self.version = checkpoint.newest_version(folder)
         """The newest policy version that was fitted; -1 before the first."""
 
+    @property
+    def steps_done(self) -> int:
+        """Optimizer steps of the next version that are done."""
+        return self._steps_done
+
     def resume(self) -> Weights | None:
         """Load the newest version, and the unfinished fit of the next one if there is one.
 

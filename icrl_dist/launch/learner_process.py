@@ -16,6 +16,7 @@ from typing import Any
 
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
+from icrl_dist.telemetry.logs import bound, stamp
 
 
 class TrainFailed(RuntimeError):  # noqa: N818
@@ -48,6 +49,8 @@ class LearnerProcess:
     def _start(self) -> None:
         command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
         self._log = (self._folder / "learner.err").open("ab")
+        self._log.write(f"{stamp()} the learner starts\n".encode())
+        self._log.flush()
         pipe = subprocess.PIPE
         environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}  # idle torch threads sleep: decision 073
         self._process = subprocess.Popen(
@@ -98,6 +101,7 @@ class LearnerProcess:
         Raises ConfigError or TrainFailed with the learner's message if it ended with an error, and
         TrainFailed if it was killed more often than ``learner.restarts``.
         """
+        bound(self._folder / "learner.err")
         code = self._process.poll()
         if code is None or self._finished:
             return

@@ -110,6 +110,7 @@ def train(
         result |= {"folder": str(folder), "seconds": round(time.monotonic() - started, 1)}
         result = _final_result(folder, result, evaluation.summary)
         write_json(folder / "result.json", result)
+        _record_heldout(settings, folder, evaluation, show)
     return TrainResult(folder, result, evaluation)
 
 
@@ -151,6 +152,12 @@ def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
         heldout.save_calibrated(folder, show)
         frame = heldout.online(run, folder, folder / "results", show)
     return reports.online(run, folder / "report" / heldout.report_name(run, folder), frame)
+
+
+def _record_heldout(run: Run, folder: Path, evaluation: Evaluation, show: ReportEvent) -> None:
+    from icrl_dist.launch import heldout_metrics  # it imports torch
+
+    heldout_metrics.record(run, folder, evaluation.summary, show)
 
 
 def _interrupted(folder: Path, transaction: FolderTransaction) -> launch.TrainInterrupted:
