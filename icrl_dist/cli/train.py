@@ -7,13 +7,16 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK
 from icrl_dist.config.run import Run, override, run_type
+
+if TYPE_CHECKING:
+    from icrl_dist.results.reports import Evaluation
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
         console.print(f"interrupted; {text}", highlight=False, markup=False, soft_wrap=True)
         return INTERRUPTED
     result = made.result
-    console.print(made.evaluation)
+    _print_evaluation(made.evaluation, console)
     console.print(
         f"dataset {result['dataset_digest'][:16]}  weights {result['weights_digest'][:16]}  {result['trajectories']} "
         f"trajectories, {result['seconds']:.0f} s, run folder {made.folder}",
@@ -93,6 +96,18 @@ def train(arguments: TrainArguments, console: Console) -> int:
     if arguments.json:
         print(json.dumps(result))
     return FAILED if made.quarantined else OK
+
+
+def _print_evaluation(evaluation: Evaluation, console: Console) -> None:
+    """The held-out returns in four rows with a conclusion; everything about experts."""
+    from icrl_dist.results import conclusion
+
+    if set(evaluation.rows["suite"]) != {"online"}:
+        console.print(evaluation)
+        return
+    console.print(conclusion.table(evaluation.rows, "Held-out tasks"))
+    for line in (conclusion.sentence(evaluation.rows), *evaluation.notes):
+        console.print(line, highlight=False, markup=False)
 
 
 def _resume_command(given: Sequence[str]) -> str:

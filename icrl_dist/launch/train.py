@@ -19,7 +19,7 @@ from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
 from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.signals import on_signals
 from icrl_dist.diagnostics.ray_token import require_ray_token
-from icrl_dist.launch import learner_process, run_folder
+from icrl_dist.launch import learner_process, run_folder, watching
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
 from icrl_dist.storage.files import atomic_write
@@ -216,6 +216,7 @@ def train_ray(
                 if event["event"] == "listening" and not started:
                     fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
+                    report({"event": "note", "text": watching.hint(run.stream, folder, learner.endpoint)})
                 elif event["event"] == "progress":
                     stored = event["trajectories"]
                 elif event["event"] in ("quarantine", "released"):
