@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from icrl_dist.results import conclusion
+from icrl_dist.results import conclusion, tables
 from tests.results.row_blocks import block, cells_of, frame, rendered
 
 RNG = np.random.default_rng(0)
@@ -65,3 +65,22 @@ def test_the_table_fits_into_80_columns(width):
     output = io.StringIO()
     Console(file=output, width=width).print(conclusion.table(frame(*agents(1000.0)), "Held-out tasks"))
     assert all(len(line.rstrip()) <= 80 for line in output.getvalue().splitlines()[2:]) and "…" not in output.getvalue()
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+def test_no_cell_of_a_table_is_cut(width):
+    found = frame(
+        *(block(np.full((2, 3, 40), 1234.5), agent, 0.2, ceiling=agent == "oracle") for agent in ("t1", "t0", "oracle"))
+    )
+    for table in (
+        tables.returns_table(found, "Return"),
+        tables.compare(found, found, names=["the first method", "the second method"]),
+    ):
+        output = io.StringIO()
+        Console(file=output, width=width).print(table)
+        lines = output.getvalue().splitlines()
+        assert "…" not in output.getvalue() and all(len(line) <= width for line in lines)
+    output = io.StringIO()
+    Console(file=output, width=width).print(tables.returns_table(found, "Return"))
+    (header,) = [line for line in output.getvalue().splitlines() if line.startswith("┃") and "agent" in line]
+    assert ("ep 30" in header) == (width >= 120) and "ep 1 " in header and "1234.5" in output.getvalue()
