@@ -33,8 +33,9 @@ class ExpectedNodes:
 
 def expected(bootstrap: Path | None = None) -> ExpectedNodes:
     """Read the cluster file that this head node was started with; no nodes if there is none."""
-    file = (bootstrap or BOOTSTRAP).expanduser()
+    file = bootstrap or BOOTSTRAP
     try:
+        file = file.expanduser()
         config = yaml.safe_load(file.read_text())
         provider = config["provider"]
         if provider.get("type") == "local":
@@ -43,7 +44,7 @@ def expected(bootstrap: Path | None = None) -> ExpectedNodes:
         kinds = config.get("available_node_types") or {}
         head = config.get("head_node_type")
         return ExpectedNodes((), sum(int(kind.get("min_workers") or 0) for name, kind in kinds.items() if name != head))
-    except FileNotFoundError:
+    except (FileNotFoundError, RuntimeError):  # or this user has no home folder
         return ExpectedNodes()
     except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError) as error:
         _log.warning("%s is not a cluster file: %s", file, error)

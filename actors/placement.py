@@ -9,12 +9,21 @@ from typing import Any
 
 from icrl_dist.config.run import ConfigError
 
+LOCAL_ACTORS = 2
+"""Number of workers without a cluster, on a machine with enough cores."""
+
+
+def local_actors() -> int:
+    """The default number of workers on this machine: ``LOCAL_ACTORS``, or 1 if this process may use a single core."""
+    return min(LOCAL_ACTORS, len(os.sched_getaffinity(0)))
+
 
 def check_cores(actors: int) -> None:
     """Raises ConfigError if this machine has fewer than ``actors`` cores: Ray would never start the remaining workers."""
     cores = len(os.sched_getaffinity(0))
     if actors > cores:
-        raise ConfigError(f"--actors {actors}: this machine has {cores} cores; ask for at most {cores}")
+        have = "1 core" if cores == 1 else f"{cores} cores"
+        raise ConfigError(f"--actors {actors}: this machine has {have} for this process; ask for at most {cores}")
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""A router for the workers of one node: ``python -m actors.router``.
+"""A router for the workers of one node: ``python -P -m actors.router``.
 
 The workers connect to the router, and only the router connects to the learner.  In clusters of hundreds
 of workers the learner then has one connection per node, not one per worker.  The environment variable
@@ -58,7 +58,7 @@ def _check_loopback(endpoint: str, name: str) -> None:
 
 def main() -> int:
     """Run a router until SIGINT or SIGTERM; returns exit code 2 and prints one line if it cannot start."""
-    parser = argparse.ArgumentParser(prog="python -m actors.router", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -P -m actors.router", description=__doc__)
     parser.add_argument("--connect", required=True, help="address of the learner, such as tls/HEAD:7447")
     parser.add_argument("--listen", default="tcp/127.0.0.1:7448", help="loopback address on which the router listens")
     parser.add_argument("--certificates", default="", help="folder with ca.pem, worker.pem and worker.key")

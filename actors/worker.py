@@ -22,12 +22,13 @@ from actors.weight_cache import WeightCache
 from icrl_dist import version as code
 from icrl_dist.collect import kinds
 from icrl_dist.config import plugins
-from icrl_dist.config.run import parse
+from icrl_dist.config.run import Run, parse
 from icrl_dist.interfaces import Problem
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.credit import CreditSender
+from icrl_dist.stream.excerpts import plain
 from icrl_dist.stream.link import Link, LinkError, Refused, StreamKeys, Unanswered
 from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
@@ -35,6 +36,8 @@ from icrl_dist.types import Identity, Job, Payload, Trajectory
 
 _log = logging.getLogger(__name__)
 
+_ENVELOPE = 64
+"""Bytes, at most, that a request adds to a single trajectory."""
 HEARTBEAT_S = 0.5
 """Seconds between heartbeats."""
 
@@ -90,7 +93,7 @@ class Worker:
                         continue
                     paused = _PausedWatchdog(weights, watchdog)
                     work = functools.partial(kinds.do, job, problem, method, paused, self.name, self._report, beliefs)
-                    self._do(job, work, lease.deadline_s, sender, watchdog, run.stream.lease_s)
+                    self._do(job, work, lease.deadline_s, sender, watchdog, run)
 
     def _decode(self, lease: messages.LeasedJob, problem: Problem) -> Job | None:
         """The leased job; None if it cannot be decoded, which is reported to the learner as a failure of the job."""
@@ -109,9 +112,10 @@ class Worker:
         deadline_s: float,
         sender: CreditSender,
         watchdog: Watchdog,
-        drain_s: float,
+        run: Run,
     ) -> None:
         """Do a job, each trajectory within ``deadline_s``, not counting the time in which it waits for the learner."""
+        drain_s, largest = run.stream.lease_s, run.stream.max_message_bytes
         self._job, self._policy_version = job.label, job.policy_version
         made: set[Identity] = set()
         try:
@@ -120,7 +124,7 @@ class Worker:
                 made.add(trajectory.identity)
                 self._episodes += 1
                 self._steps += len(trajectory.actions)
-                sender.send(wire.encode_trajectory(trajectory))
+                sender.send(_encoded(trajectory, largest))
                 self._publisher.publish(trajectory)
             self._publisher.flush()
             sender.drain(timeout_s=drain_s)
@@ -141,6 +145,7 @@ class Worker:
 
     def _report(self, text: str, note: bool = False, reached: int = 0) -> None:
         """Send a note to the learner at once; other texts are part of the next heartbeat."""
+        text = plain(text, messages.LINE)
         if note:
             self._request("note", text=text)
         else:
@@ -205,6 +210,15 @@ class Worker:
 
 def _read_payload(problem: Problem, kind: str, data: Any) -> Payload:
     return kinds.read_payload(kind, problem, data)
+
+
+def _encoded(trajectory: Trajectory, largest: int) -> bytes:
+    """The trajectory as a message.  Raises WireError if it is larger than the learner accepts."""
+    payload = wire.encode_trajectory(trajectory)
+    if len(payload) + _ENVELOPE > largest:
+        detail = f"{trajectory.identity} has {len(payload)} bytes: raise stream.max_message_bytes = {largest}"
+        raise wire.WireError("oversized", detail)
+    return payload
 
 
 class _PausedWatchdog:

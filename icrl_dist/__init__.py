@@ -88,11 +88,22 @@ _MODULES = {
     "Variation": "icrl_dist.types",
 }
 
+_COMPUTE = ("InContextAgent", "evaluate", "load_agent")
+"""Names whose modules import torch, and that compute in this process; ``train`` imports torch when it needs it."""
+
 
 def __getattr__(name: str) -> object:
     """Import a public name at its first use, because most commands need no torch."""
     if name == "oracle":
         return importlib.import_module("icrl_dist.problems.darkroom.solver")
     if name in _MODULES:
-        return getattr(importlib.import_module(_MODULES[name]), name)
+        if name in _COMPUTE:
+            importlib.import_module("icrl_dist.telemetry.processes").import_torch()
+        try:
+            return getattr(importlib.import_module(_MODULES[name]), name)
+        except ImportError as error:
+            modules = importlib.import_module("icrl_dist.diagnostics.modules")
+            for package, file in modules.hidden_packages().items():
+                raise ImportError(f"{file} hides the package {package!r}, a part of icrl-dist: rename that file") from error
+            raise
     raise AttributeError(f"module 'icrl_dist' has no attribute {name!r}")

@@ -96,12 +96,18 @@ class Reporter:
         self._metrics.write(version, "version", loss=loss, seconds=seconds)
         self.log("version", f"T^{version} is fitted: loss {loss:.3f}, {seconds:.0f} s", version=version)
 
+    def diverged(self, text: str) -> None:
+        """Report as an alert that a fit diverged; the run ends."""
+        self._report({"event": "alert", "text": f"ALERT: {text}"})
+        self._rows.append((time.time(), "alert", {"what": "diverged", "active": True, "text": text}))
+        self._publish("event", "event", what="alert", alert="diverged", active=True, text=text)
+
     def labels_rated(self, round: int, quality: LabelQuality) -> None:
         """Report the quality of a round's self-made labels."""
         fields = dataclasses.asdict(quality)
         self._metrics.write(round, "labels", **fields)
         optimal = f"{quality.agreement:.0%} optimal"
-        text = f"labels of round {round}: {optimal}; return {quality.label_return:.1f} in the labeling trials"
+        text = f"labels of adapt/{round}: {optimal}; return {quality.label_return:.1f} in the labeling trials"
         self._report({"event": "labels", "round": round, **fields})
         self.log("labels", text)
         with self._lock:

@@ -247,11 +247,14 @@ class LeaseScheduler:
         self._lost_with_node.add(worker)
         self._take_back_death(worker)
 
-    def job_failed(self, worker: str, name: tuple[str, int, int, int], cause: str) -> None:
-        """Record that the worker's job raised; a report about a job that it does not hold is ignored."""
+    def job_failed(self, worker: str, name: tuple[str, int, int, int], cause: str) -> bool:
+        """Record that the worker's job raised; returns False, and does nothing, if the worker does not hold this job."""
         state = self._held.get(worker)
-        if state is not None and state.job.name == name and self._release(worker):
+        if state is None or state.job.name != name:
+            return False
+        if self._release(worker):
             self._count_failure(state, cause)
+        return True
 
     def _state(self, identity: Identity) -> _JobState | None:
         phase = self._phases.get((identity.stage, identity.round))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -14,11 +15,17 @@ from icrl_dist.config import plugins
 from icrl_dist.config.run import Run, dumps
 from icrl_dist.stream import messages, wire
 from icrl_dist.stream.dispatch import Dispatcher
+from icrl_dist.stream.excerpts import plain, show
 from icrl_dist.stream.link import Link, Query, StreamKeys
+from icrl_dist.stream.schema import as_data
 from icrl_dist.stream.validation import read
 from icrl_dist.telemetry import crash_reports
+from icrl_dist.telemetry.budget import Budget
 from icrl_dist.types import Job
+from learner.known_workers import MAX_WORKERS, KnownWorkers
 from learner.scheduler import LeaseScheduler
+
+_log = logging.getLogger(__name__)
 
 MAX_QUARANTINED = 8
 """The run ends if a phase has this many quarantined variations and no stored trajectory: no single variation is the cause."""
@@ -29,7 +36,8 @@ _STACKS_DELAY_S = 0.3
 _LINES = 60
 """Lines of a worker's stacks in its crash record; the newest call of the first thread comes first."""
 
-_COUNTS = ("episodes", "steps", "resent", "trajectories", "waited_s")
+_REPORTS, _REPORTS_PER_S = MAX_WORKERS, 5.0
+"""Lines about workers at once, and a second after them: a worker can cause any number of them."""
 
 
 class WorkerAPI:
@@ -54,44 +62,16 @@ class WorkerAPI:
         """
         self._run, self._scheduler, self._lock, self._report, self._fail = run, scheduler, lock, report, fail
         self._folder, self._policy_version = folder, policy_version
-        self.workers: dict[str, bool] = {}
-        """Whether each worker that has ever connected is alive."""
-        self.counters: dict[str, dict[str, Any]] = {}
-        """The newest counters of each worker: episodes, steps, resent, memory_mb and so on."""
-        self._last_message: dict[str, float] = {}
+        self.known = KnownWorkers()
         self._jobs: dict[str, Job] = {}
         self._reported: set[tuple[str, int, int, int]] = set()
         self._finished = threading.Event()
+        self._closed = False
+        self._budget, self._budget_lock = Budget(_REPORTS, _REPORTS_PER_S), threading.Lock()
         self._delayed = Dispatcher("crash records")
         link.serve(keys.work, self._on_request)
-        link.subscribe(keys.heartbeats, lambda _, payload: self._on_heartbeat(payload))
+        link.subscribe(keys.heartbeats, self._on_heartbeat)
         link.watch(keys.alive_all, self._on_liveliness)
-
-    @property
-    def resent(self) -> int:
-        """How often trajectories were sent again, by all workers so far."""
-        return sum(counters["resent"] for counters in list(self.counters.values()))
-
-    @property
-    def totals(self) -> dict[str, Any]:
-        """Sums of the counters of all workers, and by worker the seconds waited and the seconds since its last message."""
-        now, counters = time.monotonic(), list(self.counters.values())
-        connected = [worker for worker, alive in list(self.workers.items()) if alive and worker in self.counters]
-        return {
-            "episodes": sum(one["episodes"] for one in counters),
-            "acknowledged": sum(one["trajectories"] for one in counters),
-            "resent": self.resent,
-            "waited_s": sum(one["waited_s"] for one in counters),
-            "waited": {worker: self.counters[worker]["waited_s"] for worker in connected},
-            "silent": {worker: now - last for worker, last in list(self._last_message.items())},
-        }
-
-    @property
-    def long_work(self) -> list[str]:
-        """What each connected worker reports about a job with a long time before its first trajectory."""
-        connected = [worker for worker, alive in sorted(self.workers.items()) if alive]
-        texts = (str(self.counters.get(worker, {}).get("doing", "")) for worker in connected)
-        return [f"{worker}: {text[:100]}" for worker, text in zip(connected, texts, strict=True) if text]
 
     def finish(self) -> None:
         """Answer every worker that asks for a job with "stop" from now on."""
@@ -100,7 +80,7 @@ class WorkerAPI:
     def wait_until_gone(self, timeout_s: float = 3.0) -> None:
         """Wait after ``finish`` until every worker has ended, at most ``timeout_s``; remove empty stacks files."""
         deadline = time.monotonic() + timeout_s
-        while any(self.workers.values()) and time.monotonic() < deadline:
+        while any(self.known.alive.values()) and time.monotonic() < deadline:
             time.sleep(0.02)
         crash_reports.sweep(self._folder)
 
@@ -118,24 +98,39 @@ class WorkerAPI:
             self._report({"event": "released", "identity": name, "text": text})
 
     def close(self) -> None:
-        """Write no more crash records; the link stays open."""
+        """Write no more crash records, and report no more workers that end; the link stays open."""
+        self._closed = True
         self._delayed.close()
 
+    def _report_of_worker(self, event: dict[str, Any]) -> None:
+        """Report an event that a worker caused; ``_REPORTS`` limits them."""
+        with self._budget_lock:
+            if not self._budget.allows():
+                return
+            event["text"] += self._budget.note()
+        self._report(event)
+
     def _on_liveliness(self, worker: str, alive: bool) -> None:
-        if alive:
+        if self._closed:
+            return
+        with self._lock:
+            known = messages.is_name(worker) and (self.known.admit(worker, self._jobs) if alive else worker in self.known.alive)
+        if not known:
+            _log.warning("the liveliness token %s is ignored: %d workers are known", show(worker), len(self.known.alive))
+        elif alive:
             self._connected(worker)
         else:
             self._disconnected(worker)
 
     def _connected(self, worker: str) -> None:
         with self._lock:
-            again = self.workers.get(worker) is False
-            self.workers[worker] = True
+            again = self.known.alive.get(worker) is False
+            self.known.alive[worker] = True
             replaced = crash_reports.predecessor(worker) or ""
-            self._last_message.pop(replaced, None)  # this worker has been replaced, so its silence is no alert
+            self.known.last_message.pop(replaced, None)  # this worker has been replaced, so its silence is no alert
             self._scheduler.worker_back(worker)
         text = f"worker {worker} {'is back' if again else 'joined'}"
-        self._report({"event": "worker", "worker": worker, "alive": True, "text": text})
+        self._report_of_worker({"event": "worker", "worker": worker, "alive": True, "text": text})
 
     def _disconnected(self, worker: str) -> None:
         crashed = not self._finished.is_set()
@@ -143,20 +138,20 @@ class WorkerAPI:
         if crashed and (stacks := self._stacks(worker)):
             cause += f": {stacks[0]}"
         with self._lock:
-            self.workers[worker] = False
+            self.known.alive[worker] = False
             job = self._jobs.pop(worker, None)
             freed = self._scheduler.worker_lost(worker, time.monotonic(), cause)
         text = f"worker {worker} is gone"
         if freed:
             text += "; its job will be leased again: " + ", ".join(job.label for job in freed)
-        self._report({"event": "worker", "worker": worker, "alive": False, "text": text})
+        self._report_of_worker({"event": "worker", "worker": worker, "alive": False, "text": text})
         if crashed:
             self._delayed.post(lambda: self._record_end(worker, job), _STACKS_DELAY_S)
         self._report_quarantines()
 
     def _record_end(self, worker: str, job: Job | None) -> None:
         """Write the crash record of a worker that ended without a report: it was killed, crashed in C, or was stuck."""
-        if self.workers[worker]:
+        if self.known.alive.get(worker):
             return  # it was disconnected and is connected again
         stacks = self._stacks(worker)
         record = {
@@ -165,7 +160,7 @@ class WorkerAPI:
             "time": time.time(),
             "job": job.label if job else "",
             "seed": self._run.seed,
-            "last_heartbeat": self.counters.get(worker, {}),
+            "last_heartbeat": self.known.counters.get(worker, {}),
             "stacks": stacks,
         }
         cause = stacks[0] if stacks else "no stacks were written: it was killed or disconnected"
@@ -175,7 +170,7 @@ class WorkerAPI:
         """The first lines that the worker's watchdog wrote; empty if it wrote nothing."""
         try:
             with crash_reports.stacks_of(self._folder, worker).open(errors="replace") as file:
-                return [line.rstrip() for line, _ in zip(file, range(_LINES), strict=False)]
+                return [plain(line.rstrip(), messages.LINE) for line, _ in zip(file, range(_LINES), strict=False)]
         except FileNotFoundError:
             return []
 
@@ -184,7 +179,7 @@ class WorkerAPI:
             text += f"; {crash_reports.write(self._folder, record)}"
         except OSError as error:
             text += f"; its crash record cannot be written: {error}"
-        self._report({"event": "crash", "worker": record["worker"], "text": text})
+        self._report_of_worker({"event": "crash", "worker": record["worker"], "text": text})
 
     def _report_quarantines(self) -> None:
         with self._lock:
@@ -207,34 +202,33 @@ class WorkerAPI:
         arrived, expected = self._scheduler.progress(stage, round_)
         return not arrived and (not expected or len(self._scheduler.quarantine_causes(stage, round_)) >= MAX_QUARANTINED)
 
-    def _on_heartbeat(self, payload: bytes) -> None:
-        kind, fields = wire.decode_message(payload)
-        if kind == "worker":
-            self._update_counters(fields)
+    def _on_heartbeat(self, key: str, payload: bytes) -> None:
+        try:
+            kind, fields = wire.decode_message(payload)
+            if kind == "worker" and fields.get("worker") == key.rpartition("/")[2]:
+                self._count(read(messages.Progress, fields, "heartbeat"), fields)
+        except wire.WireError as error:
+            _log.warning("a heartbeat is ignored: %s", str(error))  # the error itself would keep the message
 
-    def _update_counters(self, fields: dict[str, Any]) -> None:
-        """Keep a worker's newest counters; they never decrease, because heartbeats may arrive late."""
-        progress = read(messages.Progress, fields, "progress")
-        worker = progress.worker
+    def _count(self, progress: messages.Progress, fields: dict[str, Any]) -> None:
         with self._lock:
-            before = self.counters.get(worker, {})
-            counts = {name: max(getattr(progress, name), before.get(name, 0)) for name in _COUNTS}
-            self.counters[worker] = {**before, **fields, **counts}
-            self._last_message[worker] = time.monotonic()
-            self._scheduler.reached(worker, progress.job, progress.reached)
+            if not self.known.admit(progress.worker, self._jobs):
+                raise wire.WireError("schema", f"{MAX_WORKERS} workers are known, the limit: end some")
+            self.known.count(progress, fields)
+            self._scheduler.reached(progress.worker, progress.job, progress.reached)
 
     def _on_request(self, query: Query) -> None:
         try:
-            kind, fields = wire.decode_message(query.payload, self._run.stream.max_message_bytes)
+            kind, fields = wire.decode_message(query.payload)
             query.reply(self._answer(kind, fields))
         except wire.WireError as error:
             query.refuse(f"schema: {error.detail}")
-        except (KeyError, TypeError, ValueError) as error:
+        except ValueError as error:
             query.refuse(f"schema: {error}")
 
     def _answer(self, kind: str, fields: dict[str, Any]) -> bytes:
         if kind not in messages.REQUESTS:
-            raise ValueError(f"message kind {kind!r} is not known; use hello, ask, failed or note")
+            raise ValueError(f"message kind {show(kind)} is not known; use hello, ask, failed or note")
         request: Any = read(messages.REQUESTS[kind], fields, kind)
         worker = request.worker
         match request:
@@ -242,12 +236,12 @@ class WorkerAPI:
                 self._require_same_code(request)
                 return wire.encode_message("hello", run=dumps(self._run))
             case messages.Progress():
-                self._update_counters(fields)
+                self._count(request, fields)
                 return self._lease(worker)
             case messages.Failed():
                 self._failed(worker, request.job, request.record, request.file)
             case messages.Note():
-                self._report({"event": "note", "text": f"worker {worker}: {request.text[:200]}"})
+                self._report_of_worker({"event": "note", "text": f"worker {worker}: {plain(request.text)}"})
         return wire.encode_message("noted")
 
     def _require_same_code(self, hello: messages.Hello) -> None:
@@ -282,13 +276,18 @@ class WorkerAPI:
         job = lease.job
         return wire.encode_message("job", name=list(job.name), job=wire.encode_job(job), deadline_s=lease.deadline_s)
 
-    def _failed(self, worker: str, name: tuple[str, int, int, int], record: dict[str, Any], file: str) -> None:
+    def _failed(self, worker: str, name: tuple[str, int, int, int], record: messages.CrashRecord, file: str) -> None:
+        """Record the failure of a job that the worker holds; a report about another job changes nothing."""
+        cause = plain(record.exception, messages.LINE)
         with self._lock:
-            self._scheduler.job_failed(worker, name, str(record["exception"]))
-        text = f"worker {worker}: job {record['job']} failed: {record['exception']}"
-        kept = crash_reports.folder_of(self._folder) / Path(file).name
+            if not self._scheduler.job_failed(worker, name, cause):
+                return
+            self._jobs.pop(worker, None)
+        text = f"worker {worker}: job {plain(record.job)} failed: {cause}"
+        kept = crash_reports.folder_of(self._folder) / file
         if file and kept.is_file():
-            self._report({"event": "crash", "worker": worker, "text": f"{text}; {kept}"})
+            self._report_of_worker({"event": "crash", "worker": worker, "text": f"{text}; {kept}"})
         else:
-            self._record({**record, "worker": Path(worker).name}, text)
+            known = {name: value for name, value in as_data(record).items() if value is not None}
+            self._record({**known, "worker": worker}, text)
         self._report_quarantines()

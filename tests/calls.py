@@ -24,3 +24,12 @@ def keeping(results: list[Any], real: Callable[..., Any]) -> Callable[..., Any]:
         return results[-1]
 
     return call
+
+
+def failing(error: BaseException | type[BaseException]) -> Callable[..., Any]:
+    """A function that raises this error at each call."""
+
+    def call(*arguments: Any, **more: Any) -> Any:
+        raise error
+
+    return call

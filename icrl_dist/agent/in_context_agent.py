@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import threading
 from typing import Any
 
 import numpy as np
@@ -11,19 +10,26 @@ import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from icrl_dist import arrays
 from icrl_dist.agent.ood_score import Surprise
+from icrl_dist.agent.threads import torch_threads, whole_or_none
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.outcome_readout import OutcomeModel
 
 
-class InContextAgent:
+class InContextAgent(CopiedWhole):
     """T_theta deployed in B environments at once, without weight updates.
 
     ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` records the transition.  With the deployment
     rule ``paper`` (Algorithm 1) transitions join the context D_on at the end of the episode; with
     ``committed``, the default for a model trained on action windows, they join it at once.
+
+    Arguments may be arrays, lists or torch tensors; they are copied, and so is what a method returns.  A copy
+    (``copy.deepcopy``, ``pickle``) has the same context and draws the same actions.  Calls from several threads are done
+    one after the other.
     """
 
     def __init__(
@@ -35,29 +41,40 @@ class InContextAgent:
         outcomes: OutcomeModel | None = None,
         threads: int | None = None,
     ) -> None:
-        """Raises ConfigError for a deployment rule that the model was not trained for, and for ``threads`` below 1."""
-        if threads is not None and threads < 1:
-            raise ConfigError(f"threads = {threads}: use at least 1, or None for the number that torch is set to")
+        """Raises ConfigError for a rule that the model was not trained for, ``threads`` below 1, ``seed`` below 0."""
+        seed = whole_or_none("seed", seed, 0)
         self._trained, self.spec = trained, trained.spec
         self.outcomes = outcomes
         """The model's prediction of outcomes, for ``surprise``; None for a checkpoint that was not calibrated."""
         self.manifest = manifest
         """Origin of the agent: method, version, digests, seeds and library versions; in Dark Room also
         ``test_goals`` as ``[x, y]`` pairs, ``size`` and ``horizon``."""
-        self.deploy: Deployment = deploy or trained.method.deployment(trained.run)
+        self.deploy: Deployment = trained.method.deployment(trained.run) if deploy is None else deploy
         """The deployment rule."""
-        self.threads = threads
+        self.threads = whole_or_none("threads", threads, 1)
         """CPU threads of torch in the agent's methods; the process's own number is set again after each.  None: that number."""
         self._rng = np.random.default_rng(seed)
+        self._one_call = threading.RLock()
         self.reset_context()
 
     def reset_context(self, batch: int = 1) -> None:
-        """Start with an empty context in ``batch`` environments, with the current weights of the model."""
-        self._surprise = Surprise(self.outcomes, self.spec, batch) if self.outcomes else None
-        watch = self._surprise.observe if self._surprise else None
-        trained = self._trained
-        self._policy: Any = trained.method.policy(trained.model, batch, trained.run.context, self.deploy, watch)
-        self._batch = batch
+        """Start with an empty context in ``batch`` environments, with the current weights of the model.
+
+        Raises ValueError for a ``batch`` below 1.
+        """
+        batch = arrays.whole("batch", batch, 1)
+        with self._one_call, torch_threads(self.threads):
+            self._surprise = Surprise(self.outcomes, self.spec, batch) if self.outcomes else None
+            watch = self._surprise.observe if self._surprise else None
+            trained = self._trained
+            self._policy: Any = trained.method.policy(trained.model, batch, trained.run.context, self.deploy, watch)
+            self._batch = batch
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_one_call"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _one_call=threading.RLock())
 
     @property
     def model(self) -> torch.nn.Module:
@@ -78,64 +95,70 @@ class InContextAgent:
                 "surprise: this checkpoint was not calibrated: `icrl-dist train RUN --resume` calibrates the last one "
                 "of a run, `icrl-dist export` calibrates the file that it writes"
             )
-        return self._surprise.score()
+        with self._one_call:
+            return self._surprise.score()
 
     def act(self, obs: ArrayLike) -> Actions:
         """Actions for the observations ``obs (B, S)``: numbers ``(B,)``, or vectors in [-1, 1] ``(B, A)``.
 
-        Raises ValueError for a batch of another shape.
+        Raises ValueError for another shape or type, and for nan, infinity and numbers beyond 1e12.
         """
-        states = self._shaped("obs", obs, np.float32, self.spec.observation)
-        draws = self._rng.random((len(states), 1 if self.spec.discrete else self.spec.actions))
-        with self._own_threads():
-            return self._policy.act(states, draws)
+        with self._one_call, torch_threads(self.threads):
+            states = arrays.floats("obs", obs, (self._batch, self.spec.observation), self._shape_remedy)
+            draws = self._rng.random((len(states), 1 if self.spec.discrete else self.spec.actions))
+            chosen: Actions = self._policy.act(states, draws)
+            return chosen.copy()
 
     def observe(self, obs: ArrayLike, action: ArrayLike, reward: ArrayLike, next_obs: ArrayLike, done: ArrayLike) -> None:
         """Record one transition per environment: ``obs`` and ``next_obs (B, S)``, ``action`` as from ``act``, others ``(B,)``.
 
-        ``done``: whether the episode ended.  Raises ValueError for another shape, or if only some of the
-        episodes ended: all environments of a batch have the same horizon.
+        ``done``: whether the episode ended.  The arrays are copied.  Raises ValueError, and records nothing, for another
+        shape or type, for nan, infinity and numbers beyond 1e12, for an action that the agent does not have, or if only
+        some of the episodes ended: all environments of a batch have the same horizon.
         """
-        spec, size = self.spec, self.spec.observation
-        ended = self._shaped("done", done, np.bool_)
-        if ended.any() != ended.all():
-            raise ValueError("done: the episodes of a batch must end together; use one agent per horizon")
-        transition = (
-            self._shaped("obs", obs, np.float32, size),
-            self._shaped("action", action, *((np.int64,) if spec.discrete else (np.float32, spec.actions))),
-            self._shaped("reward", reward, np.float32),
-            self._shaped("next_obs", next_obs, np.float32, size),
-        )
-        with self._own_threads():
-            self._policy.observe(*transition, bool(ended.all()))
+        with self._one_call, torch_threads(self.threads):
+            spec, one, remedy = self.spec, (self._batch,), self._shape_remedy
+            ended = arrays.flags("done", done, one, remedy)
+            if ended.any() != ended.all():
+                raise ValueError("done: the episodes of a batch must end together; use one agent per horizon")
+            self._policy.observe(
+                arrays.floats("obs", obs, (*one, spec.observation), remedy),
+                arrays.choices("action", action, one, spec.actions, remedy)
+                if spec.discrete
+                else arrays.vectors("action", action, (*one, spec.actions), remedy),
+                arrays.floats("reward", reward, one, remedy),
+                arrays.floats("next_obs", next_obs, (*one, spec.observation), remedy),
+                bool(ended.all()),
+            )
 
     def distribution(self, states: ArrayLike, row: int = 0) -> Float[np.ndarray, "Q A"]:
         """T_theta(. | s, D) over discrete actions at states ``(Q, S)``, given the context of environment ``row``.
 
-        The call does not change later actions.  Raises ValueError if actions are vectors.
+        The call does not change later actions.  Raises ValueError if actions are vectors, for a ``row`` that is none, and
+        for states as ``act`` does.
         """
         if not self.spec.discrete:
             raise ValueError("distribution: the actions of this agent are vectors; use an agent with discrete actions")
-        with self._own_threads():
-            return self._policy.distribution(np.asarray(states, np.float32), row)
+        with self._one_call, torch_threads(self.threads):
+            queries = arrays.floats("states", states, (None, self.spec.observation))
+            found: np.ndarray = self._policy.distribution(queries, self._row(row))
+            return found.copy()
 
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
-        """The context D of environment ``row``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
-        return self._policy.context(row)
+        """The context D of environment ``row``: observations (T, S), actions (T), next observations (T, S) and rewards (T).
 
-    @contextlib.contextmanager
-    def _own_threads(self) -> Iterator[None]:
-        before = torch.get_num_threads()
-        if self.threads is not None:
-            torch.set_num_threads(self.threads)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(before)
+        Raises ValueError for a ``row`` that is none.
+        """
+        with self._one_call:
+            return tuple(column.copy() for column in self._policy.context(self._row(row)))
 
-    def _shaped(self, name: str, value: ArrayLike, dtype: type, *rest: int) -> np.ndarray:
-        array: np.ndarray = np.asarray(value, dtype)
-        shape = (self._batch, *rest)
-        if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}, expected {shape}; reset_context(batch=B) sets B")
-        return array
+    def _row(self, row: int) -> int:
+        return arrays.whole("row", row, 0, self._batch - 1)
+
+    @property
+    def _shape_remedy(self) -> str:
+        kind = "numbers" if self.spec.discrete else "components"
+        return (
+            f"; reset_context(batch=B) sets B; this agent was trained with {self.spec.observation} observation components "
+            f"and {self.spec.actions} action {kind}"
+        )

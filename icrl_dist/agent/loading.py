@@ -11,13 +11,17 @@ import torch
 
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
+from icrl_dist.agent.threads import torch_threads, whole_or_none
 from icrl_dist.agent.trained_model import TrainedModel
-from icrl_dist.config.run import ConfigError, Deployment, parse_written
+from icrl_dist.config.paths import path_of
+from icrl_dist.config.run import ConfigError, Deployment, load_folder, parse_written
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
 from icrl_dist.models.weights import load_weights
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, newest_version, version_file
 from icrl_dist.storage.files import StoreError
+from icrl_dist.storage.fork import Lineage
+from icrl_dist.storage.held import check_weights, hold
 from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist.agent.shipped")))
@@ -37,13 +41,17 @@ def load_agent(
     ``threads``: CPU threads of torch while the agent acts and observes; None: the number that torch is set to.  More
     than one helps large batches on idle cores.  On busy cores threads that wait for each other can take a hundred
     times as long (docs/decisions/073-openmp-wait-policy.md).  Outside these calls the process's own number holds.
+    With one thread an agent also acts in a forked process; torch's threads do not survive a fork.
 
     Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy`` or if ``threads`` is
-    below 1, StoreError if the file was not written by this system.  Loading executes no code from the file.
+    below 1 or ``seed`` below 0, StoreError if the file was not written by this system or its weights are no finite numbers.
+    Loading executes no code from the file.
     """
-    checkpoint = load_checkpoint(shipped(what) if what in SHIPPED else checkpoint_file(Path(what)))
+    threads = whole_or_none("threads", threads, 1)
+    checkpoint = agent_checkpoint(shipped(what)) if what in SHIPPED else open_checkpoint(path_of("what", what))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
+    with torch_threads(threads):  # a forked process cannot use the threads that this one started
+        return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
 
 
 def shipped(name: str | Path) -> Path:
@@ -94,6 +102,32 @@ def checkpoint_file(what: Path, version: int | None = None) -> Path:
     if not found.is_file():
         raise ConfigError(f"{what}: holds no {'checkpoint' if version is None else f'version {version}'} yet")
     return found
+
+
+def open_checkpoint(what: Path, version: int | None = None) -> Checkpoint:
+    """The checkpoint at ``checkpoint_file(what, version)``; in a run folder it is held to its run.
+
+    Raises ConfigError if it is missing, StoreError if it is damaged or of another run or version.
+    """
+    path = checkpoint_file(what, version)
+    folder, number = path.absolute().parent.parent, path.stem.removeprefix("version-")
+    checkpoint = agent_checkpoint(path)
+    if path.absolute().parent.name == "checkpoints" and number.isdigit() and (folder / "run.toml").is_file():
+        run = load_folder(folder)
+        hold(checkpoint, path, int(number), Lineage.of(folder, run).run_of(int(number)))
+    else:
+        check_weights(checkpoint, path)
+    return checkpoint
+
+
+def agent_checkpoint(path: Path) -> Checkpoint:
+    """Read the checkpoint of an agent.  Raises StoreError as ``load_checkpoint``, and for a file that holds no agent."""
+    checkpoint = load_checkpoint(path)
+    if missing := [name for name in ("run", "spec") if name not in checkpoint.manifest]:
+        raise StoreError(
+            f"{path}: holds no agent: its manifest has no {', '.join(missing)}; name a run folder or an agent file"
+        )
+    return checkpoint
 
 
 def trained(checkpoint: Checkpoint) -> TrainedModel:

@@ -11,7 +11,6 @@ import itertools
 import queue
 import statistics
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -27,6 +26,7 @@ from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import Query, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.types import Spec, Weights
 from learner.broadcast import Broadcast
 
@@ -175,13 +175,13 @@ class _RayLoader:
 
 @contextlib.contextmanager
 def _ours(workers: int) -> Iterator[_OurBroadcast]:
-    command = [sys.executable, "-c", "import sys; from icrl_dist.bench.broadcast import receive; receive(sys.argv[1])"]
+    command = processes.python("-c", "import sys; from icrl_dist.bench.broadcast import receive; receive(sys.argv[1])")
     with ZenohLink.listen("tcp/127.0.0.1:0") as link, contextlib.ExitStack() as stack:
-        processes = []
+        started = []
         for _ in range(workers):
-            processes.append(stack.enter_context(subprocess.Popen([*command, link.endpoints[0]])))
-            stack.callback(processes[-1].kill)
-        yield _OurBroadcast(link, processes)
+            started.append(stack.enter_context(subprocess.Popen([*command, link.endpoints[0]], env=processes.environment())))
+            stack.callback(started[-1].kill)
+        yield _OurBroadcast(link, started)
 
 
 @contextlib.contextmanager

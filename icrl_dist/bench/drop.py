@@ -90,6 +90,7 @@ def run(
     if problem is not None:
         disturbance.check(problem, known)
     chosen = [name for name in known if experts(name).competent] if problem is None else [problem]
+    file = calibrated_strength.own_file()
     threads, rows = torch.get_num_threads(), []
     torch.set_num_threads(1)
     try:
@@ -100,7 +101,7 @@ def run(
     return {
         "drop": drop,
         "problems": rows,
-        "file": str(calibrated_strength.own_file()),
+        "file": str(file),
         "ok": all(row["reached"] for row in rows),
     }
 
@@ -178,9 +179,7 @@ def _store(row: dict[str, Any]) -> None:
     """Store the row in the user's table; it replaces an earlier row for the same disturbance and drop."""
     key = ("problem", "forces", "meters", "drop")
     others = [old for old in calibrated_strength.own() if any(old[name] != row[name] for name in key)]
-    file = calibrated_strength.own_file()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_json(file, [*others, row])
+    write_json(calibrated_strength.own_file(), [*others, row])
 
 
 def describe_row(row: dict[str, Any]) -> str:

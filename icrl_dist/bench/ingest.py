@@ -14,7 +14,6 @@ import queue
 import shutil
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -31,6 +30,7 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.types import Job, Spec, Trajectory
 from learner.ingest import Ingest
 
@@ -170,7 +170,7 @@ class _LearnerSide:
     def _open(self, store: Dataset, stored: list[float]) -> Ingest:
         trajectory = example()
         size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
-        spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))
+        spec = Spec((-9.0,) * size, (9.0,) * size, actions, len(trajectory.actions))
         job = Job("adapt", *trajectory.identity[:3], (trajectory.variation,), 1, trajectory.policy_version, seed=0)
 
         def note(_: Trajectory) -> None:
@@ -201,8 +201,8 @@ class _LearnerSide:
 @contextlib.contextmanager
 def _learner(folder: Path) -> Iterator[_LearnerSide]:
     with ZenohLink.listen("tcp/127.0.0.1:0") as link:
-        command = [sys.executable, "-c", "import sys; from icrl_dist.bench.ingest import work; work(sys.argv[1])"]
-        with subprocess.Popen([*command, link.endpoints[0]]) as worker:
+        command = processes.python("-c", "import sys; from icrl_dist.bench.ingest import work; work(sys.argv[1])")
+        with subprocess.Popen([*command, link.endpoints[0]], env=processes.environment()) as worker:
             try:
                 learner = _LearnerSide(link, folder, worker)
                 yield learner

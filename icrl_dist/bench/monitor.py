@@ -13,13 +13,12 @@ import pty
 import signal
 import statistics
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 import urllib.request
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +28,7 @@ from icrl_dist.bench.training import need_alive, training
 from icrl_dist.stream import wire
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
 BOUND = 0.98
@@ -40,7 +40,8 @@ _FULL = ("--context.max", "200", "--stream.job-tasks", "2")
 of 80, so that an interval of a few seconds counts its trajectories to 1%."""
 _ROUND = (*_FULL, "--pretrain.contexts", "390", "--pretrain.steps", "20", "--icaa.trials", "1500", "--icaa.context-trials", "5")
 _CONTEXTS = ("--method", "dpt", "--pretrain.contexts", "780000")
-_VIEWER = (sys.executable, "-m", "icrl_dist.bench.viewer")
+_PIPES: Mapping[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
+_VIEWER = processes.python("-m", "icrl_dist.bench.viewer")
 
 How = Literal["live", "stopped"]
 
@@ -161,9 +162,7 @@ class _ViewerProcess:
     """A viewer in a separate process, which can be connected and disconnected."""
 
     def __init__(self, endpoint: str) -> None:
-        self._process = subprocess.Popen(
-            [*_VIEWER, "view", endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-        )
+        self._process = subprocess.Popen([*_VIEWER, "view", endpoint], env=processes.environment(), **_PIPES)
         self.received = 0
 
     def __enter__(self) -> _ViewerProcess:
@@ -210,9 +209,7 @@ class _Connected:
 
 def _measure_views(seconds: float) -> dict[str, Any]:
     """CPU of the page and then of the terminal view, with ``STREAMS`` simulated variations."""
-    crowd = subprocess.Popen(
-        [*_VIEWER, "crowd", str(STREAMS), str(PER_S)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-    )
+    crowd = subprocess.Popen([*_VIEWER, "crowd", str(STREAMS), str(PER_S)], env=processes.environment(), **_PIPES)
     try:
         assert crowd.stdout is not None
         endpoint = crowd.stdout.readline().strip()
@@ -232,11 +229,11 @@ def _measure_views(seconds: float) -> dict[str, Any]:
 
 
 def _monitor(endpoint: str, *more: str) -> list[str]:
-    return [sys.executable, "-u", "-m", "icrl_dist.cli", "monitor", "--connect", endpoint, *more]
+    return processes.python("-u", "-m", "icrl_dist.cli", "monitor", "--connect", endpoint, *more)
 
 
 def _page(endpoint: str, seconds: float, sent: list[int]) -> dict[str, Any]:
-    process = subprocess.Popen(_monitor(endpoint, "--web", "0"), stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(_monitor(endpoint, "--web", "0"), stdout=subprocess.PIPE, text=True, env=processes.environment())
     try:
         assert process.stdout is not None
         url = next(word for line in process.stdout for word in line.split() if word.startswith("http://"))
@@ -273,7 +270,7 @@ def _received_per_s(url: str, points: int) -> float:
 def _terminal(endpoint: str, seconds: float) -> float:
     master, slave = pty.openpty()
     process = subprocess.Popen(
-        _monitor(endpoint), stdin=slave, stdout=slave, stderr=slave, env={**os.environ, "TERM": "xterm-256color"}
+        _monitor(endpoint), stdin=slave, stdout=slave, stderr=slave, env={**processes.environment(), "TERM": "xterm-256color"}
     )
     os.close(slave)
     ended = threading.Event()

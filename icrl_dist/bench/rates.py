@@ -13,7 +13,6 @@ import os
 import platform
 import queue
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -42,6 +41,7 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.training import fit
 from icrl_dist.types import Job, Trajectory
 from learner.ingest import Ingest
@@ -292,5 +292,6 @@ def _references(run: Run) -> list[tuple[Reference, int]]:
 def _start() -> float:
     """Seconds for the learner and then the workers (in parallel) to start: twice the imports in a new process."""
     began = time.perf_counter()
-    subprocess.run([sys.executable, "-c", "import actors.worker, learner.service, ray"], check=True)
+    command = processes.python("-c", "import actors.worker, learner.service, ray")
+    subprocess.run(command, check=True, env=processes.environment())
     return 2 * (time.perf_counter() - began)

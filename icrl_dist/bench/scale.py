@@ -37,6 +37,7 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.endpoints import parse
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.types import Job, Spec, Trajectory
 from learner.ingest import Ingest
 
@@ -195,7 +196,7 @@ def _cpu(process: psutil.Process) -> float:
 def _ingest(store: Dataset, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
     trajectory = example()
     size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
-    spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))
+    spec = Spec((-9.0,) * size, (9.0,) * size, actions, len(trajectory.actions))
     variations = (trajectory.variation,) * count
     job = Job("adapt", *trajectory.identity[:2], 0, variations, 1, trajectory.policy_version, seed=0, tasks=count)
 
@@ -212,15 +213,17 @@ def _workers(endpoint: str, count: int, seconds: float) -> Iterator[list[subproc
     shares = [len(range(number, count, PROCESSES)) for number in range(min(PROCESSES, count))]
     code = "import sys; from icrl_dist.bench.scale import work; work(sys.argv[1], *map(int, sys.argv[2:4]), float(sys.argv[4]))"
     with contextlib.ExitStack() as stack:
-        others = []
+        others: list[subprocess.Popen[str]] = []
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         for number, share in enumerate(shares):
             arguments = [endpoint, str(sum(shares[:number])), str(share), str(seconds)]
-            command = [sys.executable, "-c", code, *arguments]
-            other = stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+            command = processes.python("-c", code, *arguments)
+            other = stack.enter_context(subprocess.Popen(command, env=processes.environment(), **pipes))
             stack.callback(other.kill)
             others.append(other)
         for other in others:
-            assert _read(other) == "ready"
+            if (line := _read(other)) != "ready":
+                raise RuntimeError(f"a process of simulated workers answered {line!r}")
         yield others
 
 

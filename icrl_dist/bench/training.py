@@ -6,9 +6,10 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+from icrl_dist.telemetry import processes
 
 
 @contextlib.contextmanager
@@ -17,8 +18,8 @@ def training(run: str, out: Path, *settings: str) -> Iterator[subprocess.Popen[s
 
     The caller must read its standard output; its standard error goes to the terminal.
     """
-    command = [sys.executable, "-u", "-m", "icrl_dist.cli", "train", run, "--out", str(out), *settings]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    command = processes.python("-u", "-m", "icrl_dist.cli", "train", run, "--out", str(out), *settings)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True, env=processes.environment())
     try:
         yield process
     finally:

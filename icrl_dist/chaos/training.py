@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -22,6 +22,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.stream import monitor_messages, security, wire
 from icrl_dist.stream.link import LinkError, StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import processes
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
 _POLL_S = 0.02
@@ -50,7 +51,7 @@ class Training:
         """Words before the command, for a run folder that is visible at ``view`` (see ``Disk``)."""
         self.log = folder.with_name(f"{folder.name}.log")
         words = [name, *(word for setting in settings for word in ("--set", setting))]
-        self._command = [sys.executable, "-m", "icrl_dist.cli", "train", *words, "--out", str(folder), "--actors", str(actors)]
+        self._command = processes.python("-m", "icrl_dist.cli", "train", *words, "--out", str(folder), "--actors", str(actors))
         self._process: subprocess.Popen[bytes] | None = None
         self._seen: set[psutil.Process] = set()
 
@@ -66,7 +67,8 @@ class Training:
             command = [*self.prefix, *self._command, *options]
             log.write(f"$ {' '.join(command)}\n".encode())
             log.flush()
-            self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            environment = processes.environment()
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
         self._deadline = time.monotonic() + self._limit_s
         self._listed = 0.0
 
@@ -124,6 +126,21 @@ class Training:
     def learner(self) -> psutil.Process | None:
         """Its learner process, if there is one."""
         return next((p for p in self.tree() if is_learner(p)), None)
+
+    def group(self) -> list[psutil.Process]:
+        """The living processes of its process group: the command, and Ray without the workers."""
+        assert self._process is not None
+        found = list[psutil.Process]()
+        for process in self.tree():
+            with contextlib.suppress(ProcessLookupError):
+                found += [process] * (os.getpgid(process.pid) == self._process.pid)
+        return found
+
+    def signal(self, number: int) -> None:
+        """Send a signal to its process group, as a terminal does."""
+        assert self._process is not None
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, number)
 
     def kill(self) -> list[psutil.Process]:
         """SIGKILL all processes at once; returns those that are still alive."""

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from actors.placement import local_actors
 from icrl_dist.cli.exit_codes import FAILED, OK
 from icrl_dist.config.run import ConfigError
 
@@ -20,7 +21,9 @@ class ChaosArguments:
 
     RUN is run once undisturbed, then once with each fault: kill-worker, kill-learner and
     kill-tree (SIGKILL), stop-learner (SIGSTOP for 15 s), cut-link (no traffic for 12 s), torn-tail
-    and flip-byte (a damaged dataset), full-disk (needs root, or user namespaces).  The command
+    and flip-byte (a damaged dataset), full-disk (needs root, or user namespaces), strangers (a flood of
+    connections to the learner's port), stop-run (SIGSTOP of the command and of Ray), kill-raylet and
+    kill-gcs (SIGKILL of Ray's own processes).  The command
     fails if a digest differs, and also if a fault had no effect: no process died, nothing was sent
     again, nothing was repaired.  ``icrl-dist chaos smoke`` takes some minutes on two cores.
     """
@@ -35,8 +38,8 @@ class ChaosArguments:
     """Seed of the first schedule."""
     faults: str = ""
     """Faults to inject, such as kill-worker,torn-tail.  Default: all."""
-    actors: int = 2
-    """Number of workers."""
+    actors: int | None = None
+    """Number of workers.  Default: 2, or 1 on a single core."""
     out: Path = Path("runs/chaos")
     """Folder for run folders and logs.  Those of passed faults are removed."""
     reference: Path | None = None
@@ -51,10 +54,11 @@ def chaos(arguments: ChaosArguments, console: Console) -> int:
     from icrl_dist.chaos.training import TrainingFailed
     from icrl_dist.launch.learner_process import TrainFailed
 
-    if arguments.seeds < 1 or arguments.actors < 1:
-        raise ConfigError(f"--seeds {arguments.seeds} --actors {arguments.actors}: at least 1 of each is needed")
+    actors = local_actors() if arguments.actors is None else arguments.actors
+    if arguments.seeds < 1 or actors < 1:
+        raise ConfigError(f"--seeds {arguments.seeds} --actors {actors}: at least 1 of each is needed")
     seeds = range(arguments.seed, arguments.seed + arguments.seeds)
-    with Campaign(arguments.run, arguments.set, arguments.actors, arguments.out, console) as campaign:
+    with Campaign(arguments.run, arguments.set, actors, arguments.out, console) as campaign:
         try:
             answer = campaign.run(arguments.faults, seeds, arguments.reference)
         except TrainingFailed as error:

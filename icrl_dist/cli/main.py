@@ -6,21 +6,25 @@ checkpoint written.
 
 from __future__ import annotations
 
+import io
 import os
-import select
 import shutil
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, help_text, monitor, plan, play, train
-from icrl_dist.cli.exit_codes import BROKEN_PIPE, FAILED, INTERRUPTED, OK, USAGE
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, help_text, monitor, plan, play, streams, train
+from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
-from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_type, with_problem
+from icrl_dist.config.run import ConfigError, Run, load, load_folder, names_of, run_folder_of, run_type, with_problem
+from icrl_dist.console.signals import interruptible
+from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.storage.fork import parse_source
+from icrl_dist.stream.excerpts import plain
 
 COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "train": (train.TrainArguments, train.train),
@@ -60,7 +64,10 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     found: Any = help_text.cli(kind, prog=prog, args=list(words))
     if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
-        base = load(found.run) if found.run else load_folder(parse_source(found.source or "")[0])
+        folder = run_folder_of(found.run) if found.resume or found.resume_or_begin else None
+        if not found.run:
+            folder = parse_source(found.source or "")[0]
+        base = load(found.run) if folder is None else load_folder(folder)
         if "--problem" in (word.partition("=")[0] for word in words):
             base = with_problem(base, found.config.problem)
         _check_settings(words, type(base), base.problem)
@@ -78,7 +85,7 @@ def _check_settings(words: Sequence[str], kind: type[Run], problem: str = "") ->
             former_names.check({section: {key: None}}, names_of(kind), problem, flag)
 
 
-class _Console(Console):
+class _Console(PlainConsole):
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError  # for ``main``; rich would exit with code 1
 
@@ -88,26 +95,28 @@ def main(words: Sequence[str] | None = None) -> int:
 
     If the reader of standard output has closed it, as ``head`` does, the command ends without a message.
     """
+    streams.prepare()
+    _write_any_text()
     try:
         try:
             return _run(list(sys.argv[1:] if words is None else words))
         finally:
             sys.stdout.flush()  # else Python would find a closed pipe only when it exits
     except BrokenPipeError:
-        if not _output_is_closed():
-            raise  # another pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at exit
-        return BROKEN_PIPE
+        return streams.end_of_output()
 
 
-def _output_is_closed() -> bool:
-    poll = select.poll()
-    poll.register(sys.stdout.fileno(), 0)
-    return any(event & select.POLLERR for _, event in poll.poll(0))
+def _write_any_text() -> None:
+    """Let the streams write names that their encoding lacks as escapes: with LANG=C, and file names that are not UTF-8."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _run(words: list[str]) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads sleep, also in child processes: decision 073
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without UTF-8 cannot show every printable character
+        sys.stdout.reconfigure(errors="backslashreplace")
     to_stderr = "--json" in words
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = _Console(stderr=to_stderr, width=None if terminal else 120, soft_wrap=not terminal)
@@ -123,8 +132,16 @@ def _run(words: list[str]) -> int:
         print(f"icrl-dist: no command {words[0]!r}; choose one of {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE
     try:
-        return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
+        Path.cwd()
+    except OSError as error:
+        print(f"icrl-dist: the current folder cannot be used ({error.strerror}): change to another one", file=sys.stderr)
+        return USAGE
+    try:
+        with interruptible():
+            return COMMANDS[words[0]][1](_parse(words[0], words[1:]), console)
     except KeyboardInterrupt:
+        if words[0] == "train":  # before the run began, or after it ended
+            console.print("interrupted", highlight=False)
         return INTERRUPTED
     except Exception as error:
         from icrl_dist.storage.files import explained
@@ -133,7 +150,7 @@ def _run(words: list[str]) -> int:
         code = _code(explanation)
         if code is None:
             raise
-        print(f"icrl-dist: {' '.join(str(explanation).split())}", file=sys.stderr)
+        print(f"icrl-dist: {plain(' '.join(str(explanation).split()), 4_000)}", file=sys.stderr)
         return code
 
 

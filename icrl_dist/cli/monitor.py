@@ -59,10 +59,10 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
         if what is not None and not arguments.connect and not _is_active(what, console):
             feed: LiveFeed | ReplayFeed = stack.enter_context(ReplayFeed(what, arguments.speed))
         else:
-            endpoint, certificates, run = _learner_of(what, arguments.connect, arguments.certificates)
+            endpoint, certificates, folder = _learner_of(what, arguments.connect, arguments.certificates)
             settings = security.client(certificates, "monitor")
             link = stack.enter_context(ZenohLink.connect(endpoint, arguments.timeout, settings))
-            feed = stack.enter_context(LiveFeed(link, run))
+            feed = stack.enter_context(LiveFeed(link, _run_name(folder), folder))
         if arguments.web is not None:
             from icrl_dist.monitor.page import serve
 
@@ -109,12 +109,12 @@ def tap(arguments: TapArguments, console: Console) -> int:
     from icrl_dist.stream import security
     from icrl_dist.stream.zenoh_link import ZenohLink
 
-    endpoint, certificates, run = _learner_of(arguments.what, arguments.connect, arguments.certificates)
+    endpoint, certificates, folder = _learner_of(arguments.what, arguments.connect, arguments.certificates)
     ended = threading.Event()
     tapped = TapWriter(arguments.task, arguments.adversary, arguments.every, arguments.format, arguments.count, ended.set)
     client = security.client(certificates, "monitor")
     with on_signals(ended.set), ZenohLink.connect(endpoint, arguments.timeout, client) as link:
-        link.subscribe(f"icrl/{run or '*'}/mon/trajectories/**", tapped)
+        link.subscribe(f"icrl/{_run_name(folder) or '*'}/mon/trajectories/**", tapped)
         ended.wait()
     if tapped.error is None:
         return OK
@@ -141,10 +141,10 @@ def _is_active(folder: Path, console: Console) -> bool:
     return False
 
 
-def _learner_of(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, str]:
-    """The endpoint of the learner, the folder of certificates for it, and the name of its run.
+def _learner_of(what: Path | None, connect: str | None, certificates: str | None) -> tuple[str, str, Path | None]:
+    """The endpoint of the learner, the folder of certificates for it, and its run folder.
 
-    The name is empty with ``--connect``, because the endpoint identifies the run.  Raises
+    The run folder is None with ``--connect``, because the endpoint identifies the run.  Raises
     ConfigError if no run is active, or if a TLS endpoint has no certificates.
     """
     from icrl_dist.storage.files import held
@@ -154,7 +154,7 @@ def _learner_of(what: Path | None, connect: str | None, certificates: str | None
             raise ConfigError(
                 f"--connect {connect}: TLS needs --certificates, a folder with ca.pem, monitor.pem and monitor.key"
             )
-        return connect, certificates or "", ""
+        return connect, certificates or "", None
     files = [what / "endpoint"] if what else sorted(Path("runs").glob("[!.]*/endpoint"), key=lambda f: f.stat().st_mtime)
     files = [file for file in files if held(file.parent)] or files  # a crashed learner leaves its endpoint file behind
     if not files or not files[-1].is_file():
@@ -164,13 +164,15 @@ def _learner_of(what: Path | None, connect: str | None, certificates: str | None
     folder = files[-1].parent
     stream = load_folder(folder).stream
     endpoint = stream.connect or files[-1].read_text().strip()
-    return endpoint, certificates or stream.certificates, _run_name(folder)
+    return endpoint, certificates or stream.certificates, folder
 
 
-def _run_name(folder: Path) -> str:
-    """The name of the run in a folder.
+def _run_name(folder: Path | None) -> str:
+    """The name of the run in a folder; empty without a folder.
 
-    Empty if the folder is a symbolic link with another name: its learner may use either name.
+    Also empty if the folder is a symbolic link with another name: its learner may use either name.
     """
+    if folder is None:
+        return ""
     name = folder.absolute().name
     return name if folder.resolve().name == name else ""

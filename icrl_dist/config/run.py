@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from icrl_dist.config import former_names, plugins
+from icrl_dist.config.paths import path_of
 from icrl_dist.config.ranges import Seed
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import (
@@ -48,6 +49,7 @@ __all__ = [
     "override",
     "parse",
     "parse_written",
+    "run_folder_of",
     "validate",
 ]
 
@@ -76,9 +78,21 @@ class Run:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     alerts: AlertsConfig = field(default_factory=AlertsConfig)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By the settings, because a class that ``run_type`` makes has no name of its own by which pickle could find it."""
+        settings = {name: getattr(self, name) for name in names_of(type(self))}
+        return _remade, (type(self) is Run, settings)
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self  # a run and its sections cannot change
+
     def section(self, name: str) -> Any:
         """The section of this name; sections of the problem and of methods are included."""
         return getattr(self, name)
+
+
+def _remade(without_sections: bool, settings: dict[str, Any]) -> Run:
+    return (Run if without_sections else run_type(settings["problem"]))(**settings)
 
 
 def run_type(problem: str | None) -> type[Run]:
@@ -112,7 +126,7 @@ def load(name_or_path: str) -> Run:
     if name_or_path.startswith("experts-"):
         return replace(load(name_or_path.removeprefix("experts-")), method="experts")
     path = Path(name_or_path)
-    if path.suffix == ".toml" or "/" in name_or_path:
+    if path.suffix == ".toml" or "/" in name_or_path or run_folder_of(name_or_path) is not None:
         written = path.name == _RUN_FILE and (path.parent / "env.json").is_file()  # the program writes both
         return (parse_written if written else parse)(_text(path, name_or_path), name_or_path)
     runs = _packaged()
@@ -134,8 +148,9 @@ def load_run(what: str | Path, *settings: str) -> Run:
     ``dataclasses.replace(run, seed=3)`` changes a run too; ``icrl_dist.train`` checks it.
     Raises ConfigError, with the nearest name, for an unknown run or key, and for an impossible value.
     """
-    is_path = isinstance(what, Path) or "/" in what
-    run = load_folder(Path(what)) if is_path and Path(what).is_dir() else load(str(what))
+    path = path_of("what", what)
+    is_path = not isinstance(what, str) or "/" in what
+    run = load_folder(path) if is_path and path.is_dir() else load(str(path) if is_path else str(what))
     return override(run, settings, str(what))
 
 
@@ -151,7 +166,19 @@ def load_folder(folder: Path) -> Run:
     return parse_written(_text(path, str(path)), str(path))
 
 
+def run_folder_of(what: str | Path) -> Path | None:
+    """The run folder that RUN names: ``runs/demo`` or ``runs/demo/run.toml``; None if it names a run file or a packaged run."""
+    if not str(what) or str(what) in _packaged():
+        return None
+    path = Path(what)
+    if (path / _RUN_FILE).is_file():
+        return path
+    return path.parent if path.name == _RUN_FILE and (path.parent / "env.json").is_file() else None
+
+
 def _text(path: Path, name: str) -> str:
+    if (path / _RUN_FILE).is_file():
+        raise ConfigError(f"{name} is a run folder: `icrl-dist train --resume {name}` continues its run")
     if not path.is_file():
         raise ConfigError(f"run file {name!r}: no such file")
     try:

@@ -15,7 +15,9 @@ from rich.text import Text
 
 from icrl_dist.console.event_lines import EventLines
 from icrl_dist.console.stage_rows import StageRow, duration, name_of
-from icrl_dist.telemetry.logs import stamp
+from icrl_dist.console.terminal import PlainConsole
+from icrl_dist.stream.excerpts import plain
+from icrl_dist.telemetry.stamps import stamp
 
 ReportEvent = Callable[[dict[str, Any]], None]
 """Shows one event of a run, such as ``{"event": "note", "text": ...}``."""
@@ -74,7 +76,7 @@ class Display:
 
     def _print(self, lines: list[str]) -> None:
         for line in lines:
-            self.console.print(Text(f"{stamp()} {_printable(line)}"), soft_wrap=self._live is None)
+            self.console.print(Text(f"{stamp()} {plain(line, _LONGEST)}"), soft_wrap=self._live is None)
 
     def _draw(self) -> Text:
         """The row of the present stage, for the terminal."""
@@ -83,7 +85,7 @@ class Display:
             if self._row is not None:
                 ascii_only = self.console.options.ascii_only
                 row = self._row.fit(self.console.width, now, ascii_only)
-                return Text(_printable(row), no_wrap=True, overflow="crop")
+                return Text(plain(row, _LONGEST), no_wrap=True, overflow="crop")
             waited, what = now - self._left_at, "waits for the next stage" if self._ended else "starting"
         return Text(f"{what}, {duration(waited)}" if waited > 2.0 else "")
 
@@ -122,7 +124,7 @@ class Display:
             self._print([row.line(now)])
         else:
             self.console.print(
-                Text(_printable(row.fit(self.console.width, now, self.console.options.ascii_only)), no_wrap=True)
+                Text(plain(row.fit(self.console.width, now, self.console.options.ascii_only), _LONGEST), no_wrap=True)
             )
 
 
@@ -132,12 +134,7 @@ def reporting(progress: Show) -> Iterator[ReportEvent]:
     if callable(progress):
         yield progress
     elif progress:
-        with Display(Console(soft_wrap=True)) as display:
+        with Display(PlainConsole(soft_wrap=True)) as display:
             yield display.report
     else:
         yield lambda event: None
-
-
-def _printable(text: str) -> str:
-    """Text as one line without characters that a terminal would execute."""
-    return "".join(c if c.isprintable() else " " for c in text[:_LONGEST])

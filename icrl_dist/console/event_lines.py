@@ -12,7 +12,7 @@ _JOIN_S, _DEATH_S = 1.0, 3.0
 _TOLD_S = 60.0
 """Seconds in which further reports of an end that is printed are left out."""
 _NAMED = 3
-_TEXTS = ("note", "alert", "crash", "quarantine", "released", "repaired", "interrupted")
+_TEXTS = ("note", "worker", "alert", "crash", "quarantine", "released", "repaired", "interrupted")
 _DIED = re.compile(r"worker (\S+) died \(")
 _SILENT = re.compile(r"(ALERT|alert: over): worker (\S+) has been silent")
 
@@ -51,7 +51,7 @@ class EventLines:
         """Take in an event that is no progress."""
         kind, text = event["event"], str(event.get("text", ""))
         lines = self.due(now)
-        if kind == "worker":
+        if kind == "worker" and {"worker", "alive"} <= event.keys():
             lines += self._joins(event, now) if event["alive"] else self._ends_with(event["worker"], now, gone=text)
         elif kind == "crash" and self._ending(event.get("worker", ""), now):
             lines += self._ends_with(event["worker"], now, crash=text)

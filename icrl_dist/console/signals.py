@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as an event of the program."""
+"""The signals that end a program in order: Ctrl-C, SIGTERM, a lost terminal, the warning of a batch system."""
 
 from __future__ import annotations
 
@@ -8,25 +8,41 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
+"""The last three are warnings: batch systems send them before a limit, and the kernel sends the last at a limit of CPU time."""
+
 
 @contextlib.contextmanager
 def on_signals(stop: Callable[[], None]) -> Iterator[Callable[[], object]]:
-    """Call ``stop`` on SIGINT and SIGTERM.  Yields a function that sets the handlers again after other code replaced them.
+    """Call ``stop`` on each of ``SIGNALS``.  Yields a function that sets the handlers again after other code replaced them.
 
-    The former handlers are set at the end.  Outside the main thread Python allows no handlers, and nothing is changed.
+    A signal that is ignored stays ignored: ``nohup`` starts a program so that SIGHUP does not end it, and a shell
+    starts a script's background programs so that Ctrl-C does not.  The former handlers are set at the end.
+    Outside the main thread Python allows no handlers, and nothing is changed.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
-    signals = [number for number in numbers if signal.getsignal(number) is not None]  # another could not be set again
+    found = {number: signal.getsignal(number) for number in SIGNALS if _in_main_thread()}
+    # Another could not be set again.
+    before = {number: handler for number, handler in found.items() if handler is not None}
 
     def handle() -> list[Any]:
-        return [signal.signal(number, lambda *_: stop()) for number in signals]
+        ignored = signal.SIG_IGN
+        return [signal.signal(n, ignored if before[n] == ignored else lambda *_: stop()) for n in before]
 
-    before = handle()
+    handle()
     try:
         yield handle
     finally:
-        for number, handler in zip(signals, before, strict=True):
+        for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def interruptible() -> contextlib.AbstractContextManager[object]:
+    """A context in which each of ``SIGNALS`` raises KeyboardInterrupt, for work that can be repeated."""
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    return on_signals(interrupt)
 
 
 def _in_main_thread() -> bool:

@@ -13,7 +13,6 @@ import resource
 import shutil
 import socket
 import sys
-import tempfile
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -24,9 +23,12 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.diagnostics import cluster_file, cluster_nodes, node_facts
+from icrl_dist.diagnostics import cluster_file, cluster_nodes, node_facts, ray_job, surroundings
 from icrl_dist.diagnostics.checks import Check
+from icrl_dist.diagnostics.modules import check_modules
+from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
+from icrl_dist.diagnostics.surroundings import existing, writable
 from icrl_dist.stream import endpoints
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
@@ -38,13 +40,15 @@ def diagnose(endpoint: str, folder: Path) -> list[Check]:
     return [
         _python(),
         *_libraries(),
+        check_modules(),
         _cores(),
         _memory(),
         _endpoint(endpoint),
         _loopback(),
-        _writable("run folder", folder, "choose another with --out, or make it writable"),
+        writable("run folder", folder, "choose another with --out, or make it writable"),
+        surroundings.check_locks(folder),
         _disk(folder),
-        _writable("home", Path.home(), "set HOME to a folder you may write to: Ray and torch keep files there"),
+        *surroundings.checks(),
         _shared_memory(Path("/dev/shm")),
         _open_files(),
         check_ray_token(),
@@ -76,7 +80,10 @@ def _cores() -> Check:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     enough = True if count >= 2 else None
     return Check(
-        "cores", enough, str(count), "" if enough else "use --actors 1; the learner and the worker then share the core"
+        "cores",
+        enough,
+        str(count),
+        "" if enough else "nothing must be done: one worker starts, and shares the core with the learner",
     )
 
 
@@ -129,26 +136,8 @@ def _loopback() -> Check:
     )
 
 
-def _existing(folder: Path) -> Path:
-    """The folder, or its nearest parent that exists."""
-    folder = folder.absolute()
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder
-
-
-def _writable(name: str, folder: Path, remedy: str) -> Check:
-    try:
-        # A trial write, because permission bits are not enough (root, read-only mounts).
-        with tempfile.TemporaryFile(dir=_existing(folder)):
-            pass
-    except OSError as error:
-        return Check(name, False, f"{folder}: {error.strerror or error}", remedy)
-    return Check(name, True, f"{folder} is writable")
-
-
 def _disk(folder: Path) -> Check:
-    free = shutil.disk_usage(_existing(folder)).free
+    free = shutil.disk_usage(existing(folder)).free
     ok = True if free >= 5 * GIB else None if free >= GIB else False
     return Check(
         "disk", ok, f"{free / GIB:.1f} GiB free", "" if ok else "free some space: the datasets of long runs take gigabytes"
@@ -218,9 +207,10 @@ def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Che
     except ValueError as error:
         raise ConfigError(f"--endpoint {endpoint}: {error}") from None
     require_ray_token(address)
+    require_cluster(address)
     try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+        ray.init(address=address, job_config=ray_job.job_config(ray), log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(
             f"--address {address}: {error}; `ray status` on the head shows whether a cluster is running"
         ) from None

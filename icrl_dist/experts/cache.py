@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Literal, get_args
@@ -121,10 +122,10 @@ def load(variation: Variation, horizon: int, config: SACConfig, seed: int, train
     """The history from the cache; None if it is missing or damaged."""
     if not config.cache:
         return None
-    path = file(config, key(variation, horizon, config, seed, trainer, trials))
     try:
+        path = file(config, key(variation, horizon, config, seed, trainer, trials))
         return History(**load_checkpoint(path).arrays) if path.exists() else None
-    except (StoreError, TypeError) as error:
+    except (StoreError, OSError, TypeError) as error:
         _log.warning("the history is made again: %s", error)
         return None
 
@@ -137,14 +138,35 @@ def load_any(variation: Variation, horizon: int, config: SACConfig, seed: int) -
 
 
 def file(config: SACConfig, name: str) -> Path:
-    """The file of the cache with this name."""
-    return Path(config.cache).expanduser() / f"{name}.npz"
+    """The file of the cache with this name.  Raises StoreError if the folder is in a home and this user has none."""
+    try:
+        return Path(config.cache).expanduser() / f"{name}.npz"
+    except RuntimeError:
+        raise StoreError(f"{config.cache}: this user has no home folder: set HOME, or sac.cache") from None
+
+
+def unusable(config: SACConfig) -> str:
+    """Why nothing can be stored in the cache, with the remedy; empty if something can, or if the run has no cache.
+
+    Creates the folder of the cache.
+    """
+    if not config.cache:
+        return ""
+    try:
+        folder = file(config, "").parent
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):  # permission bits are not enough (root, read-only mounts)
+            return ""
+    except StoreError as error:
+        return str(error)
+    except OSError as error:
+        return f"{config.cache}: cannot be written ({error.strerror}): set sac.cache to a folder that you may write to"
 
 
 def save(
     history: History, variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1
 ) -> None:
-    """Write the history to the cache, if the run has one."""
+    """Write the history to the cache, if the run has one.  Raises StoreError if that is impossible."""
     if config.cache:
         path = file(config, key(variation, horizon, config, seed, trainer, trials))
         save_checkpoint(path, Checkpoint(history.arrays(), {"of": str(variation), "by": trainer}))

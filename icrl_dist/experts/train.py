@@ -8,6 +8,9 @@ the run's seed only, so the expert is the same in every job.
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import functools
 import hashlib
 import logging
 import time
@@ -30,7 +33,10 @@ from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Job, Trajectory, Variation
 
 if TYPE_CHECKING:
+    import torch
+
     from icrl_dist.experts.sac.batched import Backend, SACBatch
+    from icrl_dist.experts.sac.stacked import Shape
 
 _log = logging.getLogger(__name__)
 
@@ -62,10 +68,27 @@ def _histories(job: Job, problem: Problem, config: SACConfig, progress: Progress
             f"{job.label}: {len(found)} experts from the cache, {len(found) * config.steps:,} steps of SAC saved", note=True
         )
     if missing:
+        if reason := cache.unusable(config):  # found before the training, which may take hours
+            config = _without_cache(config, reason, progress)
         for variation, history in zip(missing, _train(job, problem, missing, backend, config, progress), strict=True):
-            cache.save(history, variation, horizon, config, job.seed, trainer, job.trials)
             found[variation] = history
+            try:
+                cache.save(history, variation, horizon, config, job.seed, trainer, job.trials)
+            except StoreError as error:
+                config = _without_cache(config, cache.unusable(config) or str(error), progress)
     return [found[variation] for variation in job.variations]
+
+
+_reported = set[str]()
+"""Caches that cannot be used and were reported by this process."""
+
+
+def _without_cache(config: SACConfig, reason: str, progress: Progress) -> SACConfig:
+    """The section without its cache, which cannot be used; the first time, a note says so."""
+    if config.cache not in _reported:
+        _reported.add(config.cache)
+        progress(f"experts are not stored: {reason}", note=True)
+    return dataclasses.replace(config, cache="")
 
 
 def sac_backend(experts: int) -> Backend:
@@ -102,15 +125,19 @@ def _train(
         if part is not None and time.monotonic() - saved >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}
-            save_checkpoint(part, Checkpoint(arrays, {}))
             saved = time.monotonic()
+            try:
+                save_checkpoint(part, Checkpoint(arrays, {}))
+            except StoreError as error:
+                _log.warning("no checkpoint of this training: %s", error)
 
     experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, backend=backend)
     columns = with_labels(recorder.columns(), problem, experts.act)
     windows = window_episodes(env, problem, experts.act, seeds, range(env.batch))
     histories = make_histories(job, variations, columns, windows, experts.arrays["actor"].cpu().numpy(), progress)
     if part is not None:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
     return histories
 
 
@@ -162,17 +189,20 @@ def _mean_actions(histories: Sequence[History], config: SACConfig) -> Act:
     """The mean actions of the experts of these histories."""
     import torch
 
-    from icrl_dist.experts.sac.stacked import Shape, outputs
+    from icrl_dist.experts.sac.stacked import Shape
 
     first = histories[0]
     sizes = first.observations.shape[-1], *config.hidden, 2 * first.actions.shape[-1]
-    shape, actors = Shape(sizes), torch.from_numpy(np.stack([history.actor for history in histories]))
+    return functools.partial(_mean, Shape(sizes), torch.from_numpy(np.stack([history.actor for history in histories])))
 
-    def act(states: np.ndarray) -> np.ndarray:
-        mean: np.ndarray = outputs(shape, actors, torch.from_numpy(states.copy()))[..., : sizes[-1] // 2].tanh().numpy()
-        return mean
 
-    return act
+def _mean(shape: Shape, actors: torch.Tensor, states: np.ndarray) -> np.ndarray:
+    import torch
+
+    from icrl_dist.experts.sac.stacked import outputs
+
+    mean: np.ndarray = outputs(shape, actors, torch.from_numpy(states.copy()))[..., : shape.sizes[-1] // 2].tanh().numpy()
+    return mean
 
 
 class ExpertPolicy:

@@ -7,16 +7,21 @@ import json
 import os
 import queue
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
-from icrl_dist.telemetry.logs import bound, stamp
+from icrl_dist.telemetry import processes
+from icrl_dist.telemetry.logs import bound
+
+CHECKPOINT_S = 60.0
+"""Seconds that a learner has to write its checkpoint when the run ends."""
 
 
 class TrainFailed(RuntimeError):  # noqa: N818
@@ -42,27 +47,38 @@ class LearnerProcess:
         self._error = ""
         self._finished = False
         self._excused: list[str] = []
+        self._processes: list[tuple[int, float]] = []
         self.deaths = 0
         """Number of restarts."""
         self._start()
 
     def _start(self) -> None:
-        command = [sys.executable, "-m", "learner", str(self._folder), "--endpoint", self.endpoint]
         self._log = (self._folder / "learner.err").open("ab")
-        self._log.write(f"{stamp()} the learner starts\n".encode())
-        self._log.flush()
-        pipe = subprocess.PIPE
-        environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}  # idle torch threads sleep: decision 073
-        self._process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=self._log, start_new_session=True, env=environment
-        )
-        threading.Thread(target=self._read, args=(self._process,), name="learner events", daemon=True).start()
+        events, write_end = os.pipe()
+        try:
+            command = processes.python("-m", "learner", str(self._folder), "--endpoint", self.endpoint)
+            command += ["--events", str(write_end), "--driver", str(os.getpid())]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=self._log,
+                stderr=self._log,
+                pass_fds=(write_end,),
+                start_new_session=True,
+                env=processes.environment(),
+            )
+        except BaseException:
+            os.close(events)
+            raise
+        finally:
+            os.close(write_end)
+        threading.Thread(target=self._read, args=(events,), name="learner events", daemon=True).start()
 
-    def _read(self, process: subprocess.Popen[bytes]) -> None:
-        assert process.stdout is not None
-        with process.stdout:
-            for line in process.stdout:
-                self._queue.put(json.loads(line))
+    def _read(self, events: int) -> None:
+        with open(events, "rb") as lines:
+            for line in lines:
+                if line.endswith(b"\n"):  # else the learner was killed while it wrote the line
+                    self._queue.put(json.loads(line))
 
     def events(self) -> Iterator[dict[str, Any]]:
         """Events since the last call; waits at most 0.1 s for the first one."""
@@ -88,12 +104,20 @@ class LearnerProcess:
         """
         if new := workers[len(self._excused) :]:
             self._excused += new
-            self._send(new)
+            self._send(lost=new)
 
-    def _send(self, workers: Sequence[str]) -> None:
+    def end_after_driver(self, processes: Iterable[psutil.Process]) -> None:
+        """Let the learner end these processes of this computer if this process dies before them."""
+        for process in processes:
+            with contextlib.suppress(psutil.Error):
+                if process.pid != self._process.pid:
+                    self._processes.append((process.pid, process.create_time()))
+        self._send(processes=self._processes)
+
+    def _send(self, **message: Sequence[Any]) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # the learner has died; watch() sends the list to the next one
-            os.write(self._process.stdin.fileno(), json.dumps(workers).encode() + b"\n")
+        with contextlib.suppress(BrokenPipeError):  # the learner has died; watch() sends everything to the next one
+            os.write(self._process.stdin.fileno(), json.dumps(message).encode() + b"\n")
 
     def watch(self, report: ReportEvent) -> None:
         """Restart the learner from its checkpoint if it was killed.
@@ -119,26 +143,28 @@ class LearnerProcess:
         report({"event": "note", "text": f"the learner died (exit code {code}); restarting it from its checkpoint"})
         self._close_files()
         self._start()
-        self._send(self._excused)
+        self._send(lost=self._excused, processes=self._processes)
 
     def interrupt(self, report: ReportEvent) -> None:
         """End the learner, which writes a checkpoint first."""
-        self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=60)
+        self._stop()
         for event in self.events():
             report(event)
 
     def end(self) -> None:
-        """Wait for the learner if it has finished, else terminate it; close its files."""
+        """Wait for the learner if it has finished, else end it as ``interrupt`` does; close its files."""
+        self._stop()
+        self._close_files()
+
+    def _stop(self) -> None:
+        """Wait for a finished learner, terminate another one; kill it if it has not ended when its time is over."""
+        if not self._finished:
+            self._process.terminate()
         try:
-            if not self._finished:
-                self._process.terminate()
-            self._process.wait(timeout=10)
+            self._process.wait(timeout=10 if self._finished else CHECKPOINT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._close_files()
 
     def _close_files(self) -> None:
         assert self._process.stdin is not None

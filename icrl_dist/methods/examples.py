@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -62,4 +63,11 @@ def cache(
 def draw(run: Run, pools: Sequence[Pool]) -> Draw:
     """What draws the training batches of these pools (``training.batches.draw``)."""
     optim = run.optim
-    return lambda rng: batches.draw(rng, pools, optim.batch, optim.queries, optim.transitions, optim.windows)
+    return functools.partial(
+        batches.draw,
+        pools=pools,
+        batch=optim.batch,
+        queries=optim.queries,
+        transitions=optim.transitions,
+        windows=optim.windows,
+    )

@@ -12,7 +12,7 @@ identity (n, m: a query's and a context token's normalized state; W_q, W_k, W_v:
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
@@ -98,6 +98,14 @@ class Decoder:
         """Store each layer's tokens, and make the views of them that ``query`` needs."""
         self._tokens = tokens
         self._views = [(layer, of[:, -1], of.transpose(1, 2), of) for layer, of in zip(self._layers, tokens, strict=True)]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the views: a pickled view would be a tensor of its own."""
+        return {name: value for name, value in self.__dict__.items() if name != "_views"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._set_tokens(self._tokens)
 
     def append(self, x: Float[Tensor, "B T D"]) -> None:
         """Append embedded tokens to the contexts; each token sees its whole context up to itself."""
@@ -199,7 +207,7 @@ class Decoder:
             normed = _layer_norm(x, layer.norm_attention)
             visible = torch.cat([tokens[row, :-1], recent[row, : self._recent_count], normed])
             # (E + Q, heads * D) -> (E + Q, heads, D): all heads share the tokens.
-            q = F.linear(normed, *layer.query).view(len(x), layer.heads, -1)
+            q = F.linear(normed, *layer.query).view(len(x), layer.heads, x.shape[1])
             scores = q @ visible.T
             scores[..., -len(x) :].masked_fill_(hidden[:, None], float("-inf"))
             x = layer.attn_out_and_mlp(x, (scores.softmax(-1) @ visible).flatten(1))

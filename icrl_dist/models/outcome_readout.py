@@ -85,8 +85,8 @@ class OutcomeModel:
         return score
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays by name, as stored in a checkpoint."""
-        return {name: getattr(self, name) for name in ("readout", "deviation", "typical", "rare")}
+        """Copies of the arrays by name, as stored in a checkpoint."""
+        return {name: getattr(self, name).copy() for name in ("readout", "deviation", "typical", "rare")}
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:

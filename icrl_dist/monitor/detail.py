@@ -7,7 +7,7 @@ from typing import Any
 
 from icrl_dist.monitor.lines import ACCENT, BOLD, DIM, GOOD, PLAIN, SPARK, TITLE, TROUBLE, WARNING, Line, cell
 from icrl_dist.monitor.spark import bounds, plot, room
-from icrl_dist.monitor.view_state import number, parameters_text, summary
+from icrl_dist.monitor.view_state import by_episode, number, parameters_text, summary
 
 _HEIGHT = 6
 """Lines of a plot."""
@@ -44,10 +44,11 @@ def _field(name: str, text: str) -> Line:
 
 def _phase(phase: dict[str, Any], adversary: dict[str, Any], width: int) -> list[Line]:
     """A plot of a phase's returns; its title names the phase's adversary if it differs from ``adversary``."""
-    returns, trials, optimum = phase["returns"], phase["trials"], phase["optimum"]
+    trials, optimum = phase["trials"], phase["optimum"]
+    returns = by_episode(trials, phase["returns"])
     low, high = bounds(returns, optimum)
     against = "" if phase["adversary"] == adversary else f", against {parameters_text(phase['adversary'], 'kind')}"
-    title: Line = [(f" RETURNS, {phase['name']}", TITLE), (f"  {len(returns)} episodes{against}", DIM)]
+    title: Line = [(f" RETURNS, {phase['name']}", TITLE), (f"  {len(trials)} episodes{against}", DIM)]
     if not returns:
         return [title]
     plot_width = max(10, width - 12)

@@ -69,6 +69,8 @@ class EventStream:
     async def _events(self) -> AsyncIterator[bytes]:
         viewer = _Viewer(asyncio.get_running_loop(), self._initial_event)
         with self._lock:
+            if len(self._viewers) >= MAX_VIEWERS:  # several requests passed the check in ``respond`` at the same time
+                return
             for event, encoded in self._state.items():
                 viewer.put(event, encoded, True)
             self._viewers.add(viewer)

@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol, Self
 
+from icrl_dist.monitor.catch_up import CatchUp
+from icrl_dist.monitor.evaluation import EvaluationReader, running
 from icrl_dist.monitor.recording import Recording
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.stream.link import Link
@@ -38,17 +40,45 @@ class Feed(Protocol):
 class LiveFeed:
     """A live run, over a link to its learner."""
 
-    def __init__(self, link: Link, run: str = "") -> None:
-        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint."""
+    def __init__(self, link: Link, run: str = "", folder: Path | None = None) -> None:
+        """Subscribes to the monitor plane of ``run``, by default of all runs at that endpoint; asks for its past.
+
+        ``folder``: the run folder, if it is on this machine: the evaluation runs when the learner has ended.
+        """
         self.state = RunState(run)
-        self._ended = threading.Event()
-        link.subscribe(f"icrl/{run or '*'}/mon/**", lambda key, payload: self.state.receive(key, payload, time.time()))
+        self._evaluation = None if folder is None else EvaluationReader(folder, self.state)
+        self._ended, self._lock = threading.Event(), threading.Lock()
+        self._epoch = ""
+        """Epoch of the state whose past was requested."""
+        self._collecting = ""
+        """The phase that is being collected."""
+        self._past = CatchUp(link, self.state)
+        link.subscribe(f"icrl/{run or '*'}/mon/**", self._receive)
         self._thread = threading.Thread(target=self._tick, name="run-state", daemon=True)
         self._thread.start()
 
+    def _receive(self, key: str, payload: bytes) -> None:
+        with self._lock:
+            self.state.receive(key, payload, time.time())
+            if self._begin():
+                self.state.receive(key, payload, time.time())
+            before, self._collecting = self._collecting, self.state.collecting
+            if before and before != self._collecting and self.state.working:
+                self._past.collected(self.state.name, before)
+
+    def _begin(self) -> bool:
+        """Request the past of a run that was just selected; returns whether there was one."""
+        if not self.state.name or self.state.epoch == self._epoch:
+            return False
+        self._past.begin(self.state.name)
+        self._epoch, self._collecting = self.state.epoch, ""
+        return True
+
     def _tick(self) -> None:
         while not self._ended.wait(PERIOD_S):
-            self.state.tick(time.time())
+            with self._lock:
+                self._begin()
+                self.state.tick(time.time())
 
     def now(self) -> float:
         return time.time()
@@ -62,6 +92,9 @@ class LiveFeed:
     def close(self) -> None:
         self._ended.set()
         self._thread.join(5.0)
+        self._past.close()
+        if self._evaluation is not None:
+            self._evaluation.close()
 
     def __enter__(self) -> Self:
         return self
@@ -79,7 +112,8 @@ class ReplayFeed:
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False
-        self._at = self._recording.begin
+        self._evaluation = EvaluationReader(folder, self.state)
+        self._at = self._recording.end if running(folder) else self._recording.begin  # not a past run: it is evaluated now
         self._messages = self._recording.messages()
         self._next = next(self._messages, None)
         self._ended = threading.Event()
@@ -135,6 +169,7 @@ class ReplayFeed:
     def close(self) -> None:
         self._ended.set()
         self._thread.join(5.0)
+        self._evaluation.close()
         self._recording.close()
 
     def __enter__(self) -> Self:

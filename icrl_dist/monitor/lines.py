@@ -17,6 +17,8 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
+from icrl_dist.stream.excerpts import plain
+
 PLAIN = Style.null()
 BOLD = Style(bold=True)
 DIM = Style(color="#8b93a7")
@@ -34,10 +36,10 @@ Line = list[Part]
 
 
 def safe(text: str) -> str:
-    """``text`` without the characters that are not printable or take no cell."""
+    """``text`` as printable text without the characters that take no cell."""
     if text.isascii() and text.isprintable():
         return text
-    return "".join(c for c in text if c.isprintable() and cell_len(c) > 0)
+    return "".join(c for c in plain(text, len(text)) if cell_len(c) > 0)
 
 
 def width_of(line: Line) -> int:
@@ -49,6 +51,16 @@ def spread(left: Line, right: Line, width: int) -> Line:
     """One line with a part at each end; the right part is left out where both do not fit."""
     gap = width - width_of(left) - width_of(right)
     return [*left, (" " * gap, PLAIN), *right] if gap > 0 else left
+
+
+def flow(head: Line, groups: Sequence[Line], width: int) -> list[Line]:
+    """``head`` and groups of parts on lines of at most ``width`` cells; a group is not divided."""
+    lines = [list(head)]
+    for group in groups:
+        if width_of(lines[-1]) + width_of(group) > width:
+            lines.append([])
+        lines[-1] += group
+    return lines
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,14 @@ from icrl_dist.monitor.lines import (
     Line,
     Lines,
     cell,
+    flow,
     spread,
 )
 from icrl_dist.monitor.spark import bar, plot
 from icrl_dist.monitor.view_state import ViewState, duration, number
 
-_STATES = {"collecting": GOOD, "fitting": GOOD, "finished": GOOD, "waiting": WARNING, "interrupted": WARNING}
+_GOOD_STATES = ("collecting", "fitting", "evaluating", "finished")
+_STATES = dict.fromkeys(_GOOD_STATES, GOOD) | {"waiting": WARNING, "interrupted": WARNING}
 """Styles of the normal states; any other state is styled as trouble."""
 _MAX_ALERTS = 4
 """Alerts shown in full; further ones are counted."""
@@ -42,7 +44,9 @@ class Header(Lines):
     def fill(self, view: ViewState, replay: dict[str, Any] | None, frozen: float | None, brief: bool) -> None:
         """Show ``view``; ``frozen``: when the view was frozen (Unix seconds), if it is; ``brief``: with a line of rates."""
         width = max(20, self.size.width)
-        lines = [_run(view), _stage(view, width), *([_brief(view)] if brief else [])]
+        top: list[Line] = [[(f" {part}", BOLD)] for part in textwrap.wrap(view.headline, width - 1)]
+        lines = [_run(view), *top, _stage(view, width), *([_brief(view)] if brief else [])]
+        lines += [*_training(view, width), *_held_out(view, width, 1 if brief else _MAX_LEVELS)]
         if replay is not None:
             lines.append(_replay(replay, width))
         if frozen is not None:
@@ -61,14 +65,12 @@ def _run(view: ViewState) -> Line:
     silent = f"SILENT for {run.get('silent_s') or 0:.0f} s"
     state_text = {"waiting": "waiting for the learner", "silent": silent}.get(state, state)
     kind = " · ".join(run[name] for name in ("method", "problem") if run.get(name))
+    alerts = f", {len(view.alerts)} alert{'s' if len(view.alerts) > 1 else ''}" if view.alerts else ""
     left: Line = [
         (f" {cell(run['name'], min(len(run['name']), 32)) if run.get('name') else 'no run yet'} ", BOLD),
         (f" {kind}  " if kind else " ", DIM),
-        (f"● {state_text}", _STATES.get(state, TROUBLE)),
+        (f"● {state_text}{alerts}", TROUBLE if alerts else _STATES.get(state, TROUBLE)),
     ]
-    if run.get("rounds"):
-        round_text = f"  round {run.get('round', 0) + 1} of {run['rounds']}"
-        left.append((f"  pretraining, {run['rounds']} rounds follow" if run.get("phase") == "pretrain" else round_text, PLAIN))
     if run.get("version", -1) >= 0:
         left.append((f"  T^{run['version']}", ACCENT))
     left.append((f"  {run.get('trajectories', 0):,} stored", PLAIN))
@@ -80,18 +82,50 @@ def _stage(view: ViewState, width: int) -> Line:
     if not run.get("steps"):
         return [(" no stage has started", DIM)]
     elapsed = f"elapsed {duration(run.get('elapsed_s'))}, left {duration(run.get('eta_s'))} "
-    version = run["version"]
-    if run.get("stage") == "fit":
-        name = f"fit T^{version + 1}"
-    elif run["phase"] == "pretrain":
-        name = "contexts, D^0"
-    else:
-        name = f"round {run['round']}: rollouts of T^{version}"
+    name = run["stage_text"]
     share = run["step"] / run["steps"]
     left = f", {duration(run['stage_eta_s'])} left" if run.get("stage_eta_s") else ""
     steps = f" {share:4.0%}  {run['step']:,} of {run['steps']:,}{left}"
     done, rest = bar(share, max(5, min(60, width - len(name) - len(steps) - len(elapsed) - 4)))
     return spread([(f" {name} ", PLAIN), (done, GOOD), (rest, DIM), (steps, PLAIN)], [(elapsed, DIM)], width)
+
+
+_PAST = {"loading": "  earlier episodes are being loaded", "missing": "  episodes before this view are missing"}
+_MAX_LEVELS = 3
+"""Strengths p whose held-out returns are shown, the largest."""
+
+
+def _training(view: ViewState, width: int) -> list[Line]:
+    """Mean training return of each phase, over the last five episodes, with the number of variations in the mean."""
+    if not view.averages:
+        return []
+    groups: list[Line] = []
+    for one in view.averages[-3:]:
+        of = f", {one['pending']} optima to compute" if one["pending"] else " of the optimum" if one["scaled"] else ""
+        groups.append(
+            [
+                (f"  {one['name']} ", DIM),
+                ("-" if one["last"] is None else f"{one['last']:.2f}", PLAIN),
+                (f"{of}, n {one['variations']} of {one['of']}", DIM),
+            ]
+        )
+    return flow([(" training returns", DIM)], [*groups, [(_PAST.get(view.past, ""), WARNING)]], width)
+
+
+def _held_out(view: ViewState, width: int, most: int) -> list[Line]:
+    """Held-out returns of every agent, with 95% intervals: shares of the ceiling where there is one, by p."""
+    levels = sorted(view.evaluation["levels"], key=lambda level: float(level["p"]))[-most:] if view.evaluation else []
+    lines: list[Line] = []
+    for level in levels:
+        groups: list[Line] = []
+        for agent in level["agents"]:
+            value, low, high = (agent["share"] if level["ceiling"] else None) or agent["value"]
+            interval = "" if low is None else f" [{low:.2f}, {high:.2f}]"
+            style = BOLD if agent["role"] == "newest" else PLAIN
+            groups.append([(f"  {agent['name']} ", DIM), (number(value, 2), style), (interval, DIM)])
+        of = f" of {level['ceiling']}" if level["ceiling"] else ""
+        lines += flow([(f" held-out{of}, p {level['p']:g}", DIM)], groups, width)
+    return lines
 
 
 def _brief(view: ViewState) -> Line:

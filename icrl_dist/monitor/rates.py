@@ -9,6 +9,9 @@ _POINTS = 900
 """Points kept of each series."""
 _PERIOD_S = 1.0
 """Time between points."""
+_GAP_S = 10.0
+"""Without a point for this time, nothing is known in between."""
+_OF_WORKERS = ("episodes_per_s", "steps_per_s", "unstored")
 SERIES = ("stored_per_s", "episodes_per_s", "steps_per_s", "fit_per_s", "loss", "lag", "unstored")
 
 
@@ -50,8 +53,11 @@ class RateSeries:
             else:
                 self._collected_s[run["phase"]] = run["steps"] / self._stage_per_s
 
-    def tick(self, now: float, seq: int, run: dict[str, Any], steps_per_s: float, unstored: int) -> None:
-        """Add a point if a second has passed."""
+    def tick(self, now: float, seq: int, run: dict[str, Any], steps_per_s: float, unstored: int, partial: bool) -> None:
+        """Add a point if a second has passed; after a gap also one without values, so that no line is drawn across it.
+
+        ``partial``: the values of workers are unknown.
+        """
         if self._last is None:
             self._last = (now, run["trajectories"], self._episodes)
         before, stored, episodes = self._last
@@ -59,6 +65,8 @@ class RateSeries:
         if 0 <= span < _PERIOD_S:
             return
         self._last = (now, run["trajectories"], self._episodes)
+        if span > _GAP_S and self._points:
+            self._append(seq, before + _PERIOD_S, dict.fromkeys(SERIES))
         fitting, span = run.get("stage") == "fit", max(span, 1e-3)
         values: dict[str, float | None] = {
             "stored_per_s": max(0, run["trajectories"] - stored) / span,
@@ -69,9 +77,14 @@ class RateSeries:
             "lag": run.get("lag"),
             "unstored": unstored,
         }
+        if partial:
+            values |= dict.fromkeys(_OF_WORKERS)
+        self._append(seq, now, values)
+        self.rates = {name: value for name, value in values.items() if value is not None}
+
+    def _append(self, seq: int, now: float, values: dict[str, float | None]) -> None:
         self._number += 1
         self._points.append((self._number, seq, now, values))
-        self.rates = {name: value for name, value in values.items() if value is not None}
 
     def series(self, since: int) -> dict[str, Any]:
         """Columns of the points added after ``since``: ``number``, ``t`` (Unix seconds) and each series; None for no value."""

@@ -15,25 +15,20 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from icrl_dist.config.run import ConfigError, load_folder
-from icrl_dist.methods import registry as methods
+from icrl_dist.monitor.metric_messages import Message, MetricMessages
 from icrl_dist.monitor.pauses import session_starts, without_pauses
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry import metric_rows
-from icrl_dist.telemetry.about import about
 
 _HEARTBEAT_S = 1.0
 """Time between two heartbeats of a worker."""
 _EPISODE_S = 1.0
 """Time between two drawn episodes of a worker."""
-
-Message = tuple[float, str, bytes]
-"""Time (Unix seconds), key and payload."""
 
 
 class Recording:
@@ -83,35 +78,9 @@ class Recording:
         return heapq.merge(self._from_metrics(), self._from_dataset(), key=lambda message: message[0])
 
     def _from_metrics(self) -> Iterator[Message]:
-        method = methods.of(self._run)
-        phases = method.phases(self._run)
-        jobs = {phase.next_version: method.ask(self._run, phase) for phase in phases}
-        expected = {version: sum(job.trials * len(job.variations) for job in some) for version, some in jobs.items()}
-        info = about(self._run, phases, [job for some in jobs.values() for job in some])
-        yield self._message(self.begin, "run", "run", **info, began=self.begin)
-        version, stored = -1, 0
-        by_version = {phase.next_version: phase for phase in phases}
-        for row in self._rows:
-            now, stage, step = row["time"], row["stage"], row["step"]
-            if stage in ("event", "alert"):
-                fields = {name: row[name] for name in ("worker", "alive", "identity", "active", "version") if name in row}
-                what = {"what": "alert", "alert": row["what"]} if stage == "alert" else {"what": row["what"]}
-                yield self._message(now, "event", "event", text=row["text"], **fields, **what)
-            elif stage == "version":
-                version = step
-            elif stage == "ingest" and step in by_version:
-                stored = row["trajectories"]
-                drops = {"all": int(row["drops"])} if row["drops"] else {}
-                values = {"step": row["arrived"], "steps": expected[step], "workers": row["workers"], "lag": row["lag"]}
-                yield self._progress(now, by_version[step], version, stored, **values, stage="collect", drops=drops)
-            elif stage.startswith("fit/") and int(stage[4:]) in by_version:
-                phase = by_version[int(stage[4:])]
-                values = {"step": step, "steps": phase.steps, "loss": row["loss"], "workers": 0, "lag": 0}
-                yield self._progress(now, phase, version, stored, **values, stage="fit", drops={})
-
-    def _progress(self, now: float, phase: Any, version: int, stored: int, **values: Any) -> Message:
-        common = {"phase": phase.stage, "round": phase.round, "version": version, "trajectories": stored, "doing": []}
-        return self._message(now, "learner", "learner", **common, **values)
+        made = MetricMessages(self._run, self._keys)
+        yield made.description(self.begin, self.begin)
+        yield from made.of(self._rows)
 
     def _from_dataset(self) -> Iterator[Message]:
         episodes: Counter[str] = Counter()
@@ -141,10 +110,8 @@ class Recording:
             "memory_mb": 0.0,
             "peak_mb": 0.0,
         }
-        return self._message(now, f"worker/{_key_part(row.worker)}", "worker", **fields, **counts)
-
-    def _message(self, now: float, topic: str, kind: str, **fields: Any) -> Message:
-        return now, self._keys.monitor(topic), wire.encode_message(kind, time=now, **fields)
+        payload = wire.encode_message("worker", time=now, **fields, **counts)
+        return now, self._keys.monitor(f"worker/{_key_part(row.worker)}"), payload
 
 
 def _key_part(worker: str) -> str:

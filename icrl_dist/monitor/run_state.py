@@ -11,12 +11,14 @@ import uuid
 from collections import Counter, deque
 from typing import Any
 
-from icrl_dist.monitor import readers, validation
+from icrl_dist.console import phase_names
+from icrl_dist.monitor import headline, readers, validation
 from icrl_dist.monitor.rates import RateSeries
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.monitor.variations import VariationTable
 from icrl_dist.monitor.workers import WorkerTable
 from icrl_dist.stream import validation as strict
+from icrl_dist.types import STAGES
 
 MAX_BYTES = 1 << 20
 """Larger messages are ignored."""
@@ -29,7 +31,7 @@ _BELIEF_S = 60.0
 """Age at which a belief is removed.  A worker sends a belief rarely (after 200 times its cost) where it costs much."""
 _MAX_VARIATIONS = 4096
 """Limit on the variations in one message."""
-_OVER = ("finished", "interrupted", "failed")
+_OVER = ("finished", "evaluating", "interrupted", "failed")
 
 
 class RunState:
@@ -44,6 +46,9 @@ class RunState:
         ``recorded``: the messages come from a recording, which has no heartbeats, so nothing counts as silent.
         """
         self._lock, self._only, self._recorded = threading.RLock(), run, recorded
+        self._evaluation: dict[str, Any] | None = None
+        self._evaluating, self._evaluated = False, 0
+        self._seq = 0
         self.clear()
 
     def clear(self) -> None:
@@ -65,24 +70,61 @@ class RunState:
             self._event_count = 0
             self._alerts: dict[str, dict[str, Any]] = {}
             self._beliefs: dict[str, dict[str, Any]] = {}
+            self.past = ""
+            """``loading`` while returns from before this view are requested, ``missing`` if the learner does not answer."""
 
     # Called by the feed.
 
-    def receive(self, key: str, payload: bytes, now: float) -> None:
-        """Take in one message of the monitor plane; any bytes are allowed."""
+    @property
+    def name(self) -> str:
+        """Name of the run that is shown; empty if there is none yet."""
+        return str(self._run["name"])
+
+    @property
+    def working(self) -> bool:
+        """Whether the run collects or fits, so its learner can answer."""
+        return self._run["state"] in ("collecting", "fitting")
+
+    @property
+    def collecting(self) -> str:
+        """The phase that is being collected, as ``adapt/1``; empty otherwise."""
+        with self._lock:
+            return "{phase}/{round}".format(**self._run) if self._run["state"] == "collecting" else ""
+
+    @property
+    def phases_so_far(self) -> list[str]:
+        """The phases up to the present one, oldest first."""
+        with self._lock:
+            names = [f"{stage}/{number}" for stage, number, _ in self._rates.phases]
+            now = "{phase}/{round}".format(**self._run) if "phase" in self._run else ""
+            return names[: names.index(now) + 1] if now in names else []
+
+    def has_all_phases(self, requested: int) -> bool:
+        """Whether the returns of ``requested`` older phases would not be kept: every variation has as many newer ones."""
+        with self._lock:
+            return self._variations.complete(self._run.get("variations", 0), requested)
+
+    def receive(self, key: str, payload: bytes, now: float, past: bool = False) -> None:
+        """Take in one message of the monitor plane; any bytes are allowed.
+
+        ``past``: an answer to a request, whose episodes were not finished now, so they do not count for rates.
+        """
         try:
             message = strict.unpack(payload, MAX_BYTES)
             kind = validation.text(message.get("kind"), 32)
-            run = validation.text(key.partition("/")[2].partition("/")[0], 200)
+            _, run, _, topic = (*key.split("/"), "", "", "", "")[:4]
+            if topic != kind:  # the access rules decide who may publish on a topic, so a kind has a topic of its own
+                raise InvalidMessageError("wrong topic")
+            run = validation.text(run, 200)
             with self._lock:
-                self._apply(run, kind, message, now)
+                self._apply(run, kind, message, now, past)
         except strict.WireError as error:
             self.ignored[error.reason] += 1
         except InvalidMessageError as error:
             self.ignored[str(error)] += 1
         self.received += 1
 
-    def _apply(self, run: str, kind: str, message: dict[str, Any], now: float) -> None:
+    def _apply(self, run: str, kind: str, message: dict[str, Any], now: float, past: bool) -> None:
         if kind == "learner":
             progress = readers.progress(message)
             self._select(run, now)
@@ -94,7 +136,7 @@ class RunState:
         elif run != self._run["name"]:
             raise InvalidMessageError("another run" if self._run["name"] else "no run yet")
         elif kind == "trajectories":
-            self._apply_returns(message)
+            self._apply_returns(message, past)
         elif kind == "episode":
             self._variations.add_episode(validation.identity(message.get("identity")), message)
         elif kind == "worker":
@@ -119,12 +161,13 @@ class RunState:
             self.clear()
         self._run["name"], self._last_message = run, now
 
-    def _apply_returns(self, message: dict[str, Any]) -> None:
+    def _apply_returns(self, message: dict[str, Any], past: bool) -> None:
         worker, time = validation.text(message.get("worker")), validation.timestamp(message.get("time"))
         invalid = None
         for entry in validation.bounded_list(message.get("variations"), _MAX_VARIATIONS):
             try:
-                self._rates.count_episodes(self._variations.add_returns(validation.mapping(entry), worker, time))
+                added = self._variations.add_returns(validation.mapping(entry), worker, time)
+                self._rates.count_episodes(0 if past else added)
             except InvalidMessageError as error:  # the valid entries of the message still count
                 invalid = error
         if invalid:
@@ -136,6 +179,9 @@ class RunState:
             run["state"] = {"collect": "collecting", "fit": "fitting"}[progress["stage"]]
             run.pop("ended", None)
         run.update({name: value for name, value in progress.items() if name != "time"})
+        adapts = run["phase"] == "adapt"
+        self._variations.begun = STAGES.index("adapt"), run["round"] + 1 if adapts else 0  # may begin before the next message
+        self._variations.collecting = (STAGES.index(run["phase"]), run["round"]) if run["stage"] == "collect" else None
         self._rates.update(run, now)
 
     def _apply_info(self, info: dict[str, Any]) -> None:
@@ -161,7 +207,7 @@ class RunState:
             self._variations.set_quarantine(event["identity"], text if what == "quarantine" else "")
         elif what == "version":
             self._run["version"] = event["version"]
-        elif what in _OVER:
+        elif what in _OVER and what != "evaluating":
             self._run["state"], self._run["ended"] = what, time
         self._event_count += 1
         self._events.append({"number": self._event_count, "time": time, "what": what, "text": text, "seq": self._seq + 1})
@@ -178,14 +224,24 @@ class RunState:
         """Number of ticks so far."""
         return self._seq
 
-    def tick(self, now: float) -> None:
-        """Advance time: update rates, compute some optima, and remove old beliefs."""
+    def set_evaluation(self, found: dict[str, Any] | None, running: bool) -> None:
+        """Show held-out returns (``monitor.evaluation.held_out``), and whether an evaluation runs; ``clear`` keeps both."""
+        with self._lock:
+            if found != self._evaluation:
+                self._evaluation, self._evaluated = found, self._seq + 1
+            self._evaluating = running
+
+    def tick(self, now: float, partial: bool = False) -> None:
+        """Advance time: update rates, compute some optima, and remove old beliefs.
+
+        ``partial``: only the learner's messages were received for this time, so the rates of workers are unknown.
+        """
         with self._lock:
             self._seq += 1
             self._workers.tick(now)
             rows = self._workers.rows(now)
             steps_per_s, unstored = sum(row["steps_per_s"] for row in rows), sum(row["unstored"] for row in rows)
-            self._rates.tick(now, self._seq, self._run, steps_per_s, unstored)
+            self._rates.tick(now, self._seq, self._run, steps_per_s, unstored, partial)
             self._variations.tick(self._seq)
             self._beliefs = {w: b for w, b in self._beliefs.items() if now - b["heard"] <= _BELIEF_S}
 
@@ -202,22 +258,30 @@ class RunState:
                 run["state"] = "silent"
             began = run.get("began")
             run["elapsed_s"] = max(0.0, run.get("ended", now) - began) if began is not None else None
+            if run["state"] == "finished" and self._evaluating:
+                run["state"] = "evaluating"
             working = run["state"] in ("collecting", "fitting")
             run["eta_s"] = self._rates.eta_s(run) if working else None
             run["stage_eta_s"] = self._rates.stage_eta_s(run) if working else None
             run["silent_s"] = max(0.0, silent_s) if self._last_message > float("-inf") else None
             run["rates"] = dict(self._rates.rates)
+            run["round_text"], run["stage_text"] = phase_names.round_text(run), phase_names.stage_text(run)
+            workers = self._workers.rows(now, run["state"] in _OVER, run["version"])
             changed, left_out = self._variations.changed(since)
             return {
                 "epoch": self.epoch,
                 "seq": self._seq,
                 "since": since,
                 "time": now,
+                "headline": headline.headline(run, workers, len(self._alerts), self._evaluation),
                 "run": run,
-                "workers": self._workers.rows(now, run["state"] in _OVER, run["version"]),
+                "workers": workers,
                 "variations": changed,
                 "variation_count": len(self._variations),
                 "variations_left_out": left_out,
+                "averages": self._variations.averages(),
+                "past": self.past,
+                "evaluation": self._evaluation if self._evaluated > since else None,
                 "episodes": self._variations.episodes(since),
                 "series": self._rates.series(since),
                 "events": [event for event in self._events if event["seq"] > since],

@@ -58,6 +58,8 @@ class TapWriter:
             return
         try:
             self._write(row)
+        except ValueError:  # NaN or an infinite number, which JSON does not have
+            return
         except OSError as error:
             self.error = error
             self._end()
@@ -75,7 +77,7 @@ class TapWriter:
             fields = {name: value for name, value in row.items() if name not in ("v", "kind")}
             sys.stdout.buffer.write(wire.encode_message("trajectory", **fields))
         else:
-            sys.stdout.write(json.dumps(row, default=bytes.hex) + "\n")
+            sys.stdout.write(json.dumps(row, default=bytes.hex, allow_nan=False) + "\n")
         sys.stdout.flush()
 
     def _passes(self, fields: dict[str, Any]) -> bool:

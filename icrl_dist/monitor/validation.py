@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from icrl_dist.stream.excerpts import plain
 from icrl_dist.types import Identity
 
 _LATEST = 2.5e11
@@ -16,11 +17,10 @@ class InvalidMessageError(Exception):
 
 
 def text(value: object, longest: int = 200) -> str:
-    """Text, cut to ``longest`` characters; control characters become spaces.  Raises InvalidMessageError otherwise."""
+    """Text as one printable line of at most ``longest`` characters.  Raises InvalidMessageError otherwise."""
     if type(value) is not str:
         raise InvalidMessageError("schema")
-    short = value[:longest]
-    return short if short.isprintable() else "".join(c if c.isprintable() else " " for c in short)
+    return plain(value, longest)
 
 
 def integer(value: object, low: int, high: int = 2**53) -> int:

@@ -1,4 +1,7 @@
-"""Returns of every variation over its episodes, and sampled episodes as drawings."""
+"""Returns of every variation over its episodes, and sampled episodes as drawings.
+
+What is kept does not depend on the order in which messages arrive: a view that joins late receives old returns after new ones.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,8 @@ import functools
 from collections import OrderedDict, deque
 from typing import Any, NamedTuple
 
+from icrl_dist.monitor import averages, validation
 from icrl_dist.monitor import drawing as drawings
-from icrl_dist.monitor import validation
 from icrl_dist.monitor.validation import InvalidMessageError
 from icrl_dist.types import STAGES, Identity
 
@@ -23,6 +26,8 @@ _MAX_ENTRIES = 4096
 _MAX_DRAWINGS = 48
 _OPTIMA_PER_TICK = 4
 """Each optimum takes some milliseconds to compute."""
+_PROMPT = 500
+"""Up to this many variations, averages are computed for every snapshot."""
 _CHANGES_PER_TICK = 200
 """Limit on the variations that become part of one change; the remaining ones follow at later ticks."""
 
@@ -54,12 +59,14 @@ _UNKNOWN = VariationInfo("", {}, {})
 class PhaseReturns:
     """One phase of a variation.  ICAA draws the adversary anew in every round, so the optimum differs by phase."""
 
-    __slots__ = ("info", "name", "optimum", "quarantine", "returns")
+    __slots__ = ("info", "name", "optimum", "pending", "quarantine", "returns")
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.info: VariationInfo | None = None
         self.optimum: float | None = None
+        self.pending = False
+        """Whether the optimum is not computed yet."""
         self.quarantine = ""
         """Why the variation was quarantined in this phase; may be set before any episode arrives."""
         self.returns: dict[int, float] = {}
@@ -72,21 +79,24 @@ class VariationReturns:
 
     def __init__(self) -> None:
         self.phases: dict[Pair, PhaseReturns] = {}
-        """By (stage, round), in order of arrival."""
-        self.lineage: deque[tuple[str, int, float, int, str, str, float]] = deque(maxlen=_MAX_LINEAGE)
+        """By (stage, round)."""
+        self.lineage: dict[tuple[Pair, int], tuple[str, int, float, int, str, str, float]] = {}
+        """The newest episodes, by phase and trial."""
         self.changed = 0
         """``seq`` of the newest change that snapshots contain."""
         self.dirty = False
         """Whether it changed since then."""
 
-    def phase(self, identity: Identity) -> PhaseReturns:
-        """The phase of ``identity``, added if needed; beyond the limit the phase that arrived first is removed."""
+    def phase(self, identity: Identity, begun: Pair) -> PhaseReturns:
+        """The phase of ``identity``, added if needed.
+
+        Beyond the limit one is removed, perhaps this one: a round after ``begun`` (it may be wrong), or the oldest.
+        """
         key = _phase_key(identity)
-        if key not in self.phases:
-            if len(self.phases) >= _MAX_PHASES:
-                del self.phases[next(iter(self.phases))]
-            self.phases[key] = PhaseReturns(f"{identity.stage}/{identity.round}")
-        return self.phases[key]
+        found = self.phases.setdefault(key, PhaseReturns(f"{identity.stage}/{identity.round}"))
+        if len(self.phases) > _MAX_PHASES:
+            del self.phases[min(self.phases, key=lambda key: (key <= begun, key))]
+        return found
 
 
 class VariationTable:
@@ -100,6 +110,13 @@ class VariationTable:
         self._dirty: deque[VariationReturns] = deque()
         self._episodes: OrderedDict[Pair, dict[str, Any]] = OrderedDict()
         self._next_seq = 1
+        self._averages: list[dict[str, Any]] = []
+        self.begun: Pair = len(STAGES), 0
+        """The last phase that may have begun; after all others while it is unknown."""
+        self.collecting: Pair | None = None
+        """The phase whose returns are arriving."""
+        self._averaged = True
+        """Whether these are the averages of the present returns and optima."""
 
     def __len__(self) -> int:
         """Number of variations in messages so far, those beyond the limit included."""
@@ -120,15 +137,17 @@ class VariationTable:
         known = self._variations[key].phases.get(phase_key) if key in self._variations else None
         info = known.info if known is not None and known.info is not None else VariationInfo.from_message(entry)
         variation = self._variation(key)
-        phase = variation.phase(identity)
+        phase = variation.phase(identity, self.begun)
         if phase.info is None:
-            phase.info = info
+            phase.info, phase.pending = info, True
             self._unsolved[key, phase_key] = None
             if len(self._unsolved) > _MAX_PHASES * MAX_VARIATIONS:
                 self._unsolved.popitem(last=False)
         for trial, episode_return in zip(trials, returns, strict=True):
             phase.returns[trial] = episode_return
-            variation.lineage.append((phase.name, trial, episode_return, version, digest, worker, time))
+            variation.lineage[phase_key, trial] = phase.name, trial, episode_return, version, digest, worker, time
+        for _ in range(len(variation.lineage) - _MAX_LINEAGE):
+            del variation.lineage[min(variation.lineage, key=lambda key: (key[0] <= self.begun, key))]
         for _ in range(len(phase.returns) - _MAX_RETURNS):
             del phase.returns[min(phase.returns)]
         self._mark_dirty(variation)
@@ -145,6 +164,7 @@ class VariationTable:
         return self._variations[key]
 
     def _mark_dirty(self, variation: VariationReturns) -> None:
+        self._averaged = False
         if not variation.dirty:
             variation.dirty = True
             self._dirty.append(variation)
@@ -155,7 +175,7 @@ class VariationTable:
         ``identity`` is any trial of it, which may never have started.  Raises InvalidMessageError.
         """
         variation = self._variation((identity.task, identity.variation))
-        variation.phase(identity).quarantine = cause
+        variation.phase(identity, self.begun).quarantine = cause
         self._mark_dirty(variation)
 
     def add_episode(self, identity: Identity, message: dict[str, Any]) -> None:
@@ -177,14 +197,15 @@ class VariationTable:
     def tick(self, seq: int) -> None:
         """Compute some optima, and make some changes visible to snapshots as of ``seq``."""
         self._next_seq = seq + 1
-        for _ in range(min(_OPTIMA_PER_TICK, len(self._unsolved))):
+        computed = 0
+        while self._unsolved and computed < _OPTIMA_PER_TICK:
             (key, phase_key), _ = self._unsolved.popitem(last=False)
             variation = self._variations[key]
             phase = variation.phases.get(phase_key)
             if phase is not None and phase.info is not None:
-                phase.optimum = drawings.optimum(*phase.info)
-                if phase.optimum is not None:
-                    self._mark_dirty(variation)
+                phase.optimum, phase.pending = drawings.optimum(*phase.info), False
+                computed += 1
+                self._mark_dirty(variation)
         for _ in range(min(_CHANGES_PER_TICK, len(self._dirty))):
             variation = self._dirty.popleft()
             variation.dirty, variation.changed = False, seq
@@ -193,6 +214,20 @@ class VariationTable:
         """Rows of the variations that changed after ``since``, and the number of variations beyond the limit."""
         rows = [_row(key, variation) for key, variation in sorted(self._variations.items()) if variation.changed > since]
         return rows, len(self._left_out)
+
+    def averages(self) -> list[dict[str, Any]]:
+        """See ``averages.of_newest``.  Of many variations they are computed at every eighth tick only."""
+        if not self._averaged and (len(self._variations) <= _PROMPT or self._next_seq % 8 == 0):
+            self._averaged = True
+            phases = (variation.phases for variation in self._variations.values())
+            limits = _MAX_PHASES, _MAX_RETURNS
+            self._averages = averages.of_newest(phases, self.begun, self.collecting, limits)
+        return self._averages
+
+    def complete(self, expected: int, phases: int) -> bool:
+        """Whether every one of ``expected`` variations has as many phases as are kept, after ``phases`` were requested."""
+        full = sum(len(variation.phases) >= _MAX_PHASES for variation in self._variations.values())
+        return phases >= _MAX_PHASES and full >= expected > 0
 
     def episodes(self, since: int) -> list[dict[str, Any]]:
         """Drawn episodes that arrived after ``since``, oldest first."""
@@ -209,7 +244,7 @@ class VariationTable:
             return None
         return {
             **_row(key, found),
-            "lineage": [_lineage_entry(key, *entry) for entry in found.lineage],
+            "lineage": [_lineage_entry(key, *entry) for _, entry in sorted(found.lineage.items())],
             "episode": self._episodes.get(key),
         }
 
@@ -252,4 +287,11 @@ def _phase_row(phase: PhaseReturns) -> dict[str, Any]:
     trials = sorted(phase.returns)
     returns = [round(phase.returns[trial], 4) for trial in trials]
     adversary = (phase.info or _UNKNOWN).adversary
-    return {"name": phase.name, "adversary": adversary, "optimum": phase.optimum, "trials": trials, "returns": returns}
+    return {
+        "name": phase.name,
+        "adversary": adversary,
+        "optimum": phase.optimum,
+        "pending": phase.pending,
+        "trials": trials,
+        "returns": returns,
+    }

@@ -38,6 +38,12 @@ class ViewState:
         self.events: deque[Row] = deque(maxlen=_MAX_EVENTS)
         """Oldest first."""
         self.time = 0.0
+        self.headline = ""
+        self.averages: list[Row] = []
+        """Mean training return of each phase, oldest first."""
+        self.past = ""
+        self.evaluation: Row | None = None
+        """Held-out returns."""
 
     def update(self, now: float) -> None:
         """Take in what has changed until ``now``."""
@@ -47,9 +53,10 @@ class ViewState:
             snapshot = self._state.snapshot(now)
             self._epoch = snapshot["epoch"]
         self._since, self.time = snapshot["seq"], snapshot["time"]
-        for name in ("run", "workers", "alerts", "ignored", "variation_count"):
+        for name in ("run", "workers", "alerts", "ignored", "variation_count", "headline", "averages", "past"):
             setattr(self, name, snapshot[name])
         self.left_out = snapshot["variations_left_out"]
+        self.evaluation = snapshot["evaluation"] or self.evaluation
         for variation in snapshot["variations"]:
             self.variations[variation["name"]] = summary(variation)
         numbers = snapshot["series"]["number"]
@@ -72,7 +79,7 @@ def summary(variation: Row) -> Row:
     mean = sum(recent) / len(recent) if recent else None
     derived = {
         "phase": newest["name"],
-        "returns": returns,
+        "returns": by_episode(newest["trials"], returns),
         "episodes": newest["trials"][-1] + 1 if newest["trials"] else 0,
         "last": returns[-1] if returns else None,
         "mean": mean,
@@ -84,6 +91,14 @@ def summary(variation: Row) -> Row:
     quarantine = f"quarantined {row['quarantine']}" if row["quarantine"] else ""
     search_text = " ".join((row["name"], row["phase"], row["adversary_text"], row["parameters_text"], quarantine))
     return row | {"search_text": search_text.casefold()}
+
+
+def by_episode(trials: list[int], returns: list[float]) -> list[float | None]:
+    """Returns in order of trial, with one None where trials are missing, however many these are."""
+    found: list[float | None] = []
+    for before, trial, value in zip([None, *trials], trials, returns, strict=False):
+        found += [value] if before is None or trial == before + 1 else [None, value]
+    return found
 
 
 _COMMON = ("size", "horizon")

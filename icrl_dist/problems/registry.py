@@ -6,6 +6,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+from icrl_dist import arrays
 from icrl_dist.config import plugins
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import ConfigError, Run
@@ -46,8 +47,10 @@ def of_task(task: Task) -> Problem:
 def batch(variations: Sequence[Variation]) -> Batch:
     """The variations as one batch, with a default section; where there is a run, use the ``batch`` of its problem.
 
-    Raises ValueError for an unknown problem or a mixed batch.
+    Raises ValueError for an unknown problem or a mixed batch, TypeError for what is no variation.
     """
+    if isinstance(variations, Variation) or not all(isinstance(one, Variation) for one in variations):
+        raise TypeError(f"batch: {arrays.short(variations)}: expected a list of Variation(task, adversary)")
     kinds = sorted({v.task.kind for v in variations})
     if len(kinds) != 1:
         raise ValueError(f"a batch holds variations of one problem, not {kinds}")
@@ -67,8 +70,11 @@ def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
     ``info["adversary"]`` has the action (see ``Step.adversary``).
 
     Observations are float32 ``(S,)`` in the environment's unit, actions integers or float32 vectors ``(A,)`` in [-1, 1].
-    Raises ValueError, with the nearest name, for a task of an unknown problem, and for another ``render_mode``.
+    Raises ValueError, with the nearest name, for an unknown problem, parameter or adversary, and for another
+    ``render_mode``; TypeError for what is no variation.
     """
+    if not isinstance(variation, Variation) or not isinstance(variation.task, Task):
+        raise TypeError(f"make: {arrays.short(variation)}: expected Variation(task, adversary)")
     return VariationEnv(variation, batch([variation]), render_mode)
 
 

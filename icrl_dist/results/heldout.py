@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from icrl_dist.agent import ood_score
-from icrl_dist.agent.loading import calibrated, checkpoint_file, outcomes_of, trained
+from icrl_dist.agent.loading import calibrated, checkpoint_file, open_checkpoint, outcomes_of, trained
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment, Run
@@ -23,8 +24,9 @@ from icrl_dist.results import evaluate, rows, training_rows
 from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.names import key_of
-from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Variation
 
 if TYPE_CHECKING:
@@ -33,11 +35,10 @@ if TYPE_CHECKING:
 
 def models(what: Path, deploy: Deployment | None = None) -> dict[Agent, TrainedModel]:
     """The newest model and, in a run folder with adapted versions, T^0, each with the rule that deploys it."""
-    file = checkpoint_file(what)
-    files = [file]
-    if what.is_dir() and load_checkpoint(file).manifest["version"] > 0:
-        files.append(checkpoint_file(what, 0))
-    return dict(_agent(load_checkpoint(file), deploy) for file in files)
+    found = [open_checkpoint(what)]
+    if what.is_dir() and found[0].manifest["version"] > 0:
+        found.append(open_checkpoint(what, 0))
+    return dict(_agent(checkpoint, deploy) for checkpoint in found)
 
 
 def _agent(checkpoint: Checkpoint, deploy: Deployment | None = None) -> tuple[Agent, TrainedModel]:
@@ -53,14 +54,14 @@ def calibrate(what: Path, report: ReportEvent) -> Checkpoint:
         event = {"event": "progress", "stage": "evaluate", "phase": "calibrating surprise"}
         report(event | {"step": episodes, "steps": 2 * ood_score.EPISODES})
 
-    return calibrated(load_checkpoint(checkpoint_file(what)), progress)
+    return calibrated(open_checkpoint(what), progress)
 
 
 def save_calibrated(folder: Path, report: ReportEvent) -> None:
     """Calibrate the newest checkpoint of a run; the file is written only if it was not calibrated before."""
     calibrated = calibrate(folder, report)
     file = checkpoint_file(folder)
-    if calibrated.part("outcomes") and not load_checkpoint(file).part("outcomes"):
+    if calibrated.part("outcomes") and not open_checkpoint(folder).part("outcomes"):
         save_checkpoint(file, calibrated)
 
 
@@ -71,7 +72,7 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     its weights digest.  The report of a checkpoint file begins with the name of that file; a long list of
     strengths p is replaced by its SHA-256.
     """
-    manifest = load_checkpoint(checkpoint_file(what)).manifest
+    manifest = open_checkpoint(what).manifest
     settings = run.evaluate
     levels = "_".join(repr(float(p)).removesuffix(".0") for p in settings.p)
     if len(levels) > 60:
@@ -82,12 +83,20 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     return f"{suite}-{prefix}{agent}-{rule}-{settings.prior}-p{levels}-{settings.episodes}episodes-{settings.seeds}seeds"
 
 
-def online(run: Run, what: Path, results: Path, report: ReportEvent, deploy: Deployment | None = None) -> pd.DataFrame:
+def online(
+    run: Run,
+    what: Path,
+    results: Path,
+    report: ReportEvent,
+    deploy: Deployment | None = None,
+    unstored: list[StoreError] | None = None,
+) -> pd.DataFrame:
     """Online returns of the folder's models, the newest first, and of the problem's references, as result rows.
 
-    The rows are written to the folder ``results``.  Models are deployed by ``deploy``; None: by the rule that they
-    were trained for.  If that rule is not Algorithm 1, the newest model is deployed by Algorithm 1 as well.  Rows of
-    the newest model have the OOD score after the last episode if it was calibrated.
+    The rows are written to the folder ``results``; ``unstored`` as in ``rows.record``.  Models are deployed by
+    ``deploy``; None: by the rule that they were trained for.  If that rule is not Algorithm 1, the newest model is
+    deployed by Algorithm 1 as well.  Rows of the newest model have the OOD score after the last episode if it was
+    calibrated.
     """
     check_suite(run, "online")
     found, problem = models(what, deploy), registry.of(run)
@@ -96,7 +105,7 @@ def online(run: Run, what: Path, results: Path, report: ReportEvent, deploy: Dep
     }
     newest, model = next(iter(found.items()))
     scores: list[Surprise] = []
-    if outcomes := outcomes_of(load_checkpoint(checkpoint_file(what))):
+    if outcomes := outcomes_of(open_checkpoint(what)):
 
         def scored(rows: Sequence[Variation], env: Batch) -> Policy:
             scores.append(Surprise(outcomes, model.spec, len(rows)))
@@ -113,7 +122,7 @@ def online(run: Run, what: Path, results: Path, report: ReportEvent, deploy: Dep
         column = np.full(one.returns.shape, np.nan)
         column[:, :, -1] = score.score().reshape(column.shape[:2])
         one.extra["surprise"] = column
-    return _recorded(run, what, results, "online", {"evaluated": evaluated}, deploy)
+    return _recorded(run, what, results, "online", {"evaluated": evaluated}, deploy, unstored)
 
 
 def _recorded(
@@ -122,13 +131,19 @@ def _recorded(
     results: Path,
     suite: str,
     found: Mapping[str, Sequence[evaluate.Result]],
-    deploy: Deployment | None = None,
+    deploy: Deployment | None,
+    unstored: list[StoreError] | None,
 ) -> pd.DataFrame:
-    """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows as they were read."""
+    """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows."""
     folder = run_folder(what)
-    name = what.stem if folder is None else folder.resolve().name
+    name = named(what.stem if folder is None else folder.resolve().name)
     blocks = [one.block(run, name, tasks) for tasks, ones in found.items() for one in ones]
-    return rows.read([rows.append(results, suite, report_name(run, what, suite, deploy), blocks)])
+    return rows.record(results, suite, report_name(run, what, suite, deploy), blocks, unstored)
+
+
+def named(name: str) -> str:
+    """The name of a file or folder as text: bytes that are no UTF-8 become escapes, such as ``run\\xff``."""
+    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 def run_folder(what: Path) -> Path | None:
@@ -152,26 +167,35 @@ def check_suite(run: Run, suite: str) -> None:
         raise ConfigError(f"--suite posterior: {run.problem} has no exact answers; use --suite online")
 
 
-def offline(run: Run, what: Path, results: Path, deploy: Deployment | None = None) -> pd.DataFrame:
+def offline(
+    run: Run,
+    what: Path,
+    results: Path,
+    deploy: Deployment | None = None,
+    unstored: list[StoreError] | None = None,
+) -> pd.DataFrame:
     """Offline returns of the folder's models and of references, given random and expert data; see ``online``."""
     evaluated = evaluate.offline(run, models(what, deploy), deploy)
-    return _recorded(run, what, results, "offline", {"evaluated": evaluated}, deploy)
+    return _recorded(run, what, results, "offline", {"evaluated": evaluated}, deploy, unstored)
 
 
 def experts(run: Run, folder: Path) -> pd.DataFrame:
     """The returns of all recorded episodes of a run's experts, which are written as result rows."""
     data = Dataset(folder / "dataset", readonly=True)
-    blocks = [training_rows.of_expert(run, folder.resolve().name, data.trials(key)) for key in data.variations("pretrain", 0)]
+    name = named(folder.resolve().name)
+    blocks = [training_rows.of_expert(run, name, data.trials(key)) for key in data.variations("pretrain", 0)]
     data.close()
-    return rows.read([rows.append(folder / "results", "experts", {}, blocks)])
+    return rows.record(folder / "results", "experts", {}, blocks)
 
 
-def posterior(run: Run, what: Path, results: Path, report: ReportEvent) -> tuple[pd.DataFrame, dict[str, Any]]:
+def posterior(
+    run: Run, what: Path, results: Path, report: ReportEvent, unstored: list[StoreError] | None = None
+) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Comparison of the newest model with the exact posterior, on training and on held-out tasks.
 
     Returns the online returns, which are written as result rows to the folder ``results``, and the numbers.
     """
-    agent, model = _agent(load_checkpoint(checkpoint_file(what)), "paper")
+    agent, model = _agent(open_checkpoint(what), "paper")
     suite, split = registry.of(run).posterior, registry.of(run).split
     assert suite is not None, "``check_suite`` refuses problems without one"
 
@@ -199,7 +223,7 @@ def posterior(run: Run, what: Path, results: Path, report: ReportEvent) -> tuple
     for name, tasks in (("test", split.test), ("train", split.train[: len(split.test)])):
         progress = _count(report, f"online, {_goals(name == 'test')}", run, 2)
         evaluated[name] = posterior_suite.online(run, (agent, act), tasks, progress)
-    frame = _recorded(run, what, results, "posterior", evaluated, "paper")
+    frame = _recorded(run, what, results, "posterior", evaluated, "paper", unstored)
     for name, which in (("paper_gap", "test"), ("paper_gap_train", "train")):
         numbers[name] = posterior_suite.gaps(frame[frame["tasks"] == which])
     return frame, numbers

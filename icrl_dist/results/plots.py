@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from icrl_dist.storage.files import atomic_write
+
 COLORS = ("#1f6feb", "#8957e5", "#d29922", "#2da44e")
 _EXACT = (
     ("#8c959f", (0, (1, 1.2))),
@@ -26,7 +28,7 @@ _PRIORS = {"": "own adversaries", "_any": "any adversary"}
 def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Path:
     """Return per online episode, one panel for each p (Figures 3b and 3d); exact agents are gray, the oracle is a line.
 
-    ``rows``: of ``summaries.result_rows``.  Returns ``path``.
+    ``rows``: of ``summaries.result_rows``.  Returns ``path``.  Raises StoreError if it cannot be written.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -125,6 +127,5 @@ def _is_exact(row: Mapping[str, Any]) -> bool:
 
 
 def _saved(figure: Any, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    atomic_write(path, lambda file: figure.savefig(file, format="png", dpi=130))
     return path

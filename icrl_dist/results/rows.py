@@ -7,15 +7,18 @@ inside functions, because workers and most commands need neither.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from icrl_dist.config.paths import folder_of
 from icrl_dist.config.run import ConfigError
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.telemetry import provenance
@@ -102,17 +105,50 @@ def append(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) 
     existing file is replaced.  Raises StoreError if the file cannot be written, ConfigError for a return that is no finite
     number.
     """
+    path, table = _made(folder, suite, settings, blocks)
+    _write(path, table)
+    return path
+
+
+def record(
+    folder: Path, suite: str, settings: object, blocks: Sequence[Block], unstored: list[StoreError] | None = None
+) -> pd.DataFrame:
+    """Write the rows of one evaluation as ``append`` does; returns them as ``read`` does.
+
+    A StoreError is added to ``unstored`` if that is given, and the rows are returned all the same.
+    """
+    path, table = _made(folder, suite, settings, blocks)
+    with keeping(unstored):
+        _write(path, table)
+    return _frame([table])
+
+
+def _made(folder: Path, suite: str, settings: object, blocks: Sequence[Block]) -> tuple[Path, pa.Table]:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     now = datetime.now(UTC)
-    while (path := folder / f"{suite}-{digest}-{now:%Y%m%dT%H%M%S.%f}Z.parquet").exists():
+    while os.path.lexists(path := folder / f"{suite}-{digest}-{now:%Y%m%dT%H%M%S.%f}Z.parquet"):
         now += timedelta(microseconds=1)
     fixed = {"format": FORMAT, "evaluation": path.stem, "written": now.isoformat(), "suite": suite}
-    table = pa.concat_tables([_table({**block, **fixed, **_made_by(block)}) for block in blocks])
+    return path, pa.concat_tables([_table({**block, **fixed, **_made_by(block)}) for block in blocks])
+
+
+def _write(path: Path, table: pa.Table) -> None:
+    import pyarrow.parquet as pq
+
     atomic_write(path, lambda file: pq.write_table(table, file, compression="zstd"))
-    return path
+
+
+@contextlib.contextmanager
+def keeping(unstored: list[StoreError] | None) -> Iterator[None]:
+    """Add the StoreError of a file that cannot be written to ``unstored``, so that results are shown anyway; None: raise it."""
+    try:
+        yield
+    except StoreError as error:
+        if unstored is None:
+            raise
+        unstored.append(error)
 
 
 def _made_by(block: Block) -> dict[str, Any]:
@@ -160,9 +196,12 @@ def read(files: Iterable[Path]) -> pd.DataFrame:
 
     Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
     """
+    return _frame([_read(path) for path in files])
+
+
+def _frame(tables: Sequence[pa.Table]) -> pd.DataFrame:
     import pyarrow as pa
 
-    tables = [_read(path) for path in files]
     frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
     frame["split_seed"] = frame["split_seed"].astype("Int64")
     return frame
@@ -225,12 +264,11 @@ def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = Fal
     import pandas as pd
 
     frames = []
-    for folder in dict.fromkeys(Path(one) for one in ([runs] if isinstance(runs, str | Path) else runs)):
-        if not folder.is_dir():
-            raise ConfigError(f"{folder}: no such run folder; `icrl-dist train demo` makes one in runs/demo")
+    listed = runs if isinstance(runs, Iterable) and not isinstance(runs, str | bytes) else [runs]
+    for folder in dict.fromkeys(folder_of("runs", one) for one in listed):
         if not unfinished and is_unfinished(folder):
             raise ConfigError(
-                f"{folder}: this run is not finished: continue it with `icrl-dist train RUN --out {folder} --resume`, "
+                f"{folder}: this run is not finished: continue it with `icrl-dist train --resume {folder}`, "
                 "or read what there is with read_results(..., unfinished=True)"
             )
         found = sorted((folder / "results").glob("*.parquet"), key=lambda path: path.stem.rsplit("-", 1)[-1])

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from icrl_dist.agent.loading import SHIPPED, checkpoint_file, shipped
+from icrl_dist.agent.loading import SHIPPED, open_checkpoint, shipped
+from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
-from icrl_dist.storage.checkpoint import load_checkpoint
+from icrl_dist.storage.files import StoreError
 
 Suite = Literal["online", "offline", "posterior"]
 Prior = Literal["uniform", "unseen"]
@@ -27,7 +28,7 @@ def evaluate(
     deploy: Deployment | None = None,
     episodes: int | None = None,
     seeds: int | None = None,
-    p: Sequence[float] | None = None,
+    p: Sequence[float] | float | None = None,
     prior: Prior | None = None,
     progress: Show = False,
 ) -> Evaluation:
@@ -35,7 +36,8 @@ def evaluate(
 
     ``what``: a run folder, a checkpoint file, or the name of an agent of the package (``"darkroom"``; ``"./darkroom"``
     is a folder of that name).  The new rows are also written to ``results/`` of the run, the numbers and the figure to
-    its ``report/``; for an agent of the package to runs/NAME-pretrained.
+    its ``report/``; for an agent of the package to runs/NAME-pretrained.  If a file cannot be written, for example in a
+    folder that can only be read, the result is returned all the same, and one of its ``notes`` says so.
 
     ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
     of a random or an expert episode; ``posterior`` for the distance to the exact posterior.
@@ -53,11 +55,11 @@ def evaluate(
     for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
         if value is not None and value not in get_args(choices):
             raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
-    run = parse_written(str(load_checkpoint(checkpoint_file(source)).manifest.get("run", "")), str(source))
+    run = parse_written(str(open_checkpoint(source).manifest["run"]), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,
-        "p": None if p is None else tuple(map(float, p)),
+        "p": None if p is None else _numbers("p", p),
         "prior": prior,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -69,23 +71,34 @@ def evaluate(
     rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)
     report = folder / "report" / heldout.report_name(run, source, suite, rule)
     results = (heldout.run_folder(source) or folder) / "results"  # rows of a checkpoint in a run folder belong to that run
+    unstored: list[StoreError] = []
     with reporting(progress) as show:
         if source.is_dir() and is_unfinished(source):
             text = f"{source}: this run is not finished; the newest version so far is evaluated"
             show({"event": "note", "text": text})
         if suite == "online":
-            found = reports.online(run, report, heldout.online(run, source, results, show, deploy))
+            rows = heldout.online(run, source, results, show, deploy, unstored)
+            found = reports.online(run, report, rows, unstored)
         elif suite == "offline":
-            found = reports.offline(run, heldout.offline(run, source, results, deploy))
+            found = reports.offline(run, heldout.offline(run, source, results, deploy, unstored), unstored)
         else:
-            found = reports.posterior(run, report, *heldout.posterior(run, source, results, show))
+            found = reports.posterior(run, report, *heldout.posterior(run, source, results, show, unstored), unstored)
     answer = {"suite": suite, "deploy": rule, "what": str(source)}
     return dataclasses.replace(found, summary=answer | found.summary)
+
+
+def _numbers(name: str, value: Sequence[float] | float) -> tuple[float, ...]:
+    """Several numbers, or a single one."""
+    listed = value if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
+    try:
+        return tuple(map(float, listed))
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} = {value!r}: expected a number or a list of numbers") from None
 
 
 def _source_and_output(what: str | Path) -> tuple[Path, Path]:
     """The run folder or checkpoint to evaluate, and the folder that its report and result rows are written below."""
     if what in SHIPPED:
         return shipped(what), Path("runs") / f"{what}-pretrained"
-    source = Path(what)
+    source = path_of("what", what)
     return source, source if source.is_dir() else source.parent

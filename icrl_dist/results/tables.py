@@ -86,7 +86,7 @@ def _with_interval(of: Interval, form: str) -> str:
     if math.isnan(of.value):
         return "-"
     value, low, high = (form.format(number) for number in of)
-    return value if math.isnan(of.low) else f"{value} \\[{low.removesuffix('%')}, {high.removesuffix('%')}]"
+    return value if math.isnan(of.low) else f"{value} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
 
 
 def _range(of: Interval, form: str) -> str:

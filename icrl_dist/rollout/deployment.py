@@ -10,6 +10,8 @@ from jaxtyping import Float, Float32, Int64
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
+from icrl_dist.config.toml import nearest
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer, Transitions, Windows
 
@@ -19,7 +21,7 @@ def default_deployment(model: ModelConfig) -> Deployment:
     return "committed" if model.window > 1 else "paper"
 
 
-class InContextPolicy:
+class InContextPolicy(CopiedWhole):
     """T_theta(. | s, D_on): the context is frozen within an episode and grows at its end.
 
     Lines 10 to 17 of Algorithm 1.  A context longer than ``context.max`` drops its oldest episodes and
@@ -91,7 +93,7 @@ class InContextPolicy:
         if self._watch is not None and self._deployed.state is not None:
             self._watch(self._deployed.state.cpu().numpy(), observation, action, reward, next_observation)
             self._deployed.state = None
-        self._pending.append((observation, action, next_observation, reward))
+        self._pending.append(tuple(np.array(column) for column in (observation, action, next_observation, reward)))
         if done:
             self._add_own(self._ended_episode())
 
@@ -177,6 +179,9 @@ class CommittedPolicy(InContextPolicy):
             self._deployed.append(Transitions(*(column[:, encoded:] for column in episode)))
 
 
+_RULES: dict[Deployment, type[InContextPolicy]] = {"paper": InContextPolicy, "committed": CommittedPolicy}
+
+
 def in_context(
     model: PretrainedTransformer,
     batch: int,
@@ -188,12 +193,14 @@ def in_context(
 
     ``watch`` is called after every decision with the decision and its outcome.
 
-    Raises ConfigError for ``committed`` if the model was not trained on action windows.
+    Raises ConfigError for an unknown rule, and for ``committed`` if the model was not trained on action windows.
     """
-    rule = deploy or default_deployment(model.config)
+    rule = default_deployment(model.config) if deploy is None else deploy
+    if rule not in _RULES:
+        raise ConfigError(f"deploy = {rule!r}{nearest(str(rule), tuple(_RULES))}: choose {' or '.join(_RULES)}")
     if rule == "committed" and model.config.window == 1:
         raise ConfigError(
             "deploy 'committed': this agent was not trained on action windows (model.window = 1); "
             "deploy it by 'paper', or train with model.window, pretrain.windows and optim.windows"
         )
-    return {"paper": InContextPolicy, "committed": CommittedPolicy}[rule](model, batch, context, watch)
+    return _RULES[rule](model, batch, context, watch)

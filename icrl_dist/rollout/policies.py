@@ -7,10 +7,11 @@ import abc
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
+from icrl_dist.copies import CopiedWhole
 from icrl_dist.models.sampling import sample
 
 
-class DiscretePolicy(abc.ABC):
+class DiscretePolicy(CopiedWhole, abc.ABC):
     """A policy given by its probabilities over discrete actions."""
 
     @abc.abstractmethod

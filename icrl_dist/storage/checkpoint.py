@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from icrl_dist.config.toml import ConfigError
-from icrl_dist.storage.files import StoreError, atomic_write
+from icrl_dist.storage.files import StoreError, atomic_write, require_file
 from icrl_dist.stream.validation import VERSION
 
 FORMAT = 1
@@ -65,8 +66,24 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     atomic_write(path, lambda file: np.savez(file, file_format=np.array(FORMAT), manifest=manifest, **arrays))
 
 
+class DamagedCheckpoint(StoreError):  # noqa: N818
+    """A checkpoint that is missing, or whose bytes changed after they were written; the fit can make it again."""
+
+
 class _OtherFormat(Exception):  # noqa: N818
     """A checkpoint of another file format, whose number is the message."""
+
+
+class _NotOurs(Exception):  # noqa: N818
+    """The file is no checkpoint; the message is the reason."""
+
+
+def _archive(opened: BinaryIO) -> Any:
+    """The arrays in a file, whose first bytes are those of a zip archive."""
+    if opened.read(4) != b"PK\x03\x04":
+        raise _NotOurs("it is no archive of arrays")
+    opened.seek(0)
+    return np.load(opened, allow_pickle=False)
 
 
 _RENAMED = {"stretch": "window", "produces": "next_version"}
@@ -77,29 +94,44 @@ _FORMER_PREFIX = re.compile("^optimiser/")
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint, also of an older version, without executing anything in it.
 
-    Raises StoreError if it is missing, of another format, or not a checkpoint.
+    Raises StoreError if it is of another format or cannot be read, DamagedCheckpoint if it is missing or not a checkpoint.
     """
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        require_file(path)
+        with path.open("rb") as opened, _archive(opened) as file:
             size, unpacked = path.stat().st_size, sum(member.file_size for member in file.zip.infolist())
             if unpacked > size:
-                raise ValueError(f"{size} bytes that would unpack to {unpacked}")
+                raise _NotOurs(f"{size} bytes that would unpack to {unpacked}")
+            if "manifest" not in file.files:
+                raise _NotOurs("it has no manifest")
             found = file["file_format"].item() if "file_format" in file.files else FORMAT  # 0.1.0 stored none
             if found != FORMAT:
                 raise _OtherFormat(found)
             manifest = json.loads(file["manifest"].tobytes())
             arrays = {name.removeprefix("a/"): file[name] for name in file.files if name.startswith("a/")}
             if not isinstance(manifest, dict) or not all(isinstance(array, np.ndarray) for array in arrays.values()):
-                raise ValueError("expected a manifest that is a table, and arrays")
+                raise _NotOurs("its manifest is no table")
             manifest = {_RENAMED.get(name, name): value for name, value in manifest.items()}
             arrays = {_FORMER_PREFIX.sub("optimizer/", name): array for name, array in arrays.items()}
     except FileNotFoundError:
-        raise StoreError(f"{path}: no such checkpoint") from None
+        raise DamagedCheckpoint(f"{path}: no such checkpoint") from None
+    except IsADirectoryError:
+        raise StoreError(f"{path}: is a folder; name a run folder or a checkpoint file") from None
+    except (PermissionError, NotADirectoryError) as error:
+        raise StoreError(f"{path}: the checkpoint cannot be read ({error.strerror}): make it readable") from None
     except _OtherFormat as error:
         raise StoreError(
             f"{path}: checkpoint of file format {error}, this version of icrl-dist reads format {FORMAT}: "
             "use the version that wrote it, or train again with this one"
         ) from None
+    except StoreError:
+        raise
+    except OSError as error:
+        if error.errno != errno.EIO:  # a disk that lost the bytes
+            raise StoreError(f"{path}: cannot be read ({error.strerror or error}): make it readable") from None
+        raise DamagedCheckpoint(f"{path}: cannot be read ({error.strerror})") from None
     except Exception as error:
-        raise StoreError(f"{path}: not a checkpoint of this system ({error})") from None
+        # Messages of numpy and zipfile stay out: one advises to allow pickle, which could execute code of the file.
+        reason = str(error) if isinstance(error, _NotOurs) else "its content is damaged, or another program wrote it"
+        raise DamagedCheckpoint(f"{path}: not a checkpoint of this system ({reason})") from None
     return Checkpoint(arrays, manifest)

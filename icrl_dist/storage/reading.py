@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from icrl_dist.config.paths import folder_of
 from icrl_dist.config.run import ConfigError
+from icrl_dist.copies import NotCopied
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.types import STAGES, Adversary, Identity, Task, Trajectory
 
@@ -24,20 +26,20 @@ def read_dataset(run_dir: str | Path) -> StoredData:
     --resume`` collects them again.
     Raises ConfigError if the folder holds no run, StoreError for a dataset of another format.
     """
-    folder = Path(run_dir)
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such run folder; `icrl-dist train demo` makes one in runs/demo")
+    folder = folder_of("run_dir", run_dir)
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"{folder}: holds no run; name a run folder, such as runs/demo")
     return StoredData(Dataset(folder / "dataset", readonly=True))
 
 
-class StoredData:
+class StoredData(NotCopied):
     """Trajectories of a run in canonical order: by stage, round, task, variation and trial.
 
     Iteration reads one trajectory after the other, so the dataset may be larger than the memory.  Use it as a context,
     or call ``close``: its files, one per segment, stay open until then.
     """
+
+    instead = "it holds open files; open the run folder a second time with read_dataset(...)"
 
     def __init__(self, store: Dataset, chosen: Callable[[Identity], bool] = lambda identity: True) -> None:
         self._store, self._chosen = store, chosen

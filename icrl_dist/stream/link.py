@@ -14,6 +14,9 @@ from typing import Protocol, Self
 
 _log = logging.getLogger(__name__)
 
+WORKER_TOPICS = ("worker", "trajectories", "episode", "belief")
+"""The topics of the monitor plane on which workers publish, each followed by the worker's name; the learner owns the others."""
+
 
 @dataclass(frozen=True, slots=True)
 class StreamKeys:
@@ -50,6 +53,16 @@ class StreamKeys:
         return f"icrl/{self.run}/mon/**"
 
     @property
+    def past(self) -> str:
+        """The learner answers requests of monitors for what the run has done so far here."""
+        return f"icrl/{self.run}/mon/past"
+
+    @property
+    def monitor_of_workers(self) -> tuple[str, ...]:
+        """The part of the monitor plane on which workers publish."""
+        return tuple(f"icrl/{self.run}/mon/{topic}/*" for topic in WORKER_TOPICS)
+
+    @property
     def heartbeats(self) -> str:
         """Every worker's heartbeat on the monitor plane."""
         return f"icrl/{self.run}/mon/worker/*"
@@ -77,12 +90,18 @@ def may_drop(key: str) -> bool:
 
 def _part(name: str) -> str:
     if not name or any(c in "/*$?#" or not c.isprintable() for c in name):
-        raise ValueError(f"{name!r} cannot be part of a key: it must not be empty nor hold any of / * $ ? #")
+        raise ValueError(
+            f"{name!r} cannot be part of a key: it must not be empty nor hold any of / * $ ? # or unprintable characters"
+        )
     return name
 
 
 class LinkError(OSError):
     """A link cannot be opened, or is closed; the message names the link and the remedy."""
+
+
+LOST = "lost"
+"""In the reason of a refused request for weights: they do not exist any more, so asking again is useless."""
 
 
 class Refused(Exception):  # noqa: N818

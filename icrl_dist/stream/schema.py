@@ -9,7 +9,7 @@ A field states its type and its range in one place::
 ``read`` decodes, ``as_data`` is its inverse, ``check`` repeats the range checks on an existing
 instance.  Types: bool, int, float, str, bytes, Literal, unions of these, ``X | None``, tuples,
 ``dict[str, T]``, nested dataclasses (not recursive ones) and Any.  Ranges are those of
-``annotated_types``: Gt, Ge, Lt, Le, Interval, MinLen, MaxLen, Len.
+``annotated_types``: Gt, Ge, Lt, Le, Interval, MinLen, MaxLen, Len, and Predicate together with a Remedy.
 """
 
 from __future__ import annotations
@@ -281,7 +281,7 @@ _LENGTHS: dict[type, tuple[str, Callable[[Any, Any], bool], str]] = {
 
 def _ranged(inner: _Reader, metadata: Sequence[object]) -> _Reader:
     """``inner`` with the ranges of an annotation; values without an order (None, text) skip numeric bounds."""
-    bounds, lengths, text = [], [], ""
+    bounds, lengths, predicates, text = [], [], [], ""
     for item in _ungrouped(metadata):
         if isinstance(item, Remedy):
             text = item.text
@@ -291,9 +291,11 @@ def _ranged(inner: _Reader, metadata: Sequence[object]) -> _Reader:
         elif type(item) in _LENGTHS:
             name, holds, words = _LENGTHS[type(item)]
             lengths.append((holds, getattr(item, name), words))
+        elif isinstance(item, at.Predicate):
+            predicates.append(item.func)
         elif isinstance(item, at.BaseMetadata):
             raise TypeError(f"{item!r}: a range of this kind is not checked")
-    if not bounds and not lengths:
+    if not bounds and not lengths and not predicates:
         return inner
     checks = [(holds, bound) for holds, bound, _ in bounds]
     remedy = text or "must be " + " and ".join(words.format(bound) for _, bound, words in bounds)
@@ -309,6 +311,8 @@ def _ranged(inner: _Reader, metadata: Sequence[object]) -> _Reader:
             for holds, bound, _ in lengths:
                 if not holds(len(found), bound):
                     _refuse(found, where, remedy_length)
+        if not all(holds(found) for holds in predicates):
+            _refuse(found, where, text)
         return found
 
     return read

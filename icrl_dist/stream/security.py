@@ -79,11 +79,13 @@ def _access(keys: StreamKeys) -> dict[str, object]:
         "worker receives replies": ("egress", ["reply", "declare_queryable"], requested),
         "worker subscribes to weights": ("ingress", ["declare_subscriber"], [keys.weights]),
         "worker receives weights": ("egress", ["put"], [keys.weights]),
-        "worker publishes to monitors": ("ingress", ["put"], [keys.monitor_all]),
+        "worker publishes to monitors": ("ingress", ["put"], list(keys.monitor_of_workers)),
         "worker learns of subscribers": ("egress", ["declare_subscriber"], monitored),
         "worker holds a liveliness token": ("ingress", ["liveliness_token"], [keys.alive_all]),
         "monitor subscribes": ("ingress", ["declare_subscriber"], monitored),
         "monitor receives messages": ("egress", ["put"], monitored),
+        "monitor asks for the past": ("ingress", ["query"], ["icrl/*/mon/past"]),
+        "monitor receives the past": ("egress", ["reply", "declare_queryable"], ["icrl/*/mon/past"]),
     }
     roles = ("worker", "monitor")
     return {
@@ -99,8 +101,11 @@ def _access(keys: StreamKeys) -> dict[str, object]:
 
 
 def folder(certificates: str) -> str:
-    """The folder's absolute path; empty if ``certificates`` is."""
-    return str(Path(certificates).expanduser().absolute()) if certificates else ""
+    """The folder's absolute path; empty if ``certificates`` is.  Raises LinkError for ``~`` if this user has no home."""
+    try:
+        return str(Path(certificates).expanduser().absolute()) if certificates else ""
+    except RuntimeError:
+        raise LinkError(f"{certificates}: this user has no home folder: set HOME, or write the whole path") from None
 
 
 def files(certificates: str, role: str) -> tuple[str, str, str]:

@@ -22,6 +22,8 @@ import zenoh
 from zenoh import CongestionControl, ConsolidationMode, Priority
 from zenoh.handlers import Callback
 
+from icrl_dist.stream import endpoints
+from icrl_dist.stream.admission import Admission, Descriptors
 from icrl_dist.stream.dispatch import Dispatcher, Mailbox, handle
 from icrl_dist.stream.link import (
     Done,
@@ -57,19 +59,29 @@ class ZenohLink(Link):
         self._mailboxes: list[Mailbox] = []
         self._declared: list[object] = []
         self._dispatcher = Dispatcher("zenoh-link")
+        self._admission: Admission | None = None
         atexit.register(self.close)
 
     @classmethod
-    def listen(cls, endpoint: str, config: Mapping[str, object] | None = None) -> ZenohLink:
+    def listen(cls, endpoint: str, config: Mapping[str, object] | None = None, largest: int = 64 << 20) -> ZenohLink:
         """Listen on ``endpoint``, such as ``tcp/127.0.0.1:7447``; with port 0 on a free port.
 
-        ``config`` sets further Zenoh keys (TLS, access control).  Raises LinkError if it cannot listen there.
+        ``config`` sets further Zenoh keys (TLS, access control).  A message of more than ``largest`` bytes is dropped
+        before it is complete.  Raises LinkError if it cannot listen there.
         """
-        settings = {"mode": "peer", "connect/endpoints": [], **(config or {})}
+        descriptors = Descriptors()
+        limits = {
+            "transport/unicast/max_sessions": descriptors.sessions,
+            "transport/unicast/accept_timeout": 5_000,
+            "transport/link/rx/max_message_size": largest,
+        }
+        settings = {"mode": "peer", "connect/endpoints": [], **limits, **(config or {})}
         for left in range(9, -1, -1):
             bound = _with_port(endpoint)
             try:
-                return cls(_open({**settings, "listen/endpoints": [bound]}), bound)
+                link = cls(_open({**settings, "listen/endpoints": [bound]}), bound)
+                link._admit(Admission(endpoints.parse(bound).port, descriptors))
+                return link
             except LinkError as error:
                 if bound == endpoint or not left:
                     raise LinkError(f"cannot listen on {endpoint}: {error}; free that port or name another") from error
@@ -96,6 +108,15 @@ class ZenohLink(Link):
             raise LinkError(
                 f"cannot connect to {endpoint} within {timeout_s:g} s: {error}; check that the learner runs and listens there"
             ) from error
+
+    def _admit(self, admission: Admission) -> None:
+        def on_link(event: zenoh.LinkEvent) -> None:
+            peer = str(event.link.dst).partition("/")[2]
+            admission.session(event.kind == zenoh.SampleKind.PUT, event.link.auth_identifier, peer)
+
+        self._admission = admission
+        info = self._session.info
+        self._declared.append(info.declare_link_events_listener(Callback(on_link, indirect=False), history=True))
 
     def send(self, key: str, payload: bytes, timeout_s: float, done: Done) -> None:
         number, caller = next(self._numbers), threading.get_ident()
@@ -178,6 +199,8 @@ class ZenohLink(Link):
                 return
             self._closed = True
         atexit.unregister(self.close)
+        if self._admission is not None:
+            self._admission.close()
         self._session.close()  # type: ignore[no-untyped-call]
         for number in list(self._pending):
             if (done := self._pending.pop(number, None)) is not None:

@@ -166,5 +166,5 @@ class Alerts:
             return None
         return (
             "labels",
-            f"label quality falls: {after:.0%} of round {newest}'s labels are optimal, {before:.0%} of round {newest - 1}'s",
+            f"label quality falls: {after:.0%} of adapt/{newest}'s labels are optimal, {before:.0%} of adapt/{newest - 1}'s",
         )

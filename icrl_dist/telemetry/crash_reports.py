@@ -16,10 +16,12 @@ from typing import Any
 
 import psutil
 
+from icrl_dist.stream.excerpts import plain
+from icrl_dist.stream.messages import LINE, TRACEBACK
 from icrl_dist.types import Identity, Job
 
-_LINE, _TEXT = 1_000, 20_000
-"""Characters that a record keeps of an exception, and of the end of a traceback."""
+MAX_FILES = 1_000
+"""Files in a run's folder of crash records; later records are not written."""
 
 
 def folder_of(run: Path) -> Path:
@@ -50,11 +52,12 @@ def memory() -> dict[str, float]:
 def raised(
     worker: str, label: str, error: BaseException, job: Job | None = None, identity: Identity | None = None
 ) -> dict[str, Any]:
-    """The record of a job that raised ``error`` while it made the trajectory ``identity``.
+    """The record, a ``messages.CrashRecord``, of a job that raised ``error`` while it made the trajectory ``identity``.
 
     ``label``: the job's name as text; ``job``: None if it could not be decoded.
     """
     place = traceback.extract_tb(error.__traceback__)[-1]
+    where = plain(f" ({Path(place.filename).name}:{place.lineno})")
     of_job = {"seed": job.seed, "policy_version": job.policy_version, "variations": len(job.variations)} if job else {}
     return {
         "what": "raised",
@@ -62,18 +65,23 @@ def raised(
         "time": time.time(),
         "job": label,
         "identity": str(identity) if identity else "",
-        "exception": _text(f"{type(error).__name__}: {error}"[:_LINE] + f" ({Path(place.filename).name}:{place.lineno})"),
+        "exception": plain(f"{type(error).__name__}: {error}", LINE - len(where)) + where,
         "spawn_key": list(identity.key()) if identity else [],
         **of_job,
         **memory(),
-        "traceback": _text("".join(traceback.format_exception(error))[-_TEXT:]),
+        "traceback": _encodable("".join(traceback.format_exception(error))[-TRACEBACK:])[-TRACEBACK:],
     }
 
 
 def write(run: Path, record: dict[str, Any]) -> Path:
-    """Write a record to its worker's next free file name; returns the file."""
+    """Write a record to its worker's next free file name; returns the file.
+
+    Raises OSError if it cannot be written, also if the folder holds ``MAX_FILES`` files.
+    """
     folder = folder_of(run)
     folder.mkdir(exist_ok=True)
+    if sum(1 for _ in folder.iterdir()) >= MAX_FILES:
+        raise OSError(f"{folder} holds {MAX_FILES} files, the limit: move them away to keep further ones")
     text, number = json.dumps(record, indent=1) + "\n", 1
     while True:
         path = folder / f"{record['worker']}-{number}.json"
@@ -86,7 +94,7 @@ def write(run: Path, record: dict[str, Any]) -> Path:
             return path
 
 
-def _text(text: str) -> str:
+def _encodable(text: str) -> str:
     """Text that UTF-8 can encode: an exception's text may hold lone surrogates."""
     return text.encode("utf-8", "backslashreplace").decode()
 

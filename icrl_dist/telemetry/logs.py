@@ -8,11 +8,12 @@ import logging.handlers
 import shutil
 import sys
 import threading
-import time
-from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+from icrl_dist.telemetry.budget import LogLines
+from icrl_dist.telemetry.stamps import stamp
 
 MAX_BYTES = 8 << 20
 """Size of a full log file; then it becomes ``NAME.1``."""
@@ -20,25 +21,17 @@ OLDER = 2
 """Full files of ``learner.log`` that are kept; of ``learner.err`` one is kept."""
 
 
-def stamp(at: float | None = None) -> str:
-    """A time (Unix seconds; None: now) as every log line and message has it: ``2026-05-17T09:30:00Z``."""
-    return datetime.fromtimestamp(time.time() if at is None else at, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-class LogFormat(logging.Formatter):
-    """``TIME message``."""
-
-    def __init__(self) -> None:
-        super().__init__("%(asctime)s %(message)s")
-
-    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802
-        return stamp(record.created)
-
-
 def log_to(file: Path) -> None:
-    """Write this process's log lines and warnings to ``file``, and the time before each traceback on standard error."""
+    """Write this process's log lines and warnings to ``file``, and the time before each traceback on standard error.
+
+    The lines are those of ``LogLines``.  Does nothing if they are written elsewhere.
+    """
+    if logging.getLogger().handlers:
+        return
     handler = logging.handlers.RotatingFileHandler(file, maxBytes=MAX_BYTES, backupCount=OLDER, encoding="utf-8")
-    handler.setFormatter(LogFormat())
+    lines = LogLines()
+    handler.setFormatter(lines)
+    handler.addFilter(lines)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     logging.captureWarnings(True)
 

@@ -13,7 +13,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO
 
 from icrl_dist.storage.files import atomic_write
 
@@ -26,22 +26,31 @@ OLDER = 4
 Row = dict[str, Any]
 
 
-def read(folder: Path) -> Iterator[Row]:
+def read(folder: Path, last_bytes: int | None = None) -> Iterator[Row]:
     """The valid rows of a run folder, in the order in which they were written; none if there is no file.
 
-    A file that becomes another one during the call is read once.
+    ``last_bytes``: read only so many bytes at the end.  A file that becomes another one during the call is read once.
     """
-    seen, opened = set[int](), list[TextIO]()
+    seen, opened, left = set[int](), list[BinaryIO](), last_bytes
     with contextlib.ExitStack() as closing:
         for path in _files(folder):  # the newest first: a file that is renamed meanwhile is found again, and none is missed
+            if not path.is_file():
+                continue
             try:
-                file: TextIO = closing.enter_context(path.open(encoding="utf-8", errors="replace"))
+                file: BinaryIO = closing.enter_context(path.open("rb"))
             except FileNotFoundError:
                 continue
-            number = os.fstat(file.fileno()).st_ino
-            if number not in seen:
-                opened.append(file)
-            seen.add(number)
+            status = os.fstat(file.fileno())
+            if status.st_ino in seen:
+                continue
+            seen.add(status.st_ino)
+            opened.append(file)
+            if left is not None:
+                if left < status.st_size:
+                    file.seek(status.st_size - left)
+                    file.readline()  # the rest of a line
+                    break
+                left -= status.st_size
         for file in reversed(opened):
             yield from filter(None, map(_parsed, file))
 
@@ -51,10 +60,10 @@ def _files(folder: Path) -> list[Path]:
     return [folder / NAME, *(folder / f"{NAME}.{number}" for number in range(1, OLDER + 1))]
 
 
-def _parsed(line: str) -> Row | None:
+def _parsed(line: bytes) -> Row | None:
     """The row of a line; None for a line that a kill or a full disk has left incomplete."""
     try:
-        row = json.loads(line)
+        row = json.loads(line.decode(errors="replace"))
     except ValueError:
         return None
     valid = isinstance(row, dict) and isinstance(row.get("stage"), str)
@@ -76,7 +85,7 @@ class RowWriter:
 
     def _end_last_line(self) -> None:
         """Cut off a line that was written in part, so that the next row does not become a part of it."""
-        if self._path.exists():
+        if self._path.is_file():  # a device has no last line
             with self._path.open("rb+") as file:
                 content = file.read()
                 if not content.endswith(b"\n"):
@@ -105,7 +114,7 @@ class RowWriter:
         for path in _files(self._folder):
             if path.exists():
                 lines = path.read_bytes().splitlines(keepends=True)
-                kept = [line for line in lines if (row := _parsed(line.decode(errors="replace"))) and not superseded(row)]
+                kept = [line for line in lines if (row := _parsed(line)) and not superseded(row)]
                 if len(kept) < len(lines):
                     atomic_write(path, lambda file, kept=kept: file.writelines(kept))  # type: ignore[misc]
         self._open()

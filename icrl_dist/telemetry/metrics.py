@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,8 +93,8 @@ class HeldOut:
 class Metrics:
     """Appends rows to the files of ``metric_rows``, and optionally to TensorBoard events and a Prometheus endpoint.
 
-    A number is written once for each step of its stage: a step that is not beyond the last one is left out, and what a
-    resumed run will fit again is removed by ``continue_from``.  Writing raises StoreError if a row cannot be written.
+    A number is written once for each step of its stage: a step that is written already is left out, and what a resumed
+    run will fit again is removed by ``continue_from``.  Writing raises StoreError if a row cannot be written.
     """
 
     def __init__(self, folder: Path, tensorboard: bool = True, prometheus: str = "") -> None:
@@ -116,17 +116,26 @@ class Metrics:
             self.write_text(time.time(), step, "alert", what=name, active=False, text=f"over: the learner has ended ({text})")
 
     def _read_last(self) -> None:
-        """Read the last step of each stage, and the alerts that are still active, from what is written."""
-        self._last: dict[str, float] = {}
+        """Read the steps of each stage, and the alerts that are still active, from what is written."""
+        self._steps = defaultdict[str, set[float]](set)
         self._alerts: dict[str, tuple[int, str]] = {}
         for row in metric_rows.read(self._folder):
             stage = row["stage"]
             if stage == "alert":
                 self._change_alert(str(row.get("what")), bool(row.get("active")), row["step"], str(row.get("text")))
             elif stage not in TEXTS:
-                number = row.get("trajectories", 0) if stage in SERIES else row["step"]
-                self._last[stage] = max(number, self._last.get(stage, number))
-        self._last["alert"] = event_files.last_step(self._events, "alert/")
+                self._is_new(stage, row.get("trajectories", 0) if stage in SERIES else row["step"])
+        self._changes = event_files.last_step(self._events, "alert/")
+
+    def _is_new(self, stage: str, step: float) -> bool:
+        """Add a step to those that are written; returns whether it was not written before, in a series whether it is larger."""
+        steps = self._steps[stage]
+        if step in steps or (stage in SERIES and steps and step < max(steps)):
+            return False
+        if stage in SERIES:
+            steps.clear()
+        steps.add(step)
+        return True
 
     def _change_alert(self, name: str, active: bool, step: int, text: str) -> None:
         if active:
@@ -140,13 +149,12 @@ class Metrics:
         ``version``: the newest policy version; ``step``: the optimizer steps of the next version that are done.
         """
 
-        def superseded(stage: str, of: float) -> bool:
-            kind, _, fitted = stage.partition("/")
-            if kind == "fit" and fitted.isdecimal():
-                return (int(fitted), of) > (version + 1, step)
-            return kind in ("version", "heldout") and of > version
+        fitted, next_version = f"fit/{version + 1}", version + 1
 
-        if any(superseded(stage, last) for stage, last in self._last.items()):
+        def superseded(stage: str, of: float) -> bool:
+            return (stage == fitted and of > step) or (stage == "version" and of == next_version)
+
+        if next_version in self._steps["version"] or any(of > step for of in self._steps[fitted]):
             self._remove(superseded)
 
     def _remove(self, superseded: Callable[[str, float], bool]) -> None:
@@ -172,11 +180,10 @@ class Metrics:
         if not keep:
             return
         number = values["trajectories"] if kind in SERIES else step
-        new = number > self._last.get(stage, -math.inf)
+        new = self._is_new(stage, number)
         if new or kind in SERIES:
             self._append(stage, step, values)
         if new:
-            self._last[stage] = number
             self._add_scalars(stage, number, values)
 
     def write_text(self, at: float, step: int, stage: str, **about: object) -> None:
@@ -190,8 +197,8 @@ class Metrics:
             self._change_alert(name, bool(about["active"]), step, str(about["text"]))
             kind = alert_kind(name)
             active = sum(alert_kind(other) == kind for other in self._alerts)
-            self._last["alert"] += 1
-            self._add_scalars("alert", self._last["alert"], {kind: active})
+            self._changes += 1
+            self._add_scalars("alert", self._changes, {kind: active})
             if self._exporter is not None:
                 self._exporter.set_alerts(kind, active)
 

@@ -6,12 +6,13 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from prometheus_client import CollectorRegistry, Gauge, start_http_server
+from prometheus_client import CollectorRegistry, Gauge
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from icrl_dist.stream.link import LinkError
 from icrl_dist.telemetry.alerts import KINDS
+from icrl_dist.telemetry.exporter import MetricsServer
 
 if TYPE_CHECKING:
     from icrl_dist.telemetry.metrics import HeldOut
@@ -42,7 +43,7 @@ class Exporter:
         """Set when the values are read."""
         registry.register(_Reading(self.read))
         try:
-            self._server, self._thread = start_http_server(int(port), host.strip("[]"), registry)
+            self._server = MetricsServer(host.strip("[]"), int(port), registry)
         except OSError as error:
             raise LinkError(
                 f"learner.prometheus = {endpoint!r}: cannot listen there ({error.strerror}); free that port or choose another"
@@ -62,9 +63,7 @@ class Exporter:
                 self._heldout[name].labels(self._run, f"{one.p:g}", one.agent, str(one.version)).set(value)
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        self._server.close()
 
 
 class _Reading(Collector):

@@ -112,6 +112,15 @@ def sessions(folder: Path) -> list[dict[str, Any]]:
         return []
 
 
+def readable(folder: Path) -> bool:
+    """Whether ``env.json`` holds records of sessions, or none of them yet."""
+    try:
+        found = json.loads((folder / FILE).read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and ("versions" in found or isinstance(found.get("sessions"), list))
+
+
 def create(folder: Path) -> None:
     """Write ``env.json`` of a new run, without sessions; keep the file of a run that continues."""
     if not (folder / FILE).exists():
@@ -121,12 +130,16 @@ def create(folder: Path) -> None:
 def add_session(folder: Path, policy_version: int, made_by: Mapping[str, Any]) -> str:
     """Add a session that begins now, at this policy version, to ``env.json``.
 
-    Returns how its record differs from the one that the run began with, as one line for the user; empty if it does not.
+    Returns how its record differs from the one that the run began with, or that the file was damaged, as one line for the
+    user; empty if there is nothing to say.
     Raises StoreError if the file cannot be written.
     """
+    damaged = (folder / FILE).exists() and not readable(folder)
     before = sessions(folder)
     began = {"began": datetime.now(UTC).isoformat(timespec="seconds"), "policy_version": policy_version}
     _write(folder, [*before, {**began, "cores": len(os.sched_getaffinity(0)), **made_by}])
+    if damaged:
+        return f"{folder / FILE}: was damaged, so its earlier sessions are lost; it is written anew"
     changed = differences(before[0], made_by) if before else ""
     return f"this run began with {changed}: digests can differ from those of an uninterrupted run" if changed else ""
 

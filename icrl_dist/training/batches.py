@@ -10,6 +10,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar, overload
 import numpy as np
 from jaxtyping import Float32, Int64, Integer
 
+from icrl_dist.copies import NotCopied
 from icrl_dist.types import Trajectory
 
 K = TypeVar("K", bound=Hashable)
@@ -92,8 +93,10 @@ class Examples:
         return sum(array.nbytes for array in (*own, *(self.windows or ())))
 
 
-class ExamplesCache(Generic[K]):
+class ExamplesCache(NotCopied, Generic[K]):
     """Reads examples when they are needed; keeps the most recently used in memory, up to ``budget`` bytes."""
+
+    instead = "it reads an open dataset; open the run folder again, and make it anew"
 
     def __init__(self, budget: int, read: Callable[[K], Examples]) -> None:
         self._budget, self._read = budget, read

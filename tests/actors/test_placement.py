@@ -1,11 +1,15 @@
 """Placement of workers on nodes that join and leave, and reports about nodes that do not join."""
 
+import os
 import socket
 
 import pytest
 
-from actors import missing
+from actors import missing, placement
 from actors.placement import Node, Placement
+from icrl_dist.config.run import ConfigError
+from icrl_dist.launch import train, whole_run
+from icrl_dist.launch.learner_process import TrainFailed
 from tests.optional import known
 
 
@@ -109,3 +113,26 @@ def test_expected_nodes_are_read_from_the_cluster_file(tmp_path):
     assert missing.expected(file) == missing.ExpectedNodes((), 5)
     file.write_text("[")
     assert missing.expected(file) == missing.ExpectedNodes()
+
+
+@pytest.mark.parametrize(("cores", "workers"), [(1, 1), (2, 2), (8, 2)])
+def test_a_process_on_one_core_starts_one_worker(monkeypatch, cores, workers):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)))
+    assert placement.local_actors() == workers
+    placement.check_cores(placement.local_actors())
+    with pytest.raises(ConfigError, match=rf"--actors {cores + 1}: this machine has {cores} cores?\b"):
+        placement.check_cores(cores + 1)
+
+
+def test_a_run_without_a_number_of_workers_begins_on_one_core(module_run, monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
+    asked = list[int | None]()
+
+    def started(run, folder, actors, *rest):
+        asked.append(actors)
+        raise TrainFailed("far enough")
+
+    monkeypatch.setattr(train, "train_ray", started)
+    with pytest.raises(TrainFailed):
+        whole_run.train(module_run, tmp_path / "run")
+    assert asked == [1]

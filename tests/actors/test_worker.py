@@ -34,9 +34,17 @@ from icrl_dist.types import Weights
 from tests.calls import keeping
 from tests.contracts.link_battery import eventually
 from tests.jobs import jobs_of
+from tests.stream.examples import trajectory
 from tests.toys.site import CORRIDOR, SLIPPERY, installed
 
 KEYS = StreamKeys("test")
+
+
+def test_a_trajectory_that_the_learner_would_drop_is_not_sent():
+    payload = worker_module._encoded(trajectory(), 1 << 20)
+    assert len(batching.join([payload])) <= len(payload) + worker_module._ENVELOPE
+    with pytest.raises(wire.WireError, match=r"oversized: .*raise stream\.max_message_bytes = 100"):
+        worker_module._encoded(trajectory(), 100)
 
 
 def untrained(run):

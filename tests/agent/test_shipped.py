@@ -157,5 +157,5 @@ def test_an_agent_uses_its_own_number_of_threads_and_leaves_that_of_the_process(
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
-    with pytest.raises(ConfigError, match="threads = 0: use at least 1"):
+    with pytest.raises(ConfigError, match="threads = 0: expected a whole number of at least 1, or None"):
         load_agent("darkroom", threads=0)

@@ -233,12 +233,17 @@ def test_a_stopped_evaluation_prints_the_command_that_resumes(monkeypatch, tmp_p
         signal.raise_signal(getattr(signal, name))
         pytest.fail("the signal was ignored")
 
-    monkeypatch.setattr(train, "train_inline", lambda *_: {})
+    def trained(run, folder, report):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "version-0000.npz").touch()
+        return {}
+
+    monkeypatch.setattr(train, "train_inline", trained)
     monkeypatch.setattr(heldout, "save_calibrated", stopped)
     assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
     assert (
-        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the checkpoint"
+        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the last checkpoint"
         in printed
     )
     assert (tmp_path / "run" / "run.toml").exists()
@@ -285,3 +290,13 @@ def test_a_reader_that_closes_the_pipe_ends_a_command_without_a_message(small_ru
     script = f"{command} > >(exec 0<&-); echo $?"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=120)
     assert (done.stdout, done.stderr) == ("141\n", "")
+
+
+def test_a_current_folder_that_was_deleted_is_named(tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main.main(["doctor"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "the current folder cannot be used (No such file or directory): change to another one" in line

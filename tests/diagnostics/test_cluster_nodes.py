@@ -12,6 +12,7 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import cluster_nodes, doctor, node_facts
 from icrl_dist.diagnostics.checks import table
 from icrl_dist.stream import endpoints
+from tests.actors.fake_ray import FakeJobConfig
 
 HERE = node_facts.facts()
 
@@ -27,6 +28,7 @@ class FakeRay:
         self.answer, self.asked = answer, {}
 
     exceptions = SimpleNamespace(AuthenticationError=PermissionError)
+    job_config = SimpleNamespace(JobConfig=FakeJobConfig)
 
     def init(self, **options):
         pass

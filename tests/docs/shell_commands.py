@@ -52,6 +52,7 @@ fi
 
 _PROGRAMS = (
     *("icrl-dist", "ray", "make", "git", "pip", "python", "python3", "python3.11", "ssh", "ssh-copy-id", "rm", "cd"),
+    *("sbatch", "scancel", "sudo", "systemctl", "journalctl", "kubectl"),
     *("aws", "gcloud", "openssl", "head", "nohup", "jq", "du", "deploy/zenoh/certificates.sh", ".venv/bin/python"),
 )
 

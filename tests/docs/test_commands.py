@@ -20,7 +20,7 @@ PAGES = [
     *sorted(Path("docs").glob("*.md")),
     *sorted(Path("docs/results").glob("*.md")),
 ]
-CLUSTERS = sorted(Path("deploy/clusters").glob("*.yaml"))
+CLUSTERS = [*sorted(Path("deploy/clusters").glob("*.yaml")), *sorted(Path("deploy/batch").iterdir())]
 SOURCES = sorted(Path("icrl_dist/cli").glob("*.py"))
 COMMAND_PAGE = Path("docs/commands.md")
 
@@ -96,7 +96,7 @@ def test_every_command_of_a_page_is_accepted(page, runs):
 
 
 @pytest.mark.parametrize("page", CLUSTERS, ids=str)
-def test_every_command_in_the_comments_of_a_cluster_file_is_accepted(page, runs):
+def test_every_command_in_the_comments_of_a_file_is_accepted(page, runs):
     text = comments((ROOT / page).read_text())
     assert blocks(text), "the file says how it is used"
     assert not faults([*blocks(text), *spans(text)], runs), page

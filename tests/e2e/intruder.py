@@ -90,6 +90,16 @@ def forge_the_monitor_key(scene):
     return scene.succeeds(lambda: scene.intruder.put(KEYS.monitor("learner"), b"forged"))
 
 
+def delete_the_monitor_key(scene):
+    scene.monitor.subscribe(KEYS.monitor_all, scene.record)
+    return scene.succeeds(lambda: scene.intruder.delete(KEYS.monitor("worker/w0")))
+
+
+def forge_a_heartbeat(scene):
+    scene.learner.subscribe(KEYS.heartbeats, scene.record)
+    return scene.succeeds(lambda: scene.intruder.put(KEYS.monitor("worker/w0"), b"forged"))
+
+
 def forge_another_run(scene):
     scene.monitor.subscribe("icrl/*/mon/**", scene.record)
     return scene.succeeds(lambda: scene.intruder.put(StreamKeys("other").monitor("learner"), b"forged"))
@@ -139,6 +149,16 @@ def ask_for_the_weights(scene):
     return scene.succeeds(lambda: scene.request(KEYS.weights_latest))
 
 
+def ask_for_the_past(scene):
+    scene.learner.serve(KEYS.past, lambda query: query.reply(b"returns"))
+    return scene.succeeds(lambda: scene.request(KEYS.past))
+
+
+def serve_the_past(scene):
+    scene.serve(KEYS.past)
+    return scene.succeeds(lambda: answered(scene.monitor, KEYS.past))
+
+
 def ask_for_anything(scene):
     return scene.succeeds(lambda: scene.request("**"))
 
@@ -170,8 +190,9 @@ def list_the_workers(scene):
 
 
 BOTH_ROLES = [forge_weights, delete_weights, read_the_data_of_others, serve_the_weights, serve_everything, read_everything]
-BOTH_ROLES += [ask_for_anything, forge_another_run, watch_the_workers, list_the_workers]
-MONITOR_ONLY = [forge_the_monitor_key, read_the_weights, ask_for_work, send_data, ask_for_the_weights, pose_as_a_worker]
-FORBIDDEN = [("worker", action) for action in [*BOTH_ROLES, read_the_monitor_key]] + [
+BOTH_ROLES += [serve_the_past, ask_for_anything, forge_another_run, watch_the_workers, list_the_workers]
+BOTH_ROLES += [forge_the_monitor_key, delete_the_monitor_key]
+MONITOR_ONLY = [forge_a_heartbeat, read_the_weights, ask_for_work, send_data, ask_for_the_weights, pose_as_a_worker]
+FORBIDDEN = [("worker", action) for action in [*BOTH_ROLES, read_the_monitor_key, ask_for_the_past]] + [
     ("monitor", action) for action in [*BOTH_ROLES, *MONITOR_ONLY]
 ]

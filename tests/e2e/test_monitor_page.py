@@ -13,14 +13,17 @@ import pytest
 
 from icrl_dist.monitor import variations
 from icrl_dist.monitor.drawing import optimum
+from icrl_dist.monitor.evaluation import of_rows
 from icrl_dist.monitor.feed import LiveFeed
 from icrl_dist.monitor.page import serving_run
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.stream.validation import from_array
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
+from tests.monitor.test_evaluation import evaluated
 from tests.monitor.test_page import CountingFeed
 from tests.optional import known
+from tests.results.row_blocks import frame
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -273,6 +276,45 @@ def test_every_round_is_divided_by_its_own_optimum_and_many_alerts_leave_room(pa
         until(page, "document.querySelector('#alerts').scrollTop > 1000")
         run.send("run", **ABOUT, alerts=[])  # the list in a run message replaces the alerts
         expect(page, "#alerts p").to_have_count(0)
+
+
+def test_what_the_run_is_worth_alerts_and_a_filter_that_matches_nothing(page):
+    with plane() as run, shown(page, run.feed) as url:
+        for trial in (0, 1, 2, 5, 6):  # 3 and 4 are missing
+            run.send_return("0/0", trial, 1.0 + trial, problem="unknown")
+        for trial in range(4):
+            run.send_return("0/1", trial, 2.0, problem="unknown")
+        run.send("run", **ABOUT | {"rounds": 2})
+        page.goto(url)
+        expect(page, "#headline").to_contain_text("Round 1 of 2 (adapt/0), ")
+        expect(page, "#stage").to_have_text("adapt/0: rollouts of T^0")
+        expect(page, "#round").to_have_text("1 of 2 (adapt/0)")
+        expect(page, "#adaptation-summary").to_contain_text("mean of 1 variation in episodes 1 to 4 (n = 1 of 2)")
+        expect(page, "#adaptation-summary").to_contain_text("earlier episodes are missing")
+        line = page.locator("#variation-table tbody tr").first.locator("path")
+        assert line.get_attribute("d").count("M") == 2, "no line across the missing episodes"
+        page.get_by_label("Task").fill("7")
+        expect(page, "#adaptation-summary").to_have_text("No variation matches the filters.")
+        expect(page, "#adaptation canvas").to_have_count(0)
+        page.get_by_label("Task").fill("")
+        expect(page, "#adaptation canvas").to_have_count(1)
+
+        run.send("event", what="alert", alert="zero", active=True, text="no returns")
+        expect(page, "#state").to_have_text("collecting, 1 alert")
+        until(page, "document.title === '(1 alert) a-run: collecting'")
+        expect(page, "#heldout").to_be_hidden()
+        run.send("event", what="finished", text="done")
+        run.feed.state.set_evaluation(None, True)
+        expect(page, "#heldout-note").to_have_text("The evaluation on held-out tasks is running.")
+        until(page, "document.title === '(1 alert) a-run: evaluating'")
+        run.feed.state.set_evaluation(of_rows(frame(*evaluated(0.0), *evaluated(3.0, p=0.2))), False)
+        expect(page, "#headline").to_contain_text(" of oracle, T^0 ")
+        expect(page, "#heldout-table tbody th").to_have_text(["T^2 (dpt)", "T^0", "random", "oracle"])
+        expect(page, "#heldout-note").to_contain_text("T^2 (dpt): higher than T^0 (difference ")
+        page.get_by_label("Strength p").select_option("p = 0")
+        expect(page, "#heldout-note").to_contain_text("T^2 (dpt): a difference from T^0 is not shown")
+        expect(page, "#heldout-note").to_contain_text("one training: nothing is claimed beyond it. 1 further reference")
+        assert page.locator(".key", has_text="random, held-out").count() == 1, "no optimum: returns stand beside references"
 
 
 def test_a_recording_is_controlled_by_keyboard(page):

@@ -4,11 +4,13 @@ import contextlib
 import functools
 import json
 import shutil
+import socket
+import ssl
 
 import pytest
 
 from icrl_dist.cli import main
-from icrl_dist.stream import security
+from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import LinkError, Refused, Unanswered
 from icrl_dist.stream.zenoh_link import ZenohLink
 from tests import certificates
@@ -56,6 +58,26 @@ def test_only_a_certificate_of_the_same_authority_is_accepted(certified, foreign
         with pytest.raises(LinkError, match="cannot connect"):
             ZenohLink.connect(unencrypted, 1.5).close()
         assert accepted(link, right), "the valid one is still accepted"
+        rotated = certificates.make(shutil.copytree(certified, tmp_path / "rotated"))
+        assert accepted(link, security.client(rotated, "worker")), "a new certificate, before the learner's is replaced"
+    with listening(rotated) as link:
+        assert accepted(link, right), "an old one, after it"
+
+
+def test_the_learner_speaks_tls_1_3_only(certified):
+    with listening(certified) as link:
+        place = ("127.0.0.1", endpoints.parse(link.endpoints[0]).port)
+        for version, spoken in ((ssl.TLSVersion.TLSv1_3, True), (ssl.TLSVersion.TLSv1_2, False)):
+            context = ssl.create_default_context(cafile=f"{certified}/ca.pem")
+            context.load_cert_chain(f"{certified}/worker.pem", f"{certified}/worker.key")
+            context.minimum_version = context.maximum_version = version
+            with socket.create_connection(place, timeout=OPEN_S) as plain:
+                if spoken:
+                    with context.wrap_socket(plain, server_hostname="127.0.0.1") as encrypted:
+                        assert encrypted.version() == "TLSv1.3"
+                else:
+                    with pytest.raises(ssl.SSLError):
+                        context.wrap_socket(plain, server_hostname="127.0.0.1")
 
 
 def test_a_worker_accepts_only_the_learners_certificate(certified, foreign, tmp_path):
@@ -106,6 +128,8 @@ def test_each_role_may_do_what_it_needs(certified):
         assert worker.has_subscribers(KEYS.monitor("trajectories/w0")) and not worker.has_subscribers(KEYS.monitor("belief/w0"))
         monitor.subscribe("icrl/*/mon/**", lambda key, payload: None)
         eventually(lambda: worker.has_subscribers(KEYS.monitor("belief/w0")), OPEN_S)
+        learner.serve(KEYS.past, lambda query: query.reply(b"past of " + query.payload))
+        eventually(lambda: answered(monitor, KEYS.past, b"rounds") == b"past of rounds", OPEN_S)
         eventually(lambda: published(learner, KEYS.weights, b"T^1", weights), OPEN_S)
         eventually(lambda: alive == [("w0", True)], OPEN_S)
         assert (KEYS.monitor("trajectories/w0"), b"look") in received and b"T^1" in weights

@@ -67,6 +67,10 @@ def installed(tmp_path_factory):
     (package / "METADATA").write_text("Metadata-Version: 2.1\nName: toys\nVersion: 1.0\n")
     (package / "entry_points.txt").write_text(ENTRY_POINTS)
     (site / "toy.toml").write_text(RUN)
+    hostile = site / "hostile"
+    hostile.mkdir()
+    for name in ("actors", "learner", "queue", "random"):  # files of the user in the folder where the commands are started
+        (hostile / f"{name}.py").write_text("raise SystemExit('a file of the user was imported')")
     paths = [str(site), str(ROOT), os.environ.get("PYTHONPATH", "")]
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}, site / "toy.toml"
 
@@ -76,7 +80,8 @@ def interrupted(installed, tmp_path_factory):
     """A run through Ray and Zenoh with a tap beside it, stopped by Ctrl-C in the first round."""
     environment, run = installed
     folder = tmp_path_factory.mktemp("runs") / "toy"
-    process = start("train", run, *NO_RESTARTS, "--out", folder, env=environment, start_new_session=True)
+    among = run.parent / "hostile"
+    process = start("train", run, *NO_RESTARTS, "--out", folder, env=environment, start_new_session=True, cwd=among)
     tap = [*CLI, "tap", "--connect", endpoint_of(folder), "--count", "3", "--timeout", "60"]
     family = []
 
@@ -98,7 +103,7 @@ def trained(installed, interrupted):
     environment, run = installed
     folder = interrupted[0]
     before = checkpoints.read_manifest(version_file(folder, 0))["weights_digest"]
-    process = start("train", run, *NO_RESTARTS, "--out", folder, "--resume", env=environment)
+    process = start("train", run, *NO_RESTARTS, "--out", folder, "--resume", env=environment, cwd=run.parent / "hostile")
     output = finish(process)
     assert process.returncode == 0, output
     return folder, before

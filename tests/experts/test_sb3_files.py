@@ -1,6 +1,14 @@
 """Experts as files of stable-baselines3, in both directions."""
 
+import base64
+import contextlib
 import dataclasses
+import io
+import json
+import os
+import pickle
+import zipfile
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -101,3 +109,76 @@ def test_the_global_generators_do_not_change(tmp_path):
         torch.equal(before[0], torch.get_rng_state())
         and before[1] == np.random.get_state(legacy=False)["state"]["key"].tolist()
     )
+
+
+class Bomb:
+    """An object that creates a folder when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = str(marker)
+
+    def __reduce__(self):
+        return os.mkdir, (self.marker,)
+
+
+def encoded(value):
+    return base64.b64encode(pickle.dumps(value)).decode()
+
+
+def rewritten(source, target, **members):
+    """The file with some members replaced; None removes a member."""
+    with zipfile.ZipFile(source) as before, zipfile.ZipFile(target, "w") as after:
+        contents = {name: before.read(name) for name in before.namelist()} | members
+        for name, content in contents.items():
+            if content is not None:
+                after.writestr(name, content)
+    return target
+
+
+def torch_pickle(value):
+    buffer = io.BytesIO()
+    torch.save(value, buffer)
+    return buffer.getvalue()
+
+
+def test_a_file_of_others_executes_nothing(tmp_path):
+    engine, marker = SACBatch([0], SPEC, SMALL, "cpu"), tmp_path / "executed"
+    whole, bomb = tmp_path / "whole.zip", Bomb(marker)
+    engine.save_sb3(0, whole)
+    data = json.loads(zipfile.ZipFile(whole).read("data"))
+    for name in [name for name, value in data.items() if isinstance(value, dict) and ":serialized:" in value]:
+        data[name][":serialized:"] = encoded(bomb)
+    hostile = rewritten(whole, tmp_path / "hostile.zip", data=json.dumps(data))
+    other = SACBatch([1], SPEC, SMALL, "cpu")
+    other.load_sb3([hostile])
+    assert all(torch.equal(other.arrays[name], array) for name, array in engine.arrays.items())
+    for member in [name for name in zipfile.ZipFile(whole).namelist() if name.endswith(".pth")]:
+        for content in (pickle.dumps(bomb, 2), torch_pickle(bomb), torch_pickle({"x": bomb})):
+            hostile = rewritten(whole, tmp_path / "hostile.zip", **{member: content})
+            with pytest.raises(ValueError, match="can be read"):
+                other.load_sb3([hostile])
+    assert not marker.exists()
+    hostile = rewritten(whole, tmp_path / "hostile.zip", data=json.dumps(data))
+    with contextlib.suppress(Exception):
+        stable_baselines3.SAC.load(hostile, device="cpu")
+    assert marker.exists(), "the file does execute code where it is unpickled"
+
+
+def test_malformed_files_are_refused_with_their_name(tmp_path):
+    engine, whole = SACBatch([0], SPEC, SMALL, "cpu"), tmp_path / "whole.zip"
+    engine.save_sb3(0, whole)
+    spare = torch_pickle({"log_ent_coef": torch.zeros(3)})
+    changes: list[dict[str, Any]] = [{"data": data} for data in (b"{", b"[]", b"{}", None)]
+    changes += [{"policy.pth": content} for content in (None, spare)]
+    changes += [{"pytorch_variables.pth": content} for content in (None, spare)]
+    changes += [{"actor.optimizer.pth": spare}]
+    for change in changes:
+        with pytest.raises(ValueError, match=r"broken\.zip is no file .* save it again"):
+            engine.load_sb3([rewritten(whole, tmp_path / "broken.zip", **change)])
+    (tmp_path / "broken.zip").write_bytes(b"no archive")
+    with pytest.raises(ValueError, match=r"broken\.zip is no file"):
+        engine.load_sb3([tmp_path / "broken.zip"])
+    with zipfile.ZipFile(tmp_path / "broken.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("data", bytes(1 << 24))
+    with pytest.raises(ValueError, match="more than its own size"):
+        engine.load_sb3([tmp_path / "broken.zip"])

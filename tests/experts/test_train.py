@@ -1,12 +1,15 @@
 """Histories of SAC experts: what is delivered, what the cache keeps, and the cost of a kill or a diverged simulation."""
 
 import dataclasses
+import errno
+import pwd
 
 import numpy as np
 import pytest
 
 from icrl_dist.experts import cache, train
 from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.experts.sac import batched
 from icrl_dist.experts.train import ExpertPolicy
 from icrl_dist.methods.examples import self_labelled
 from icrl_dist.problems import registry
@@ -15,8 +18,10 @@ from icrl_dist.problems.continuous.problem import EXPERT
 from icrl_dist.problems.dmc.problem import DMCProblem
 from icrl_dist.results import evaluate, summaries
 from icrl_dist.storage.checkpoint import save_checkpoint
+from icrl_dist.storage.files import unwritten
 from icrl_dist.stream import wire
 from icrl_dist.types import NULL
+from tests.calls import failing
 from tests.experts.histories import EPISODES, HORIZON, Breaking, KilledError, digests, run, trained
 from tests.jobs import FixedWeights, decoded, do, jobs_of
 from tests.optional import known
@@ -79,6 +84,43 @@ def test_nothing_is_trained_that_is_in_the_cache(run, trained, caplog):
         file.write_bytes(damage)
         assert digests(do(run, job)) == first
     assert trained == [4, 1, 1] and "is made again" in caplog.text and file.read_bytes() == whole
+
+
+@pytest.mark.parametrize("broken", ["a file", "no home", "disk full at the end"])
+def test_experts_are_trained_once_and_delivered_where_the_cache_cannot_be_used(run, trained, tmp_path, monkeypatch, broken):
+    job = jobs_of(run)[0]
+    expected = digests(do(run, job))
+    notes, place = list[str](), str(tmp_path / "file" / "experts")
+    if broken == "a file":
+        (tmp_path / "file").write_text("")
+    elif broken == "no home":
+        place = "~/.cache/icrl-dist/experts"
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr(pwd, "getpwuid", failing(KeyError("uid not found: 12345")))
+    else:
+        full = OSError(errno.ENOSPC, "No space left on device")
+        monkeypatch.setattr(cache, "save_checkpoint", failing(unwritten(tmp_path / "x.npz", full)))
+    monkeypatch.setattr(train, "_reported", set())
+    other = jobs_of(dataclasses.replace(run, sac=dataclasses.replace(run.sac, cache=place)))
+
+    def progress(text, note=False, reached=0):
+        notes.extend([text] * note)
+
+    made = [digests(do(run, one, progress=progress)) for one in other]
+    assert made[0] == expected and trained == [4, 4, 4], "each job trained its experts once"
+    (note,) = notes
+    assert note.startswith("experts are not stored: ") and ("set HOME" if broken == "no home" else str(tmp_path)) in note
+
+
+def test_a_cache_that_cannot_be_written_is_found_before_the_training(run, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    sac = dataclasses.replace(run.sac, cache=str(tmp_path / "file"))
+    events = list[str]()
+    monkeypatch.setattr(train, "_reported", set())
+    monkeypatch.setattr(batched, "train", failing(KilledError))
+    with pytest.raises(KilledError):
+        do(run, jobs_of(dataclasses.replace(run, sac=sac))[0], progress=lambda text, **_: events.append(text))
+    assert "set sac.cache to a folder that you may write to" in events[0]
 
 
 def test_a_method_takes_the_experts_that_another_method_trained_and_ends_with_the_same_bytes(run, trained, tmp_path):

@@ -2,9 +2,13 @@
 
 import contextlib
 import dataclasses
+import errno
+import fcntl
 import inspect
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,12 +22,16 @@ import torch
 
 import icrl_dist
 from actors import fleet, local
+from actors.session import SessionFailed
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps
-from icrl_dist.launch import learner_process, whole_run
+from icrl_dist.console.signals import SIGNALS, interruptible
+from icrl_dist.launch import learner_process, resuming, whole_run
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout, reports
+from learner import checkpoints, reporter
 from tests.actors.fake_ray import FakeRay
+from tests.calls import failing
 from tests.learner.test_service import no_tensorboard
 from tests.results.row_blocks import block, frame
 
@@ -94,7 +102,7 @@ def test_a_handler_that_python_cannot_set_again_is_not_replaced(monkeypatch):
     """``signal.getsignal`` gives None for a handler of an extension, and ``signal.signal`` refuses None."""
     get, was = signal.getsignal, signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(signal, "getsignal", lambda number: None if number == signal.SIGTERM else get(number))
-    with launch.interruptible():
+    with interruptible():
         assert get(signal.SIGTERM) is was and get(signal.SIGINT) is not signal.default_int_handler
     assert (get(signal.SIGINT), get(signal.SIGTERM)) == (signal.default_int_handler, was)
 
@@ -139,16 +147,23 @@ def test_a_real_session_of_ray_still_works_after_the_refusal(tmp_path):
 
 @pytest.mark.parametrize("start_fails", [False, True])
 def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
-    def start(ray, *_, **__):
-        assert os.environ["RAY_worker_niceness"] == "0"  # noqa: SIM112 - Ray's name
-        os.environ |= {"RAY_AUTH_MODE": "token", "PYTHONBREAKPOINT": "ray"}  # as Ray does
-        if start_fails:
-            raise RuntimeError("Ray did not start")
+    class Session:
+        def __init__(self, ray, *_, **__):
+            assert os.environ["RAY_worker_niceness"] == "0"  # noqa: SIM112 - Ray's name
+            assert "RAY_ADDRESS" not in os.environ
+            os.environ |= {"RAY_AUTH_MODE": "token", "PYTHONBREAKPOINT": "ray"}  # as Ray does
+            if start_fails:
+                raise SessionFailed("Ray did not start")
+
+        def close(self):
+            pass
 
     ray = FakeRay(1)
     monkeypatch.setitem(sys.modules, "ray", ray)
-    monkeypatch.setattr(local, "start_ray", start)
+    monkeypatch.setattr(fleet, "Session", Session)
+    monkeypatch.setattr(local, "protect_token", lambda: None)
     monkeypatch.setenv("RAY_worker_niceness", "5")
+    monkeypatch.setenv("RAY_ADDRESS", "192.0.2.1:6379")
     for name in ("RAY_USAGE_STATS_ENABLED", "RAY_AUTH_MODE", "PYTHONBREAKPOINT"):
         monkeypatch.delenv(name, raising=False)
     before = dict(os.environ)
@@ -160,7 +175,7 @@ def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
 def test_the_learner_process_has_the_waiting_policy_also_without_the_command_line(monkeypatch, tmp_path):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     program = tmp_path / "program"
-    program.write_text('#!/bin/sh\necho "$OMP_WAIT_POLICY" > "$3/policy"\n')
+    program.write_text('#!/bin/sh\necho "$OMP_WAIT_POLICY" > "$4/policy"\n')
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
     process = learner_process.LearnerProcess(tmp_path, "tcp/127.0.0.1:0", 0)
@@ -194,17 +209,70 @@ def test_a_folder_that_exists_needs_resume_or_overwrite(made, module_run):
         icrl_dist.train(module_run, made.result.folder, engine="inline")
 
 
-def test_an_interrupted_run_says_what_its_folder_holds(module_run, tmp_path, monkeypatch):
-    def interrupted(run, folder, report):
-        raise launch.TrainInterrupted
+def test_an_interrupted_run_says_what_its_folder_holds(made, module_run, tmp_path, monkeypatch):
+    """ "continues from the last checkpoint" is said only where there is one; a folder that holds nothing is removed."""
+    folder, segments = tmp_path / "run", sorted((made.result.folder / "dataset").iterdir())
 
-    monkeypatch.setattr(launch, "train_inline", interrupted)
-    with pytest.raises(icrl_dist.TrainInterrupted, match=r"holds the checkpoint: resume=True") as stopped:
+    def interrupted(*left):
+        def train_inline(run, folder, report):
+            (folder / "learner.log").write_text("a line\n")
+            for path in left:
+                (folder / path.parent.name).mkdir(exist_ok=True)
+                shutil.copy(path, folder / path.parent.name)
+            raise launch.TrainInterrupted
+
+        monkeypatch.setattr(launch, "train_inline", train_inline)
+        with pytest.raises(icrl_dist.TrainInterrupted) as stopped:
+            icrl_dist.train(module_run, folder, engine="inline", overwrite=folder.exists())
+        return stopped.value
+
+    error = interrupted()
+    assert not error.resumable and str(error) == "nothing had been done yet" and not folder.exists()
+    error = interrupted(segments[0])
+    assert error.resumable and re.fullmatch(r"the \d+ stored trajectories", error.kept) and error.kept in str(error)
+    shutil.rmtree(folder)
+    error = interrupted(made.result.folder / "checkpoints" / "version-0000.npz")
+    assert error.resumable and error.kept == "the last checkpoint" and "resume=True" in str(error)
+    error = interrupted()
+    assert not error.resumable and str(error).endswith("run is as it was before") and (folder / "run.toml").exists()
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("moment", ["before the folder", "at the start", "after the training", "at the last file"])
+def test_a_signal_at_any_moment_ends_a_run_in_order(module_run, tmp_path, monkeypatch, moment, number):
+    def signalled(*_, **__):
+        signal.raise_signal(number)
+        pytest.fail("the signal was ignored")
+
+    def trained(run, folder, report):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "version-0000.npz").touch()
+        return {}
+
+    monkeypatch.setattr(launch, "train_inline", trained)
+    monkeypatch.setattr(whole_run, "_evaluate", lambda *_: SimpleNamespace(summary={}))
+    owner, name = {
+        "before the folder": (launch, "prepare"),
+        "at the start": (launch, "train_inline"),
+        "after the training": (whole_run, "hold"),
+        "at the last file": (whole_run, "write_json"),
+    }[moment]
+    monkeypatch.setattr(owner, name, signalled)
+    with pytest.raises(icrl_dist.TrainInterrupted) as stopped:
         icrl_dist.train(module_run, tmp_path / "run", engine="inline")
-    assert stopped.value.resumable
-    with pytest.raises(icrl_dist.TrainInterrupted, match=r"run is as it was before$") as stopped:
-        icrl_dist.train(module_run, tmp_path / "run", engine="inline", overwrite=True)
-    assert not stopped.value.resumable and (tmp_path / "run" / "run.toml").exists()
+    assert stopped.value.resumable or moment in ("before the folder", "at the start")
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError, ZeroDivisionError])
+def test_a_receiver_of_events_that_fails_ends_the_run_with_a_checkpoint_of_the_fit(module_run, tmp_path, monkeypatch, error):
+    def receive(event):
+        if event.get("stage") == "fit" and event["step"] == 3:
+            raise error("the output is closed")
+
+    monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
+    with pytest.raises(error, match="the output is closed"):
+        icrl_dist.train(module_run, tmp_path / "run", engine="inline", progress=receive)
+    assert checkpoints.read_manifest(tmp_path / "run" / "checkpoints" / checkpoints.PARTIAL)["step"] == 3
 
 
 def test_quarantined_variations_are_in_the_result_and_give_exit_code_1(module_run, tmp_path, monkeypatch, capsys):
@@ -233,8 +301,8 @@ def test_load_run_takes_names_files_and_folders(made, module_run, tmp_path):
 
 def test_the_default_folder_is_named_after_the_run(made):
     names = {"demo": "demo", "mine/small.toml": "small", "experts-dmc": "experts-dmc"}
-    assert {name: whole_run.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
-    assert whole_run.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
+    assert {name: resuming.default_folder(name).as_posix() for name in names} == {n: f"runs/{f}" for n, f in names.items()}
+    assert resuming.default_folder("", f"{made.result.folder}@0").as_posix() == "runs/run-from-0"
 
 
 def test_an_evaluation_is_shown_by_print_and_by_a_notebook(module_run, tmp_path):
@@ -242,3 +310,12 @@ def test_an_evaluation_is_shown_by_print_and_by_a_notebook(module_run, tmp_path)
     for text in (str(found), found._repr_mimebundle_([], [])["text/plain"]):
         assert "Return by online episode" in text and "T^0" in text and "figure" in text
     assert repr(found) == "Evaluation()"
+
+
+@pytest.mark.integration
+def test_a_run_on_a_file_system_without_locks_goes_on_with_one_warning(module_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(fcntl, "flock", failing(OSError(errno.ENOLCK, "No locks available")))
+    events = list[dict[str, object]]()
+    whole_run.train(module_run, tmp_path / "run", engine="inline", progress=events.append)
+    (warning,) = [str(event["text"]) for event in events if "No locks available" in str(event.get("text"))]
+    assert warning.startswith(f"{tmp_path / 'run'}: its file system has no locks")

@@ -166,12 +166,12 @@ def test_counters_are_the_newest_of_each_worker_and_never_decrease(server, hub):
     other = hub()
     other.publish(KEYS.monitor("worker/w0"), wire.encode_message("worker", worker="w0", **heartbeat), droppable=True)
     deadline = time.monotonic() + 30
-    while "memory_mb" not in server.worker_api.counters["w0"]:
+    while "memory_mb" not in server.worker_api.known.counters["w0"]:
         assert time.monotonic() < deadline, "the heartbeat did not arrive"
         time.sleep(0.01)
-    counters = server.worker_api.counters["w0"]
+    counters = server.worker_api.known.counters["w0"]
     assert [counters[name] for name in COUNTS] == [3, 24, 2, 3, 1.5] and counters["memory_mb"] == 80.5
-    assert server.worker_api.resent == 3 and server.worker_api.totals["waited_s"] == 1.5
+    assert server.worker_api.known.resent == 3 and server.worker_api.known.totals["waited_s"] == 1.5
 
 
 def test_the_silence_of_a_replaced_worker_is_no_alert(server, worker):
@@ -179,9 +179,9 @@ def test_the_silence_of_a_replaced_worker_is_no_alert(server, worker):
     server.ask("w0")
     link.close()
     server.wait("worker", 2)
-    assert "w0" in server.worker_api.totals["silent"]
+    assert "w0" in server.worker_api.known.totals["silent"]
     worker("w0-1")
-    assert "w0" not in server.worker_api.totals["silent"]
+    assert "w0" not in server.worker_api.known.totals["silent"]
 
 
 def test_a_worker_that_ends_without_a_report_gets_a_crash_record(server, worker):
@@ -223,7 +223,7 @@ def test_a_worker_that_ends_with_the_run_leaves_no_record(server, worker):
     first.close()
     second.close()
     server.worker_api.wait_until_gone(timeout_s=30.0)
-    assert server.worker_api.workers == {"w0": False, "w1": False, "w2": False}
+    assert server.worker_api.known.alive == {"w0": False, "w1": False, "w2": False}
     assert sorted(path.name for path in (server.folder / "crashes").iterdir()) == ["w0-1.json", "w0.stacks"]
 
 
@@ -252,8 +252,11 @@ def test_a_record_of_the_worker_is_named_and_not_written_again(server):
     path = crash_reports.write(server.folder, {**RECORD, "worker": "w0"})
     server.fail("w0", server.jobs[0], file=path.name)
     assert server.wait("crash")[0]["text"].endswith(f"; {path}")
-    server.fail("w0", server.jobs[0], file="../../elsewhere.json")
+    server.ask("w0")
+    server.fail("w0", server.jobs[0], file="another.json")
     assert server.wait("crash", 2)[1]["text"].endswith("w0-2.json")
+    with pytest.raises(Refused, match="name a file of the folder crashes"):
+        server.fail("w0", server.jobs[0], file="../../elsewhere.json")
     assert sorted(records(server)) == ["w0-1.json", "w0-2.json"]
 
 
@@ -333,19 +336,19 @@ def test_a_record_that_cannot_be_written_is_reported(server):
 
 
 def test_long_work_is_listed_while_its_worker_is_connected_and_notes_are_reported(server, worker):
-    assert server.worker_api.long_work == []
+    assert server.worker_api.known.long_work == []
     links = {name: worker(name) for name in ("w1", "w0")}
     for name, text in (("w0", "4 experts at 1,000 of 12,000 steps"), ("w1", "")):
         server.ask(name, doing=text)
-    assert server.worker_api.long_work == ["w0: 4 experts at 1,000 of 12,000 steps"]
+    assert server.worker_api.known.long_work == ["w0: 4 experts at 1,000 of 12,000 steps"]
     server.ask("w1", doing="x" * 1000)
-    assert [len(text) for text in server.worker_api.long_work] == [
+    assert [len(text) for text in server.worker_api.known.long_work] == [
         len("w0: 4 experts at 1,000 of 12,000 steps"),
         len("w1: ") + 100,
     ]
     links["w0"].close()
     server.wait("worker", 3)
-    assert [text[:3] for text in server.worker_api.long_work] == ["w1:"]
+    assert [text[:3] for text in server.worker_api.known.long_work] == ["w1:"]
     assert server.request("note", "w1", text="2 experts from the cache")[0] == "noted"
     assert server.wait("note")[0]["text"] == "worker w1: 2 experts from the cache"
     with pytest.raises(Refused, match="use hello, ask, failed or note"):

@@ -21,7 +21,16 @@ def test_the_view_shows_all_parts_of_a_run(monkeypatch):
 
     async def script(app, press):
         header = text(app, "header")
-        for part in ("demo", "icaa · darkroom", "fitting", "round 1 of 1", "T^0", "310 stored", "fit T^1", " 25%  30 of 120"):
+        for part in (
+            "demo",
+            "icaa · darkroom",
+            "fitting",
+            "Round 1 of 1 (adapt/0)",
+            "T^0",
+            "310 stored",
+            "adapt/0: fit T^1",
+            " 25%  30 of 120",
+        ):
             assert part in header
         assert rows(app, "variations") == [f"{t}/{v}" for t in range(4) for v in range(2)]
         first = shown(app, "variations")[2]

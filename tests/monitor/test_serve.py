@@ -147,6 +147,18 @@ def test_viewers_beyond_the_limit_are_refused(page, monkeypatch):
     first.response.close()
 
 
+def test_viewers_that_come_at_the_same_time_are_limited_too(monkeypatch):
+    monkeypatch.setattr(event_stream, "MAX_VIEWERS", 2)
+    stream = EventStream()
+
+    async def come():
+        streams = [stream._events() for _ in range(5)]
+        first = [await anext(one, None) for one in streams]
+        return sum(chunk is not None for chunk in first), stream.viewers
+
+    assert asyncio.run(come()) == (2, 2)
+
+
 def test_the_end_of_the_server_ends_every_stream_and_thread():
     before = threading.active_count()
     stream = EventStream()

@@ -126,3 +126,18 @@ def test_the_tap_ends_when_its_reader_is_gone_or_writing_fails(hub, monkeypatch,
 def test_numbers_out_of_range_are_refused(monkeypatch, invalid):
     with pytest.raises(ConfigError, match="must be at least"):
         tapped(monkeypatch, **invalid)
+
+
+def test_a_line_is_printable_json_whatever_a_worker_sends(monkeypatch):
+    out = Out()
+    monkeypatch.setattr(sys, "stdout", out)
+    columns = {"trials": [0], "steps": [9], "adversary": {"kind": "\x1b]52;c;x\x07\n[/x]"}}
+    entries = [
+        {"identity": f"adapt/0/0/{n}", "returns": [value], **columns}
+        for n, value in enumerate((float("nan"), 1.0, float("inf")))
+    ]
+    tap = TapWriter((), (), 1, "json", 0, lambda: None)
+    tap("key", wire.encode_message("trajectories", worker="\u202e\x9b", variations=entries))
+    lines = out.bytes.getvalue().decode().splitlines()
+    assert [json.loads(line, parse_constant=pytest.fail)["identity"] for line in lines] == ["adapt/0/0/1/0"]
+    assert all(line.isascii() and line.isprintable() for line in lines)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from icrl_dist.monitor import variations, workers
 from icrl_dist.monitor.run_state import RunState
 from icrl_dist.stream import monitor_messages, wire
+from icrl_dist.stream.link import WORKER_TOPICS
 from tests.monitor.messages import event, heartbeat, progress, run_info, send, send_trajectories, trajectory
 
 
@@ -71,18 +72,18 @@ def test_invalid_fields_of_any_message_are_ignored(kind):
     state = RunState("demo")
     whole = msgpack.unpackb(MESSAGES[kind])
     for name in whole:
-        send(state, "x", msgpack.packb({k: v for k, v in whole.items() if k != name}))
+        send(state, kind, msgpack.packb({k: v for k, v in whole.items() if k != name}))
         for invalid in INVALID_VALUES:
             try:
                 message = msgpack.packb(whole | {name: invalid})
             except OverflowError:
                 continue
-            send(state, "x", message)
+            send(state, kind, message)
     for name in wire.decode_message(MESSAGES["trajectories"])[1]["variations"][0] if kind == "trajectories" else ():
         for invalid in INVALID_VALUES:
             broken = dict(whole["variations"][0]) | {name: invalid}
             with contextlib.suppress(OverflowError):
-                send(state, "x", msgpack.packb(whole | {"variations": [broken]}))
+                send(state, kind, msgpack.packb(whole | {"variations": [broken]}))
     state.tick(1.0)
     text = json.dumps(state.snapshot(1.0), allow_nan=False)
     assert "\\u001b" not in text and sum(state.ignored.values()) > len(INVALID_VALUES)
@@ -129,3 +130,15 @@ def test_a_message_beyond_the_size_limit_is_ignored():
     state = RunState("demo")
     send(state, "event", event("note", "x" * (2 << 20)))
     assert state.snapshot(0.0)["ignored"] == {"oversized": 1}
+
+
+@pytest.mark.parametrize("kind", ["learner", "run", "event"])
+def test_the_learners_messages_count_on_its_own_topics_only(kind):
+    state = RunState("demo")
+    send(state, "learner", progress())
+    before = state.snapshot(2.0)
+    for topic in (*(f"{topic}/w0" for topic in WORKER_TOPICS), "x", f"{kind}s"):
+        send(state, topic, MESSAGES[kind] if kind != "event" else event("finished", "over"))
+    after = state.snapshot(2.0)
+    assert after.pop("ignored") == {"wrong topic": 6} and after.pop("heard") == before.pop("heard") + 6
+    assert after == {name: value for name, value in before.items() if name != "ignored"}

@@ -7,6 +7,7 @@ import pytest
 
 from icrl_dist.monitor import variations
 from icrl_dist.monitor.run_state import RunState
+from icrl_dist.monitor.view_state import by_episode
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns
 from tests.monitor.messages import DIRICHLET, ROOM, event, send, send_trajectories, trajectory
 from tests.optional import known
@@ -131,3 +132,8 @@ def test_the_optimum_is_unknown_where_the_adversary_gives_no_finite_numbers(alph
     state.tick(1.0)
     (row,) = state.snapshot(1.0)["variations"]
     assert row["optimum"] is None and json.dumps(row, allow_nan=False)
+
+
+def test_missing_episodes_are_one_gap_in_a_text_drawing_however_many_they_are():
+    assert by_episode([0, 1, 5, 6, 2**40], [1.0, 2.0, 3.0, 4.0, 5.0]) == [1.0, 2.0, None, 3.0, 4.0, None, 5.0]
+    assert by_episode([], []) == []

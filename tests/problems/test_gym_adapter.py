@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import mujoco  # noqa: F401 - at collection, because its first import starts a process
 import numpy as np
 import pytest
 

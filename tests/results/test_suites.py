@@ -3,6 +3,9 @@
 import inspect
 import io
 import json
+import os
+import shutil
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -33,6 +36,39 @@ def test_an_evaluation_from_python_is_that_of_the_command(folder, suite, monkeyp
     frame = icrl_dist.read_results(folder)
     assert len(frame) == len(found.rows) and set(found.rows.suite) == {suite}
     assert (found.figure is None) == (suite == "offline")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("suite", ["online", "offline", "posterior"])
+def test_results_that_cannot_be_stored_are_shown_all_the_same(folder, suite, monkeypatch, capsys):
+    settings: dict[str, Any] = {"suite": suite, "episodes": 6, "seeds": 1, "p": [0.0, 0.2]}
+    stored = icrl_dist.evaluate(folder, **settings)
+    for name in ("results", "report"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        (folder / name).write_text("")  # not even root can write into it
+    found = icrl_dist.evaluate(folder, **settings)
+    changed = {"evaluation", "written"}
+    assert found.rows.drop(columns=[*changed]).equals(stored.rows.drop(columns=[*changed]))
+    (note,) = [note for note in found.notes if note.startswith("not stored")]
+    assert str(folder / "results") in note and found.figure is None
+    assert {**stored.summary, "figure": None} == {"figure": None, **found.summary}
+    words = ["evaluate", str(folder), "--suite", suite, "--episodes", "6", "--seeds", "1", "--p", "0", "0.2", "--json"]
+    assert main.main(words) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out.splitlines()[-1]).keys() == found.summary.keys() and printed.err.count("not stored: ") == 1
+
+
+@pytest.mark.integration
+def test_a_folder_whose_name_is_no_utf_8_is_evaluated_and_named_with_escapes(folder, tmp_path_factory, monkeypatch):
+    odd = Path(os.fsdecode(os.fsencode(tmp_path_factory.mktemp("odd")) + b"/r\xff"))
+    shutil.copytree(folder, odd)
+    rows = icrl_dist.evaluate(odd, episodes=1, seeds=1, p=[0.0]).rows
+    assert set(rows.run) == {"r\\xff"} and set(icrl_dist.read_results(odd).run) == {"r\\xff"}
+    output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", output)
+    assert main.main(["evaluate", str(odd), "--episodes", "1", "--seeds", "1", "--p", "0"]) == 0
+    output.flush()
+    assert b"figure" in output.buffer.getvalue()
 
 
 def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(folder, capsys):

@@ -127,13 +127,14 @@ def flat(value, prefix=""):
     return {key: v for name, inner in value.items() for key, v in flat(inner, f"{prefix}/{name}" if prefix else name).items()}
 
 
-# Timeouts and buffer sizes of our link, which do not concern security.
-TUNING = ("connect/timeout_ms", "connect/exit_on_failure", "connect/retry", "transport/link/tx/", "transport/link/rx/")
+# Timeouts and buffer sizes of our link, which do not concern security, and what depends on this machine.
+TUNING = ("connect/timeout_ms", "connect/exit_on_failure", "connect/retry", "transport/link/tx/", "transport/link/rx/buffer")
+MACHINE = ("transport/unicast/max_sessions",)
 
 
 def differences(template, system):
     here, there = flat(json.loads(str(template))), flat(json.loads(str(system)))
-    return {k for k in here | there if here.get(k) != there.get(k) and not k.startswith(TUNING)}
+    return {k for k in here | there if here.get(k) != there.get(k) and not k.startswith((*TUNING, *MACHINE))}
 
 
 @pytest.mark.parametrize("role", ROLES)

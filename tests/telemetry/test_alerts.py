@@ -105,7 +105,7 @@ def test_label_quality_that_falls_from_round_to_round():
     assert changes(alerts) == []
     alerts.add_label_quality(2, 0.80)
     (alert,) = alerts.check({}, 0.0)
-    assert alert.text == "label quality falls: 80% of round 2's labels are optimal, 87% of round 1's"
+    assert alert.text == "label quality falls: 80% of adapt/2's labels are optimal, 87% of adapt/1's"
 
 
 def test_a_threshold_of_0_turns_an_alert_off():

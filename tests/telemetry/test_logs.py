@@ -8,16 +8,18 @@ import sys
 import pytest
 
 from icrl_dist.telemetry import logs
+from icrl_dist.telemetry.budget import LogLines
+from icrl_dist.telemetry.stamps import stamp
 
 TIME = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ"
 
 
 def test_the_time_is_in_utc_whatever_the_zone_of_the_machine(monkeypatch):
     monkeypatch.setenv("TZ", "Asia/Tokyo")
-    assert logs.stamp(0.0) == "1970-01-01T00:00:00Z"
+    assert stamp(0.0) == "1970-01-01T00:00:00Z"
     record = logging.LogRecord("x", logging.INFO, "x.py", 1, "resent %d", (3,), None)
     record.created = 86_400.5
-    assert logs.LogFormat().format(record) == "1970-01-02T00:00:00Z resent 3"
+    assert LogLines().format(record) == "1970-01-02T00:00:00Z resent 3"
 
 
 def test_a_full_file_of_standard_error_is_moved_while_its_writer_writes_on(tmp_path, monkeypatch):
@@ -42,8 +44,9 @@ from pathlib import Path
 from icrl_dist.telemetry import logs
 logs.MAX_BYTES = 2000
 logs.log_to(Path({str(tmp_path / "learner.log")!r}))
-for number in range(200):
+for number in range(90):
     logging.getLogger("learner").info("message %d", number)
+    logging.getLogger("learner").info("further message %d", number)
 warnings.warn("an old name")
 thread = threading.Thread(target=lambda: 1 / 0)
 thread.start()
@@ -54,4 +57,4 @@ raise SystemError("the end")
     assert len(re.findall(rf"^{TIME}\n(Exception in|Traceback)", ran.stderr, re.M)) == 2 and ran.returncode == 1
     assert {file.name for file in tmp_path.iterdir()} == {"learner.log", "learner.log.1", "learner.log.2"}
     lines = (tmp_path / "learner.log").read_text()
-    assert re.search(rf"^{TIME} message 199$", lines, re.M) and "an old name" in lines
+    assert re.search(rf"^{TIME} message 89$", lines, re.M) and "an old name" in lines

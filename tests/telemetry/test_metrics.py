@@ -1,8 +1,10 @@
 """Metrics in the file, in TensorBoard and at the Prometheus endpoint, by one list of names."""
 
+import contextlib
 import json
 import re
 import socket
+import threading
 import urllib.request
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 
 from icrl_dist.config.run import ConfigError, parse
 from icrl_dist.stream.link import LinkError
-from icrl_dist.telemetry import metrics
+from icrl_dist.telemetry import exporter, metrics
 from icrl_dist.telemetry.metrics import NAMES, STAGES, Metrics
 
 
@@ -44,6 +46,23 @@ def test_a_number_goes_to_the_file_and_to_prometheus(tmp_path):
     assert rows[2] == {"time": 12.0, "stage": "alert", "step": 2, "what": "zero", "active": True, "text": "stuck"}
 
 
+def test_bare_connections_to_the_prometheus_port_use_one_descriptor_and_one_thread(tmp_path, monkeypatch):
+    monkeypatch.setattr(exporter._Handler, "timeout", 0.05)
+    where = ("127.0.0.1", free_port())
+    written = Metrics(tmp_path, tensorboard=False, prometheus=f"127.0.0.1:{where[1]}")
+    try:
+        threads, ends = threading.active_count(), contextlib.ExitStack()
+        with ends, contextlib.suppress(TimeoutError):
+            for _ in range(50):
+                ends.enter_context(socket.create_connection(where, timeout=0.1))
+            assert threading.active_count() == threads
+        with urllib.request.urlopen(f"http://127.0.0.1:{where[1]}/metrics", timeout=10) as page:
+            assert b"icrl_fit_loss" in page.read()
+        assert threading.active_count() == threads
+    finally:
+        written.close()
+
+
 def test_a_number_that_is_not_in_the_list_is_refused(tmp_path):
     written = Metrics(tmp_path, tensorboard=False)
     with pytest.raises(KeyError, match="losses"):
@@ -64,3 +83,14 @@ def test_the_page_is_generated_from_the_list():
 def test_an_invalid_endpoint_is_refused(where):
     with pytest.raises(ConfigError, match=r"learner.prometheus = .*use HOST:PORT, such as 127.0.0.1:9464"):
         parse(f'[learner]\nprometheus = "{where}"', "x")
+
+
+@pytest.mark.parametrize("lines", [0, 1, 900])
+@pytest.mark.parametrize("half", ["", '{"time": 1.0, "stage": "fi', "x" * 9000])
+def test_a_half_last_line_is_cut_off_and_later_rows_have_lines_of_their_own(tmp_path, lines, half):
+    path, whole = tmp_path / "metrics.jsonl", '{"time": 1.0}\n' * lines
+    path.write_text(whole + half)
+    metrics = Metrics(tmp_path, tensorboard=False)
+    metrics.write_text(2.0, 0, "event", what="x")
+    metrics.close()
+    assert path.read_text() == whole + json.dumps({"time": 2.0, "stage": "event", "step": 0, "what": "x"}) + "\n"

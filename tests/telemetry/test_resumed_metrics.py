@@ -50,11 +50,12 @@ def test_a_version_that_is_lost_is_fitted_again(tmp_path):
     for version in range(3):
         written.write(50, f"fit/{version}", loss=1.0)
         written.write(version, "version", loss=1.0, seconds=1.0)
-    written.continue_from(version=0, step=0)  # the checkpoints of T^1 and T^2 were damaged
-    assert rows_of(tmp_path) == [("fit/0", 50), ("version", 0)]
+    written.continue_from(version=0, step=0)  # the checkpoint of T^1 was damaged, that of T^2 is intact
+    assert rows_of(tmp_path) == [("fit/0", 50), ("version", 0), ("fit/2", 50), ("version", 2)]
     written.write(50, "fit/1", loss=1.0)
+    written.write(1, "version", loss=1.0, seconds=1.0)
     written.close()
-    assert rows_of(tmp_path)[-1] == ("fit/1", 50)
+    assert rows_of(tmp_path)[-2:] == [("fit/1", 50), ("version", 1)]
 
 
 def test_a_phase_that_is_collected_again_keeps_its_first_numbers(tmp_path):

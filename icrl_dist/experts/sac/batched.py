@@ -161,7 +161,7 @@ class SACBatch:
         sb3_files.save(path, self.spec, self.config, (self.actor_shape, self.critic_shape), expert, self.updates)
 
     def load_sb3(self, paths: Sequence[Path]) -> None:
-        """Load expert i's parameters and moments from file i; the replays do not change.
+        """Load expert i's parameters and moments from file i; the replays do not change.  Executes nothing of the files.
 
         Raises ValueError unless there is one file per expert, all of this shape and with the same
         number of updates.

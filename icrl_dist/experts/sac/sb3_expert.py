@@ -20,7 +20,8 @@ from icrl_dist.config.sac import SACConfig
 class Expert(stable_baselines3.SAC):
     """``stable_baselines3.SAC`` with a learning rate per part, and random steps separate from the warm-up.
 
-    ``stable_baselines3.SAC.load`` also opens its files.
+    ``stable_baselines3.SAC.load`` also opens its files.  It executes what a file says, so load only your own files with
+    it; ``SACBatch.load_sb3`` reads those of others without executing anything.
     """
 
     rates: tuple[float, float, float] = (SACConfig.actor_rate, SACConfig.critic_rate, SACConfig.temperature_rate)

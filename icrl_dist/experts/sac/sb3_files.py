@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import json
+import pickle
+import re
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +21,7 @@ from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED
 from icrl_dist.experts.sac.sb3_expert import Expert, expert
 from icrl_dist.experts.sac.stacked import Shape
+from icrl_dist.stream.excerpts import plain, show
 from icrl_dist.types import Spec
 
 Shapes = tuple[Shape, Shape]
@@ -51,23 +57,75 @@ def save(path: Path, spec: Spec, config: SACConfig, shapes: Shapes, arrays: Mapp
 def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dict[str, Tensor], int]:
     """One expert's arrays and its number of updates.
 
-    Raises ValueError for another shape, activation, action range or a fixed temperature.
+    Nothing of the file is unpickled as an object, so a file from others executes no code: only its tensors and the
+    readable part of its JSON are read.  (``stable_baselines3.SAC.load`` executes what a file says.)
+
+    Raises ValueError for another shape, activation, action range or a fixed temperature, and for any other file.
     """
-    with torch.random.fork_rng(devices=[]):
-        model = stable_baselines3.SAC.load(path, device="cpu", custom_objects={"buffer_size": 1})
-    found = (model.observation_space.shape, model.action_space.shape, model.policy.net_arch)
+    try:
+        about, tensors = _read(path)
+        policy = tensors["policy"]
+        layers = [value for name, value in policy.items() if re.fullmatch(r"actor\.latent_pi\.\d+\.weight", name)]
+        found = (layers[0].shape[1:], policy["actor.mu.bias"].shape, [len(layer) for layer in layers])
+        low, high, activation = _space_and_activation(about)
+    except (OSError, zipfile.BadZipFile, *_MALFORMED) as error:
+        raise _unreadable(path, error) from error
     if found != ((spec.observation,), (spec.actions,), list(config.hidden)):
         raise ValueError(
-            f"{path} holds an expert of {found[0]} observations, {found[1]} actions and hidden layers {found[2]}, "
-            f"not {spec.observation}, {spec.actions} and {config.hidden}: load it with its own spec and hidden layers"
+            f"{path} holds an expert of {tuple(found[0])} observations, {tuple(found[1])} actions and hidden layers "
+            f"{found[2]}, not {spec.observation}, {spec.actions} and {config.hidden}: "
+            "load it with its own spec and hidden layers"
         )
-    actions: Any = model.action_space
-    bounds, activation = (actions.low, actions.high), model.policy.activation_fn
-    if activation is not nn.ReLU or (bounds[0] != -1).any() or (bounds[1] != 1).any():
+    if activation != "ReLU" or set(low) != {-1.0} or set(high) != {1.0}:
         raise ValueError(
-            f"{path} holds an expert with activation {activation.__name__} and actions from {bounds[0].tolist()} to "
-            f"{bounds[1].tolist()}: only ReLU and actions in [-1, 1] are supported"
+            f"{path} holds an expert with activation {plain(activation)} and actions from {show(low)} to {show(high)}: "
+            "only ReLU and actions in [-1, 1] are supported"
         )
+    if "ent_coef_optimizer" not in tensors:
+        raise ValueError(f"{path}: {_FIXED_TEMPERATURE}")
+    try:
+        return _arrays(tensors, spec, config, shapes)
+    except _MALFORMED as error:
+        raise _unreadable(path, error) from error
+
+
+_FIXED_TEMPERATURE = "the temperature is fixed: only experts with an automatic temperature (ent_coef='auto') are supported"
+_MALFORMED = (KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError)
+"""What the parts of a malformed file raise."""
+
+
+def _unreadable(path: Path, error: Exception) -> ValueError:
+    return ValueError(f"{path} is no file of stable-baselines3's SAC that can be read: {plain(str(error))}; save it again")
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The JSON of a file, and the tensors of its members by name."""
+    with zipfile.ZipFile(path) as file:
+        if sum(member.file_size for member in file.infolist()) > path.stat().st_size:
+            raise ValueError("it would unpack to more than its own size")
+        members = [name for name in file.namelist() if name.endswith(".pth")]
+        read = {name: torch.load(io.BytesIO(file.read(name)), "cpu", weights_only=True) for name in members}
+        return json.loads(file.read("data")), {
+            name.removesuffix(".pth").replace(".optimizer", "_optimizer"): read[name] for name in members
+        }
+
+
+def _space_and_activation(about: Mapping[str, Any]) -> tuple[list[float], list[float], str]:
+    """The least and largest actions, and the name of the activation, from the readable part of the JSON."""
+    space = about["action_space"]
+    low, high = ([float(number) for number in space[name].strip("[]").split()] for name in ("low", "high"))
+    activation = str(about["policy_kwargs"].get("activation_fn", nn.ReLU))
+    return low, high, activation.rpartition(".")[2].removesuffix("'>")
+
+
+def _arrays(
+    tensors: Mapping[str, Mapping[str, Any]], spec: Spec, config: SACConfig, shapes: Shapes
+) -> tuple[dict[str, Tensor], int]:
+    model = blank(spec, config)
+    model.policy.load_state_dict(tensors["policy"])
+    optimizers = {"actor": "actor_optimizer", "critic": "critic_optimizer", "log_temperature": "ent_coef_optimizer"}
+    for name, member in optimizers.items():
+        _optimizer(model, name).load_state_dict(dict(tensors[member]))
     actor, critic = (torch.zeros(shape.parameters) for shape in shapes)
     arrays = {"actor": actor, "critic": torch.stack([critic, critic]), "log_temperature": torch.zeros(())}
     arrays |= {f"{name}/{moment}": torch.zeros_like(arrays[name]) for name in TRAINED for moment in MOMENTS}
@@ -75,6 +133,7 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
     state = _optimizer(model, "actor").state
     updates = int(next(iter(state.values()))["step"]) if state else 0
     with torch.no_grad():
+        _optimizer(model, "log_temperature").param_groups[0]["params"][0].copy_(tensors["pytorch_variables"]["log_ent_coef"])
         for ours, theirs in _pairs(model, shapes, arrays, updates > 0):
             ours.copy_(theirs)
     return arrays, updates
@@ -145,5 +204,5 @@ def _optimizer(model: stable_baselines3.SAC, name: str) -> torch.optim.Optimizer
     """The Adam of one of ``TRAINED``.  Raises ValueError for a fixed temperature."""
     found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "log_temperature": model.ent_coef_optimizer}
     if (optimizer := found[name]) is None:
-        raise ValueError("the temperature is fixed: only experts with an automatic temperature (ent_coef='auto') are supported")
+        raise ValueError(_FIXED_TEMPERATURE)
     return optimizer

@@ -2,7 +2,7 @@
 
 import { Chart, axis, line } from "./monitor-charts.js";
 import { Tile } from "./monitor-episodes.js";
-import { brief, byId, clock, el, plural, setText } from "./monitor-dom.js";
+import { brief, byId, clock, el, plural, setText, withGaps } from "./monitor-dom.js";
 import { factsOf } from "./monitor-panels.js";
 
 const INKS = ["--series-1", "--series-4", "--series-6"];
@@ -72,7 +72,7 @@ export class Detail {
   #show(row) {
     this.row = row;
     byId("detail-facts").replaceChildren(...factsOf(row).map(([name, text]) => el("div", {}, el("dt", {}, name), el("dd", {}, text))));
-    const trials = [...new Set(row.phases.flatMap((phase) => phase.trials))].sort((one, other) => one - other);
+    const trials = withGaps(row.phases.flatMap((phase) => phase.trials));
     const columns = row.phases.map((phase) => {
       const returns = new Map(phase.trials.map((trial, index) => [trial, phase.returns[index]]));
       return trials.map((trial) => returns.get(trial) ?? null);

@@ -23,14 +23,14 @@ export function setText(element, text) {
 
 /** Style of the badge of a run's or worker's state; the badge also contains the state as text. */
 const KINDS = {
-  collecting: "ok", fitting: "ok", finished: "ok", working: "ok", done: "ok",
+  collecting: "ok", fitting: "ok", evaluating: "ok", finished: "ok", working: "ok", done: "ok",
   waiting: "muted", silent: "warn", interrupted: "warn", failed: "bad", gone: "bad",
 };
 
-export function badge(element, state) {
-  const kind = `badge ${KINDS[state] ?? "muted"}`;
+export function badge(element, state, alerts = 0) {
+  const kind = `badge ${alerts ? "bad" : (KINDS[state] ?? "muted")}`;
   if (element.className !== kind) element.className = kind;
-  setText(element, state);
+  setText(element, alerts ? `${state}, ${plural(alerts, "alert")}` : state);
 }
 
 /** A duration in seconds as 1:02:03 or 2:03; a dash for null. */
@@ -43,8 +43,8 @@ export function span(seconds) {
   return hours ? `${hours}:${two(minutes)}:${two(rest)}` : `${minutes}:${two(rest)}`;
 }
 
-/** A time in Unix seconds as the time of day. */
-export const clock = (time) => (Math.abs(time) < 8e12 ? new Date(time * 1000).toLocaleTimeString("en-GB") : "–");
+/** A time in Unix seconds as the time of day; a dash for 0, an unknown time. */
+export const clock = (time) => (time && Math.abs(time) < 8e12 ? new Date(time * 1000).toLocaleTimeString("en-GB") : "–");
 
 /** A number with about three digits; a dash for null. */
 export function brief(value) {
@@ -72,17 +72,25 @@ export const plural = (count, noun) => `${number(count)} ${noun}${count === 1 ? 
 
 export const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
 
-/** A line over values as an SVG, between `low` and `high`. */
-export function sparkline(svg, values, low, high) {
+/** The different trials in order, with one more after each gap, at which nothing has a value, so that no line crosses it. */
+export function withGaps(trials) {
+  const all = [...new Set(trials)].sort((one, other) => one - other);
+  return all.flatMap((trial, index) => (index + 1 < all.length && all[index + 1] > trial + 1 ? [trial, trial + 1] : [trial]));
+}
+
+/** A line over values by trial as an SVG, between `low` and `high`; a missing trial is a gap. */
+export function sparkline(svg, trials, values, low, high) {
   const [width, height] = [110, 22];
+  const [first, last] = [trials[0] ?? 0, trials.at(-1) ?? 0];
   const place = (value, index) => {
-    const x = values.length > 1 ? 2 + ((width - 4) * index) / (values.length - 1) : width / 2;
+    const x = last > first ? 2 + ((width - 4) * (trials[index] - first)) / (last - first) : width / 2;
     const y = height - 3 - ((height - 6) * (value - low)) / (high - low || 1);
-    return `${x.toFixed(1)},${y.toFixed(1)}`;
+    return `${x.toFixed(1)} ${y.toFixed(1)}`;
   };
   const places = values.map(place);
-  svg.firstChild.setAttribute("points", places.join(" "));
-  const [x, y] = (places.at(-1) ?? "-9,-9").split(",");
+  const steps = places.map((at, index) => `${index && trials[index] === trials[index - 1] + 1 ? "L" : "M"}${at}`);
+  svg.firstChild.setAttribute("d", steps.join("") || "M0 0");
+  const [x, y] = (places.at(-1) ?? "-9 -9").split(" ");
   svg.lastChild.setAttribute("cx", x);
   svg.lastChild.setAttribute("cy", y);
 }
@@ -94,6 +102,6 @@ export function sparklineElement() {
     return element;
   };
   const svg = make("svg", { class: "spark", viewBox: "0 0 110 22", "aria-hidden": "true" });
-  svg.append(make("polyline", {}), make("circle", { r: "2" }));
+  svg.append(make("path", {}), make("circle", { r: "2" }));
   return svg;
 }

@@ -4,21 +4,20 @@ import { command, number } from "./common.js";
 import { badge, brief, byId, clock, el, parameters, plural, reasons, setText, span } from "./monitor-dom.js";
 import { Table } from "./monitor-table.js";
 
-const STAGES = { collect: "Collecting", fit: "Fitting" };
-
-export function drawHeader({ run, replay }) {
+export function drawHeader({ run, alerts, replay, headline }) {
   setText(byId("name"), run.name || "Waiting for a run");
-  document.title = run.name ? `${run.name}: ${run.state}` : "icrl-dist: live view";
-  badge(byId("state"), run.state ?? "waiting");
+  const warned = alerts.length ? `(${plural(alerts.length, "alert")}) ` : "";
+  document.title = run.name ? `${warned}${run.name}: ${run.state}` : "icrl-dist: live view";
+  badge(byId("state"), run.state ?? "waiting", alerts.length);
+  setText(byId("headline"), headline);
   setText(byId("what"), [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(" · "));
-  const over = ["finished", "interrupted", "failed"].includes(run.state);
+  const over = ["finished", "evaluating", "interrupted", "failed"].includes(run.state);
   const fit = run.stage === "fit";
-  setText(byId("stage"), run.stage ? `${STAGES[run.stage] ?? run.stage} ${run.phase}/${run.round}` : "no stage yet");
+  setText(byId("stage"), run.stage_text || "no stage yet");
   const steps = run.steps ?? 0;
   setText(byId("steps"), steps ? `${number(run.step)} of ${number(steps)} ${fit ? "steps" : "trajectories"} · ${Math.floor((100 * run.step) / steps)}%` : "");
   byId("bar").value = steps ? Math.min(1, run.step / steps) : 0;
-  const last = run.rounds ? ` of ${number(run.rounds - 1)}` : "";
-  setText(byId("round"), run.stage ? (run.phase === "adapt" ? `${run.round}${last}` : "before 0") : "–");
+  setText(byId("round"), run.round_text ? (run.phase === "adapt" ? `${run.round + 1}${run.rounds ? ` of ${number(run.rounds)}` : ""} (${run.phase}/${run.round})` : `${run.phase}/${run.round}`) : "–");
   setText(byId("elapsed"), span(run.elapsed_s));
   setText(byId("stage-eta"), over ? "–" : span(run.stage_eta_s));
   setText(byId("eta"), over ? "–" : span(run.eta_s));

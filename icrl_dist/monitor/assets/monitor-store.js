@@ -23,6 +23,10 @@ export function emptyStore() {
     beliefs: {},
     ignored: {},
     replay: null,
+    headline: "",
+    past: "",
+    averages: [],
+    evaluation: null,
     changes: 0, // grows when variations change
   };
 }
@@ -32,13 +36,15 @@ export function apply(store, snapshot) {
   if (snapshot.since === -1) Object.assign(store, emptyStore(), { changes: store.changes + 1 });
   else if (snapshot.epoch !== store.epoch || snapshot.since > store.seq) return false;
   else if (snapshot.seq < store.seq) return true;
-  for (const name of ["epoch", "seq", "time", "run", "workers", "alerts", "ignored", "replay"]) store[name] = snapshot[name];
+  for (const name of ["epoch", "seq", "time", "run", "workers", "alerts", "ignored", "replay", "headline", "averages"]) store[name] = snapshot[name];
   store.variationCount = snapshot.variation_count;
   store.leftOut = snapshot.variations_left_out;
   for (const row of snapshot.variations) {
     if (store.variations.size < VARIATIONS || store.variations.has(row.name)) store.variations.set(row.name, row);
   }
-  if (snapshot.variations.length) store.changes += 1;
+  if (snapshot.variations.length || snapshot.evaluation || snapshot.past !== store.past) store.changes += 1;
+  store.past = snapshot.past;
+  if (snapshot.evaluation) store.evaluation = snapshot.evaluation;
   for (const episode of snapshot.episodes) {
     if (store.episodes.get(episode.name)?.identity === episode.identity) continue;
     store.episodes.delete(episode.name);

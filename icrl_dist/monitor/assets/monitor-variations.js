@@ -41,7 +41,7 @@ const COLUMNS = [
     fill: (cell, row) => {
       if (!cell.firstChild) cell.append(sparklineElement());
       const returns = row.phases.at(-1)?.returns ?? [];
-      sparkline(cell.firstChild, returns, Math.min(0, ...returns), Math.max(row.optimum ?? 0, ...returns));
+      sparkline(cell.firstChild, row.phases.at(-1)?.trials ?? [], returns, Math.min(0, ...returns), Math.max(row.optimum ?? 0, ...returns));
     },
   },
   { name: "last", title: "Last", about: "Return of the last episode", number: true, first: "desc", value: (row) => row.phases.at(-1)?.returns.at(-1) ?? null, text: (row) => brief(row.phases.at(-1)?.returns.at(-1)) },
@@ -106,7 +106,7 @@ export class Variations {
     ];
     setText(byId("variation-more"), notes.filter(Boolean).join("; "));
     byId("variation-show").hidden = !more;
-    drawAdaptation(rows);
+    drawAdaptation(rows, this.store);
   }
 
   #updateKinds() {

@@ -5,6 +5,7 @@ import { Timeline, watchTheme } from "./monitor-charts.js";
 import { Detail } from "./monitor-detail.js";
 import { byId, brief, setText } from "./monitor-dom.js";
 import { Beliefs, Episodes } from "./monitor-episodes.js";
+import { HeldOut } from "./monitor-heldout.js";
 import { Events, Replay, Workers, drawAlerts, drawHeader } from "./monitor-panels.js";
 import { apply, emptyStore } from "./monitor-store.js";
 import { Variations } from "./monitor-variations.js";
@@ -22,6 +23,7 @@ const workers = new Workers();
 const events = new Events();
 const replay = new Replay();
 const beliefs = new Beliefs();
+const heldOut = new HeldOut();
 
 const timelines = [
   ["throughput", [
@@ -84,6 +86,7 @@ const jobs = [
   }],
   [500, () => {
     variations.draw();
+    heldOut.draw(store);
     detail.refresh();
     beliefs.draw(store.beliefs);
   }],

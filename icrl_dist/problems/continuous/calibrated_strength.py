@@ -73,8 +73,11 @@ def _look_up(control: ControlConfig, problem: str) -> float:
 
 
 def own_file() -> Path:
-    """The file with the user's own measurements."""
-    return Path(SACConfig().cache).expanduser().parent / "drops.json"
+    """The file with the user's own measurements.  Raises ConfigError if this user has no home folder."""
+    try:
+        return Path(SACConfig().cache).expanduser().parent / "drops.json"
+    except RuntimeError:
+        raise ConfigError("bench disturbance --drop: this user has no home folder to keep the result in: set HOME") from None
 
 
 def packaged() -> list[dict[str, Any]]:
@@ -95,7 +98,10 @@ def table() -> list[dict[str, Any]]:
 
 def own() -> list[dict[str, Any]]:
     """The user's own measurements.  Raises ConfigError for a damaged file."""
-    file = own_file()
+    try:
+        file = own_file()
+    except ConfigError:  # without a home folder there are none
+        return []
     try:
         return _rows(file.read_text(encoding="utf-8"), str(file)) if file.exists() else []
     except (OSError, UnicodeDecodeError) as error:

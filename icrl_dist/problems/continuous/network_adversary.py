@@ -7,12 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
+from icrl_dist.arrays import whole
+from icrl_dist.config.toml import nearest
+from icrl_dist.problems.checks import check_parameters
 from icrl_dist.types import NULL, Adversary, Spec
 
 HIDDEN = 64
 """Units in each of the two hidden layers."""
 _GAIN = 3.0
 """Scale of the last layer's weights: with it outputs sometimes reach their bounds and change sign within an episode."""
+
+
+_PARAMETERS = {"null": (), "network": ("seed", "inputs", "outputs", "strength")}
+"""The families of adversaries, and their parameters."""
 
 
 def network(seed: int, inputs: int, outputs: int, strength: float = 1.0) -> Adversary:
@@ -41,15 +48,22 @@ class Networks:
     """The adversaries of B variations, evaluated together."""
 
     def __init__(self, adversaries: Sequence[Adversary], spec: Spec, outputs: int) -> None:
-        """Raises ValueError for an adversary of another family, or with other numbers of inputs or outputs."""
+        """Raises ValueError, with the nearest name, for an unknown family or parameter, and for other widths."""
         for one in adversaries:
-            if one.kind not in ("null", "network"):
-                raise ValueError(f"adversary {one.kind!r}: a continuous problem has null and network")
+            if one.kind not in _PARAMETERS:
+                families = tuple(_PARAMETERS)
+                raise ValueError(
+                    f"adversary {one.kind!r}{nearest(one.kind, families)}: a continuous problem has {' and '.join(families)}"
+                )
+            check_parameters(one, _PARAMETERS[one.kind])
             if one.kind == "network" and (one["inputs"], one["outputs"]) != (spec.observation, outputs):
                 raise ValueError(
                     f"adversary of {one['inputs']} inputs and {one['outputs']} outputs: this problem has {spec.observation} "
                     f"observation components and {outputs} of disturbance; make it with network(seed, inputs, outputs)"
                 )
+            if one.kind == "network":
+                whole("adversary seed", one["seed"], 0)
+                one.number("strength")
         self._rows = [row for row, one in enumerate(adversaries) if one.kind == "network"]
         self._layers = [np.stack(same) for same in zip(*(weights(adversaries[row]) for row in self._rows), strict=True)]
         self._strength = np.array([[adversaries[row].number("strength")] for row in self._rows], np.float32)

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
+from icrl_dist.config.toml import nearest
+from icrl_dist.problems.checks import check_parameters
 from icrl_dist.types import NULL, Adversary
 
 ALPHA_RANGE = (0.05, 2.0)
 """Range of each Dirichlet parameter's uniform prior; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
+
+
+_PARAMETERS = {"null": (), "uniform": ("p",), "dirichlet": ("p", "alpha")}
+"""The families of adversaries, and their parameters."""
 
 
 def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
@@ -33,21 +39,25 @@ def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
 def override_distribution(adversary: Adversary, actions: int) -> tuple[float, Float64[np.ndarray, " A"]]:
     """``(p, q)``: with probability p the executed action is drawn from q.
 
-    Raises ValueError if p is outside [0, 1] or the adversary is of another family.
+    Raises ValueError if p is outside [0, 1], or for an unknown family or parameter, with the nearest name.
     """
+    if adversary.kind not in _PARAMETERS:
+        families = tuple(_PARAMETERS)
+        raise ValueError(
+            f"adversary {adversary.kind!r}{nearest(adversary.kind, families)}: Dark Room has {', '.join(families)}"
+        )
+    check_parameters(adversary, _PARAMETERS[adversary.kind])
     if adversary.kind == "null":
         return 0.0, np.full(actions, 1.0 / actions)
-    p = adversary.number("p") if adversary.kind in ("dirichlet", "uniform") else 0.0
+    p = adversary.number("p")
     if not 0.0 <= p <= 1.0:
         raise ValueError(f"adversary p={p}: the probability of an override must lie in [0, 1]")
     if adversary.kind == "uniform":
         return p, np.full(actions, 1.0 / actions)
-    if adversary.kind == "dirichlet":
-        alpha = tuple(float(a) for a in adversary.vector("alpha"))
-        if len(alpha) != actions or min(alpha) <= 0:
-            raise ValueError(f"adversary alpha={alpha}: expected {actions} numbers above 0, one per action")
-        return p, argmax_distribution(alpha)
-    raise ValueError(f"adversary {adversary.kind!r}: Dark Room has null, uniform and dirichlet")
+    alpha = tuple(float(a) for a in adversary.vector("alpha"))
+    if len(alpha) != actions or min(alpha) <= 0:
+        raise ValueError(f"adversary alpha={alpha}: expected {actions} numbers above 0, one per action")
+    return p, argmax_distribution(alpha)
 
 
 def sample_dirichlet(rng: np.random.Generator, actions: int, p_max: float) -> Adversary:

@@ -98,5 +98,5 @@ class Walks(DiscretePolicy):
         next_observation: Float32[np.ndarray, "B S"],
         done: bool,
     ) -> None:
-        self._last = action
+        self._last = action.copy()
         self._step += 1

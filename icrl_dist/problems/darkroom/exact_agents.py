@@ -56,15 +56,20 @@ class ExactAgent(DiscretePolicy):
 
         ``labels``: the optimal policies of each family, from ``soft_labels``.
         """
-        self._size, self._rule, self._family = families[0].size, rule, family
+        self._size, self._rule, self._family = families[0].size, rule, family.copy()
         stacked = (np.stack([getattr(h, name) for h in families])[family] for name in ("goal", "p", "q"))
         self._h = Hypotheses(self._size, families[0].horizon, *stacked)
-        self._labels = np.stack(labels).transpose(0, 2, 3, 1).astype(np.float64)
+        self._by_hypothesis = np.stack(labels).astype(np.float64)
         self._log_prior = np.full(self._h.p.shape[1], -np.log(self._h.p.shape[1]))
         self._loglik = np.zeros(self._h.p.shape)
         self._weight = self._posterior()
         self._step = 0
         self._zeta: list[Float64[np.ndarray, "B M"]] = []
+
+    @property
+    def _labels(self) -> Float64[np.ndarray, "F C A M"]:
+        """A view: pickle would give an array in this order another layout in memory, and products other last bits."""
+        return self._by_hypothesis.transpose(0, 2, 3, 1)
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
         labels = self._labels[self._family, cell_numbers(observation, self._size)]
@@ -134,7 +139,7 @@ class OptimalAgent(DiscretePolicy):
     """The oracle: it is given tau and phi, and follows pi*_{tau,phi} of eq. (5)."""
 
     def __init__(self, labels: Float32[np.ndarray, "B C A"], size: int) -> None:
-        self._labels, self._size = labels, size
+        self._labels, self._size = labels.copy(), size
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
         cell = cell_numbers(observation, self._size)

@@ -11,6 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float64, Int, UInt8
 
+from icrl_dist.arrays import short
+from icrl_dist.copies import CopiedWhole
+from icrl_dist.problems.checks import check_generators, check_parameters
 from icrl_dist.problems.darkroom.adversaries import override_distribution
 from icrl_dist.types import Spec, Step, Task, Variation
 
@@ -31,7 +34,8 @@ def task(goal: Sequence[int], size: int = 10, horizon: int = 100, start: Sequenc
 
 
 def check(task: Task) -> None:
-    """Raises ValueError, naming the value, unless the task describes a room."""
+    """Raises ValueError, naming the parameter and its value, unless the task describes a room."""
+    check_parameters(task, ("goal", "size", "horizon"), ("start",))
     size, horizon = task.number("size"), task.number("horizon")
     if not (size >= 2 and float(size).is_integer()):
         raise ValueError(f"darkroom size={size}: expected a whole number of cells, at least 2")
@@ -64,7 +68,7 @@ def next_cell(size: int) -> Int[np.ndarray, "C A"]:
     return table
 
 
-class DarkRoom:
+class DarkRoom(CopiedWhole):
     """B variation environments of one size and horizon, stepped as one batch."""
 
     def __init__(self, variations: Sequence[Variation]) -> None:
@@ -90,8 +94,7 @@ class DarkRoom:
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float[np.ndarray, "B S"]:
         """Start an episode in every row; all random numbers of the episode are drawn here, row by row."""
-        if len(rngs) != self.batch:
-            raise ValueError(f"darkroom: {len(rngs)} generators for {self.batch} rows")
+        check_generators("darkroom", self.batch, rngs)
         u = np.stack([rng.random(1 + self.spec.horizon) for rng in rngs], axis=1)
         random_start = (u[0] * len(self._cells)).astype(np.int64)
         self._noise: Float64[np.ndarray, "H B"] = u[1:]
@@ -104,8 +107,9 @@ class DarkRoom:
         """Execute one action in every row.  Raises RuntimeError past the horizon or before a reset."""
         if self._h >= self.spec.horizon:
             raise RuntimeError(f"darkroom: stepped past the horizon of {self.spec.horizon}; call reset first")
-        if actions.shape != (self.batch,) or actions.min() < 0 or actions.max() >= ACTIONS:
-            raise ValueError(f"darkroom: actions {actions}: expected {self.batch} numbers in 0..{ACTIONS - 1}")
+        right = actions.shape == (self.batch,) and actions.dtype.kind in "iu"
+        if not right or actions.min() < 0 or actions.max() >= ACTIONS:
+            raise ValueError(f"darkroom: actions {short(actions)}: expected {self.batch} numbers in 0..{ACTIONS - 1}")
         u = self._noise[self._h]
         drawn = np.zeros(self.batch, dtype=np.int64)
         for edge in self._edges.T:

@@ -72,6 +72,7 @@ class SACExperts(DisturbanceExperts):
         return (setting.task,)
 
     def policy(self, config: SACConfig, report: Report) -> Make:
+        _require_cache(config)
         variation = Variation(domains.task(self._kind))
         found = self._kept(variation, config)
         if found is None:
@@ -87,6 +88,7 @@ class SACExperts(DisturbanceExperts):
         return tuple(task.replace(forces=setting.forces) for task in domains.grid(self._kind, 2))
 
     def calibration_policy(self, config: SACConfig, report: Report) -> Make:
+        _require_cache(config)
         variations = tuple(Variation(task) for task in domains.grid(self._kind, 2))
         found = self._trained(variations, config, report)
         if len(found) < len(variations):
@@ -120,3 +122,10 @@ class SACExperts(DisturbanceExperts):
         for _ in train_expert(job, self._problem, "bench", progress):
             pass  # the trajectories are not needed: the histories are read from the cache
         return [history for variation in variations if (history := self._kept(variation, config)) is not None]
+
+
+def _require_cache(config: SACConfig) -> None:
+    """Raises ConfigError before a training whose expert is read from the cache, if there is none."""
+    reason = "" if config.cache else "sac.cache = '': the expert is read from there: set it to a writable folder"
+    if reason := reason or cache.unusable(config):
+        raise ConfigError(reason)

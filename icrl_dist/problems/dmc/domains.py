@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from icrl_dist.config.toml import nearest
+from icrl_dist.problems.checks import check_parameters
 from icrl_dist.types import Spec, Task
 
 HORIZON = 200
@@ -160,10 +161,8 @@ def check(task: Task) -> None:
     """Raises ValueError, with the value, unless the task is one of the problem's."""
     parameters = {one.name: one for one in problem(task.kind).parameters}
     choices = {"forces": ("paper", "qarl"), "mass": ("rescaled", "qarl")}
-    known = [*parameters, "horizon", *choices]
+    check_parameters(task, (), (*parameters, "horizon", *choices))
     for name, value in task.params:
-        if name not in known:
-            raise ValueError(f"{task.kind}: no parameter {name!r}{nearest(name, known)}; there are {', '.join(known)}")
         if name in choices and value not in choices[name]:
             raise ValueError(f"{task.kind} {name}={value!r}: choose one of {', '.join(choices[name])}")
         if name in parameters:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Float, Float32
 
+from icrl_dist.problems.continuous.renderer import mujoco
 from icrl_dist.problems.dmc.domains import problem
 from icrl_dist.problems.dmc.simulation import suite_environment
 

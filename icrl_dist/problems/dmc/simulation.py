@@ -11,11 +11,14 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from icrl_dist.copies import CopiedWhole
+from icrl_dist.problems.checks import check_generators
+from icrl_dist.problems.continuous import renderer
 from icrl_dist.problems.continuous.network_adversary import Networks
+from icrl_dist.problems.continuous.renderer import mujoco
 from icrl_dist.problems.dmc.domains import AXES, HORIZON, Preset, check, problem, spec
 from icrl_dist.problems.dmc.suite import BROKEN, DOMAINS, Rows, check_step, observed, rendered
 from icrl_dist.types import Step, Task, Variation
@@ -23,14 +26,14 @@ from icrl_dist.types import Step, Task, Variation
 
 def suite_environment(kind: str) -> Any:
     """dm_control's environment of this problem, with the suite's parameters."""
-    os.environ.setdefault("MUJOCO_GL", "disabled")  # must be set before dm_control is imported, which looks for a display
-    from dm_control import suite
-
+    if not os.environ.get("MUJOCO_GL"):
+        os.environ["MUJOCO_GL"] = "disabled"  # must be set before dm_control is imported, which looks for a display
+    suite = renderer.imported("dm_control.suite")
     one = problem(kind)
     return suite.load(one.domain, one.task, task_kwargs={"random": np.random.RandomState(0)})
 
 
-class DMC:
+class DMC(CopiedWhole):
     """B simulations of one problem, each with its own task; agent and adversary act simultaneously."""
 
     def __init__(self, tasks: Sequence[Task]) -> None:
@@ -49,25 +52,37 @@ class DMC:
         self._envs = [suite_environment(one.kind) for one in tasks]
         for env, one in zip(self._envs, tasks, strict=True):
             _vary(env.physics, one)
+        self._view()
+        self._wrenches = np.zeros((self.batch, *self._data[0].xfrc_applied.shape))
+        components = [(self._rows.body(body), AXES.index(axis)) for body, axes in self._forces.components for axis in axes]
+        self._bodies, self._axes = (np.array(places) for places in zip(*components, strict=True))
+        self._substeps = round(self._envs[0].control_timestep() / self._models[0].opt.timestep)
+        self._runge_kutta = self._models[0].opt.integrator == mujoco.mjtIntegrator.mjINT_RK4.value
+        self._low, self._high = (np.array(bound, np.float32) for bound in (self.spec.low, self.spec.high))
+        self._h = self.spec.horizon
+
+    def _view(self) -> None:
+        """Make what a step needs and no copy can hold: views of the simulations' memory, and functions."""
         self._models = [env.physics.model.ptr for env in self._envs]
         self._data = [env.physics.data.ptr for env in self._envs]
         self._rows = Rows(self._models, self._data)
         self._reward = DOMAINS[self._problem.domain].rewards[self._problem.task]
         views = ([data.ctrl for data in self._data], [data.xfrc_applied for data in self._data])
         self._each = list(zip(self._models, self._data, *views, strict=True))
-        self._wrenches = np.zeros((self.batch, *views[1][0].shape))
-        components = [(self._rows.body(body), AXES.index(axis)) for body, axes in self._forces.components for axis in axes]
-        self._bodies, self._axes = (np.array(places) for places in zip(*components, strict=True))
         self._warnings = [data.warning.number for data in self._data]
-        self._substeps = round(self._envs[0].control_timestep() / self._models[0].opt.timestep)
-        self._runge_kutta = self._models[0].opt.integrator == mujoco.mjtIntegrator.mjINT_RK4.value
-        self._low, self._high = (np.array(bound, np.float32) for bound in (self.spec.low, self.spec.high))
-        self._h = self.spec.horizon
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy has simulations of its own, and views of their memory: a copied view would not be one."""
+        views = ("_models", "_data", "_rows", "_reward", "_each", "_warnings")
+        return _unfilled, (), {name: value for name, value in self.__dict__.items() if name not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._view()
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
         """Start an episode in every row as in dm_control, with the row's generator."""
-        if len(rngs) != self.batch:
-            raise ValueError(f"dmc: {len(rngs)} generators for {self.batch} rows")
+        check_generators("dmc", self.batch, rngs)
         for env, rng in zip(self._envs, rngs, strict=True):
             env.task.random.seed(int(rng.integers(2**32)))
             with env.physics.reset_context():
@@ -75,7 +90,7 @@ class DMC:
         self._h = 0
         self._diverged = np.zeros(self.batch, bool)
         self._shown = self._observe()
-        return self._shown
+        return self._shown.copy()
 
     def step(self, actions: Float32[np.ndarray, "B A"], forces: Float32[np.ndarray, "B F"]) -> Step:
         """Execute the agent's and the adversary's action in every row; ``forces`` of 1 are the preset's largest force.
@@ -96,7 +111,7 @@ class DMC:
         self._diverged |= np.stack(self._warnings)[:, BROKEN].any(axis=1)
         reward = np.where(self._diverged, 0.0, self._reward(self._rows)).astype(np.float32)
         self._shown = np.where(self._diverged[:, None], self._shown, self._observe())
-        return Step(self._shown, reward, self._h == self.spec.horizon, forces, self._diverged.copy())
+        return Step(self._shown.copy(), reward, self._h == self.spec.horizon, forces.copy(), self._diverged.copy())
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
         """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot render on this node."""
@@ -135,10 +150,19 @@ def _vary(physics: Any, task: Task) -> None:
             model.body_inertia[body] *= value / model.body_mass[body]
         model.body_mass[body] = value
     if task.get("mass", "rescaled") == "rescaled":
+        seen = model.stat.extent, model.stat.center.copy()
         mujoco.mj_setConst(model, data)
+        # It also computes these two anew, from the whole floor.  Cameras clip by them, and would clip the robot away.
+        model.stat.extent, model.stat.center[:] = seen
 
 
-class DMCVariations:
+def _unfilled() -> DMC:
+    """A ``DMC`` before its copied state is set; called before dm_control is imported, also in another process."""
+    os.environ.setdefault("MUJOCO_GL", "disabled")
+    return DMC.__new__(DMC)
+
+
+class DMCVariations(CopiedWhole):
     """B variation environments: simulations in which every row has its fixed adversary."""
 
     def __init__(self, variations: Sequence[Variation]) -> None:
@@ -150,14 +174,14 @@ class DMCVariations:
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
         """Start an episode in every row."""
         self._observation = self.simulation.reset(rngs)
-        return self._observation
+        return self._observation.copy()
 
     def step(self, actions: Float32[np.ndarray, "B A"]) -> Step:
         """Execute one action in every row; the adversary acts on the same observation.  Raises as ``DMC.step`` does."""
         if self._observation is None:
             raise RuntimeError("dmc: call reset before the first step")
         step = self.simulation.step(actions, self._adversaries.act(self._observation))
-        self._observation = step.observation
+        self._observation = step.observation.copy()
         return step
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:

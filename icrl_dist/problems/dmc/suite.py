@@ -11,11 +11,12 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from dm_control.utils.rewards import tolerance
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from icrl_dist.arrays import short
+from icrl_dist.problems.continuous.renderer import OFF, missing, mujoco
 from icrl_dist.types import Spec
 
 Array = Float64[np.ndarray, "B ..."]
@@ -210,7 +211,9 @@ def rendered(draw: Callable[[], np.ndarray]) -> UInt8[np.ndarray, "height width 
     """The image that ``draw`` renders with MuJoCo.  Raises RuntimeError, with the remedy, if it cannot on this node."""
     gl = os.environ.get("MUJOCO_GL", "")
     remedy = "set MUJOCO_GL=egl, or osmesa without a GPU, before Python starts, and install libegl1 or libosmesa6"
-    if gl in ("", "disabled", "disable", "off", "false", "0"):
+    if missing:
+        raise RuntimeError(f"MuJoCo cannot render here ({missing[0]}): {remedy}")
+    if gl in OFF:
         raise RuntimeError(f"MuJoCo cannot render here (MUJOCO_GL={gl!r}): {remedy}")
     try:
         return np.asarray(draw(), np.uint8)
@@ -222,5 +225,5 @@ def check_step(problem: str, spec: Spec, batch: int, done: int, actions: Float32
     """Raises RuntimeError if ``done`` steps reach the horizon, ValueError for actions outside [-1, 1]."""
     if done >= spec.horizon:
         raise RuntimeError(f"{problem}: stepped past the horizon of {spec.horizon}; call reset first")
-    if actions.shape != (batch, spec.actions) or not np.abs(actions).max() <= 1:
-        raise ValueError(f"{problem}: actions {actions}: expected {batch} x {spec.actions} numbers in [-1, 1]")
+    if actions.shape != (batch, spec.actions) or actions.dtype.kind != "f" or not np.abs(actions).max() <= 1:
+        raise ValueError(f"{problem}: actions {short(actions)}: expected {batch} x {spec.actions} numbers in [-1, 1]")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from icrl_dist.config.toml import nearest
+from icrl_dist.problems.checks import check_parameters
 from icrl_dist.types import Spec, Task
 
 KIND = "metaworld-pick-place"
@@ -35,10 +35,7 @@ def task(object: Sequence[float], goal: Sequence[float], **settings: object) -> 
 
 def check(task: Task) -> None:
     """Raises ValueError, with the value, unless the task is one of Meta-World's."""
-    known = ("object", "goal", "horizon", "goal_shown", "disturbance")
-    for name, _ in task.params:
-        if name not in known:
-            raise ValueError(f"{KIND}: no parameter {name!r}{nearest(name, known)}; there are {', '.join(known)}")
+    check_parameters(task, ("object", "goal"), ("horizon", "goal_shown", "disturbance"))
     for name in ("object", "goal"):
         place = task.vector(name)
         inside = len(place) == 3 and all(

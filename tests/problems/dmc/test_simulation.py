@@ -196,6 +196,17 @@ def test_a_mass_changes_inertia_and_derived_constants_except_with_qarls_forces()
     np.testing.assert_array_equal(kept, inertia)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mass_does_not_change_what_cameras_clip_by(kind):
+    """``mj_setConst`` also changes these two, for a walker from 2 m to 273 m: its image showed no robot."""
+    ours, suites = (model.stat for model in (simulation.DMC([corner(kind, 1)])._models[0], plain_model(kind)))
+    assert ours.extent == suites.extent and ours.center.tolist() == suites.center.tolist()
+
+
+def plain_model(kind):
+    return simulation.suite_environment(kind).physics.model.ptr
+
+
 def test_friction_applies_to_every_geom():
     model = simulation.DMC([domains.task("dmc-cheetah-run", friction=0.3)])._models[0]
     np.testing.assert_array_equal(model.geom_friction[:, 0], 0.3)
@@ -247,6 +258,10 @@ def test_a_diverged_episode_is_truncated_and_marked(tmp_path, monkeypatch):
     env._batch.simulation._data[0].qvel[:] = 1e12
     _, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
     assert (reward, terminated, truncated, info["diverged"]) == (0.0, False, True, True)
+    with pytest.raises(RuntimeError, match="broke down in this episode; call reset"):
+        env.step(np.zeros(1, np.float32))
+    env.reset()
+    assert not env.step(np.zeros(1, np.float32))[4]["diverged"]
 
 
 @pytest.mark.parametrize(
