@@ -74,6 +74,11 @@ class Fitting:
         self.version = -1
         """The newest policy version that was fitted or loaded; -1 before the first."""
 
+    @property
+    def steps_done(self) -> int:
+        """Optimizer steps of the next version that are done."""
+        return self._steps_done
+
     def load(self) -> Weights | None:
         """Load the newest version that follows the present one without a gap, and the unfinished fit of the next one.
 

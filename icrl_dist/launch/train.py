@@ -23,7 +23,7 @@ from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.signals import on_signals
 from icrl_dist.diagnostics.modules import hidden_packages
 from icrl_dist.diagnostics.ray_token import require_ray_token
-from icrl_dist.launch import learner_process, run_folder
+from icrl_dist.launch import learner_process, run_folder, watching
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
@@ -274,6 +274,7 @@ def train_ray(
                         learner.end_after_driver(psutil.Process().children(recursive=True))
                     fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
+                    report({"event": "note", "text": watching.hint(run.stream, folder, learner.endpoint)})
                 elif event["event"] == "progress":
                     stored = event["trajectories"]
                 elif event["event"] in ("quarantine", "released"):
