@@ -249,10 +249,7 @@ def train_ray(
         if address is None:  # without a cluster both start at once; on a cluster the nodes are checked first
             learner = stack.enter_context(learner_process.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
-        try:
-            fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
-        except SystemExit:  # raised by Ray's handler of SIGTERM
-            raise TrainInterrupted from None
+        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
         stack.callback(fleet.close)
         handle_again()  # Ray replaces the handlers
         needed = plugins.of_run(run.problem, run.method)
