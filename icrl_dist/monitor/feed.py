@@ -106,14 +106,18 @@ class LiveFeed:
 class ReplayFeed:
     """A run on disk, finished or crashed, played from its dataset and metrics."""
 
-    def __init__(self, folder: Path, speed: float = 10.0) -> None:
-        """``speed``: recorded seconds played in a second.  Raises ConfigError if there is nothing to play."""
+    def __init__(self, folder: Path, speed: float = 10.0, at_end: bool = False) -> None:
+        """``speed``: recorded seconds played in a second; ``at_end``: begin with the state at the end.
+
+        Raises ConfigError if there is nothing to play.
+        """
         self.state = RunState(recorded=True)
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False
         self._evaluation = EvaluationReader(folder, self.state)
-        self._at = self._recording.end if running(folder) else self._recording.begin  # not a past run: it is evaluated now
+        at_end = at_end or running(folder)  # a run that is evaluated now is not past
+        self._at = self._recording.end if at_end else self._recording.begin
         self._messages = self._recording.messages()
         self._next = next(self._messages, None)
         self._ended = threading.Event()
