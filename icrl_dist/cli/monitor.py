@@ -73,7 +73,7 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
             return serve(feed, arguments.host, arguments.web, console)
         from icrl_dist.monitor.screen import watch
 
-        return watch(feed)
+        return watch(feed) or OK
 
 
 def _holds_runs(folder: Path) -> bool:

@@ -32,6 +32,8 @@ MAX_OPEN = 8
 """Runs that are watched at once; a run that nobody watches makes room for another."""
 _IDLE_S = 60.0
 """A run that nobody has watched for this time is closed."""
+_REOPEN_S = 10.0
+"""A recording of a run that goes on is opened again this often."""
 _PERIOD_S = 2.0
 _CONNECT_S = 5.0
 
@@ -62,9 +64,20 @@ class _Watched:
     def __init__(self, run: ListedRun, open_run: OpenFeed) -> None:
         self.run, self.asked = run, time.monotonic()
         self._stack, self._over = contextlib.ExitStack(), threading.Event()
-        self.publisher = SnapshotPublisher(self._stack.enter_context(open_run(run)))
+        self._feed, self._opened = self._stack.enter_context(open_run(run)), time.monotonic()
+        self.publisher = SnapshotPublisher(self._feed)
         self._thread = threading.Thread(target=self.publisher.run, args=(self._over,), name="publisher", daemon=True)
         self._thread.start()
+
+    @property
+    def behind(self) -> bool:
+        """Whether it is a recording at its end and the run has gone on: a run in one process has no learner to connect to."""
+        replay = self._feed.replay()
+        if not self.run.held or replay is None or replay["at"] < replay["end"] or time.monotonic() - self._opened < _REOPEN_S:
+            return False
+        with contextlib.suppress(OSError):
+            return (self.run.folder / "metrics.jsonl").stat().st_mtime > replay["end"] + 1.0
+        return False
 
     @property
     def watched(self) -> bool:
@@ -122,7 +135,7 @@ class FolderViews:
             for name, one in list(self._open.items()):
                 run = now.get(name)
                 resumed = run is not None and run.live and (not one.run.live or run.began != one.run.began)
-                if run is None or resumed or not (one.watched or time.monotonic() - one.asked < _IDLE_S):
+                if run is None or resumed or one.behind or not (one.watched or time.monotonic() - one.asked < _IDLE_S):
                     self._open.pop(name).close()
 
     def _watch(self) -> None:

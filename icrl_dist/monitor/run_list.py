@@ -81,10 +81,13 @@ def state(run: ListedRun) -> str:
     """``training``, ``evaluating``, ``starting``, ``finished``, ``interrupted`` or ``failed``."""
     if run.live:
         return "training"
-    ends = [row["what"] for row in read(run.folder / "metrics.jsonl", _TAIL_BYTES) if row.get("what") in _ENDS]
-    if run.held:
-        return "evaluating" if ends and ends[-1] == "finished" else "starting"
-    return str(ends[-1]) if ends else "interrupted"
+    rows = list(read(run.folder / "metrics.jsonl", _TAIL_BYTES))
+    ends = [row["what"] for row in rows if row.get("what") in _ENDS]
+    if not run.held:
+        return str(ends[-1]) if ends else "interrupted"
+    if rows and rows[-1].get("what") not in _ENDS:
+        return "training"  # in one process, which no view can connect to
+    return "evaluating" if ends and ends[-1] == "finished" else "starting"
 
 
 class RunList:

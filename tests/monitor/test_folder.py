@@ -12,7 +12,7 @@ from rich.console import Console
 from icrl_dist.cli import monitor as command
 from icrl_dist.config.run import ConfigError
 from icrl_dist.monitor import folder as folder_module
-from icrl_dist.monitor import run_list, screen
+from icrl_dist.monitor import headline, run_list, screen
 from icrl_dist.monitor.folder import FolderViews, open_feed, serving_folder
 from icrl_dist.monitor.run_list import RunList, find, state
 from icrl_dist.storage.files import hold
@@ -83,8 +83,11 @@ def test_the_state_of_a_run_is_read_from_its_files(tmp_path):
     assert state(find(tmp_path)[0]) == "finished"
     with hold(path):
         assert state(find(tmp_path)[0]) == "evaluating"
+        rows = (path / "metrics.jsonl").read_text()
         (path / "metrics.jsonl").write_text("")
         assert state(find(tmp_path)[0]) == "starting"
+        (path / "metrics.jsonl").write_text(rows.rpartition('{"time"')[0])
+        assert state(find(tmp_path)[0]) == "training", "in one process, so there is no endpoint"
     assert state(find(tmp_path)[0]) == "interrupted"
 
 
@@ -199,9 +202,14 @@ def test_runs_that_nobody_watches_are_closed_and_a_resumed_run_is_opened_again(t
 
 def test_held_out_results_are_listed_once_they_are_known_and_read_again_if_they_change(tmp_path, monkeypatch):
     path = begun(tmp_path / "run", 1.0)
-    read = []
-    monkeypatch.setattr(run_list.headline, "worth", lambda *_: f"reading {len(read)}")
-    monkeypatch.setattr(run_list, "held_out", lambda folder: read.append(folder) or {})
+    read: list[object] = []
+
+    def held_out(folder):
+        read.append(folder)
+        return {}
+
+    monkeypatch.setattr(run_list, "held_out", held_out)
+    monkeypatch.setattr(headline, "worth", lambda *_: f"reading {len(read)}")
     (path / "results").mkdir()
     (path / "results" / "online-1.parquet").touch()
     with contextlib.closing(RunList(tmp_path)) as runs:
@@ -251,3 +259,16 @@ def test_the_command_tells_a_run_from_a_folder_of_runs(tmp_path):
     assert not command._holds_runs(run) and not command._holds_runs(run / "run.toml")
     with open_feed(find(run)[0]) as feed:
         wait_for(lambda: feed.state.snapshot(feed.now())["run"]["state"] == "finished")
+
+
+def test_a_recording_of_a_run_that_goes_on_is_opened_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder_module, "_PERIOD_S", 30.0)
+    path = begun(tmp_path / "run", 1.0)
+    with hold(path), contextlib.closing(FolderViews(tmp_path, open_feed)) as views:
+        first = views.watched("run")
+        wait_for(lambda: first._feed.replay()["at"] == first._feed.replay()["end"])
+        views.refresh()
+        assert views.watched("run") is first, "only every ten seconds"
+        first._opened -= 20.0
+        views.refresh()
+        assert views.watched("run") is not first

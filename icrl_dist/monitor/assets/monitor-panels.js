@@ -44,7 +44,9 @@ const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 500];
 
 /** The controls of a recording. */
 export class Replay {
-  constructor() {
+  /** `named()`: the fields of a command that name the run. */
+  constructor(named) {
+    this.named = named;
     this.dragging = false;
     this.speeds = "";
     this.replay = null;
@@ -63,7 +65,7 @@ export class Replay {
   }
 
   async #send(fields) {
-    setText(byId("replay-error"), await command(fields));
+    setText(byId("replay-error"), await command({ ...this.named(), ...fields }));
   }
 
   #ended() {
