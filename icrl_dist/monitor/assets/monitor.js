@@ -117,10 +117,18 @@ setInterval(() => {
   document.body.classList.toggle("stale", silent > STALE_MS);
 }, CHECK_MS);
 
+/** Show all on one screen if it has room for everything: more of it for the list of a folder, never for a comparison. */
+function arrange() {
+  const least = runs.folder === null ? 780 : 1000;
+  document.body.classList.toggle("fixed", runs.other === null && innerWidth >= 1200 && innerHeight >= least);
+}
+addEventListener("resize", arrange);
+
 // Drawing: numbers four times a second, tables twice, charts once.
 
 const jobs = [
   [240, () => {
+    arrange();
     drawHeader(store);
     drawAlerts(store);
     replay.draw(store);
