@@ -144,7 +144,7 @@ const jobs = [
   }],
   [1000, () => {
     for (const { id, names, line, title } of timelines) {
-      line.draw(store.series);
+      line.draw(store.series, store.history);
       const newest = names.map(({ name, label }) => `${label} ${brief(store.series[name].at(-1))}`).join(", ");
       byId(id).setAttribute("aria-label", `${title}; now ${newest}`);
     }
