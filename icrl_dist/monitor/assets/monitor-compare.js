@@ -36,7 +36,7 @@ export class Comparison {
       curve?.means.length ? [{ label: `${names[index]} (${curve.name})`, ink: INKS[index], width: 2.5, dash: [], begin: curve.begin, values: curve.means }] : [],
     );
     this.#plot(0, lines);
-    const texts = curves.map((curve, index) => `${names[index]}: ${curve?.means.length ? `n = ${curve.variations} of ${curve.started} variations` : "no mean yet"}`);
+    const texts = curves.map((curve, index) => `${names[index]}: ${curve?.means.length ? `n = ${curve.variations} of ${curve.started} variations` : curve ? "no mean until every optimum is computed" : "no episode yet"}`);
     setText(byId("compare-training-note"), `${texts.join("; ")}. Training tasks and adversaries, which may differ between the runs.`);
   }
 
@@ -58,7 +58,7 @@ export class Comparison {
     setText(byId("compare-p"), same ? (strengths.find(Boolean) ?? "") : "different strengths p");
     const cells = [
       ["Method, problem", ...stores.map(({ run }) => [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(", ") || "–")],
-      ["State", ...stores.map(({ run }) => run.state ?? "–")],
+      ["State", ...stores.map(({ run, replay }) => (replay?.loading ? "loading" : (run.state ?? "–")))],
       ...(same ? [] : [["Strength", ...strengths]]),
       ["Newest model", ...chosen.map((level) => agentText(level, (agent) => agent.role === "newest"))],
       ["T^0", ...chosen.map((level) => agentText(level, (agent) => agent.key === "t0"))],

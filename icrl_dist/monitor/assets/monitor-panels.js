@@ -8,8 +8,8 @@ export function drawHeader({ run, alerts, replay, headline }) {
   setText(byId("name"), run.name || "Waiting for a run");
   const warned = alerts.length ? `(${plural(alerts.length, "alert")}) ` : "";
   document.title = run.name ? `${warned}${run.name}: ${run.state}` : "icrl-dist: live view";
-  badge(byId("state"), run.state ?? "waiting", alerts.length);
-  setText(byId("headline"), headline);
+  badge(byId("state"), replay?.loading ? "loading" : (run.state ?? "waiting"), alerts.length);
+  setText(byId("headline"), replay?.loading ? "Reading the recording: the page does not show the chosen moment yet." : headline);
   setText(byId("what"), [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(" · "));
   const over = ["finished", "evaluating", "interrupted", "failed"].includes(run.state);
   const fit = run.stage === "fit";
