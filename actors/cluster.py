@@ -13,6 +13,7 @@ from typing import Any
 
 from actors import missing
 from actors.placement import Node, Placement
+from actors.running_time import RunningTime
 from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import node_facts
 from icrl_dist.stream import endpoints
@@ -26,6 +27,8 @@ RETRY_S = 2.0
 _MAX_RETRY_S = 60.0
 TRIES = 3
 """A node on which Ray fails this often before a run starts, although it can be reached, is refused."""
+HEAD_S = 30.0
+"""Seconds after which a cluster whose head cannot be reached is lost; Ray aborts this process after 60 s."""
 UNREACHED_S = 5.0
 """Seconds before a node that could not be reached is tried again."""
 _EXAMPLE = "--stream.endpoint tls/HEAD_IP:7447 --stream.certificates FOLDER"
@@ -39,7 +42,7 @@ class _Candidate:
     due: float = 0.0
     """Time of the next check."""
     since: float = 0.0
-    """Time of the last check."""
+    """Time of the last check, in seconds for which this process ran."""
     tries: int = 0
     reported: str = ""
     """The last reported reason for which the node is refused."""
@@ -63,6 +66,10 @@ class Cluster:
         self._certificates = ""
         self._needed: Mapping[str, str] = {}
         self._ports: list[tuple[str, int]] = []
+        self._head: str = ray.get_runtime_context().gcs_address
+        self._unanswered = ""
+        self._clock = RunningTime()
+        self._probed = self._head_answered = self._clock()
         self._own_facts = node_facts.facts()
         self._loopback = ""
 
@@ -118,6 +125,22 @@ class Cluster:
                 self._start_check(candidate)
         return [*refused, *self._finish_checks()]
 
+    def lost(self) -> str:
+        """Why Ray must not be called now: its head cannot be reached, so a call would not return; empty if it can.
+
+        Raises ConnectionError after ``HEAD_S``.
+        """
+        now = self._clock()
+        if now - self._probed >= REFRESH_S:
+            self._probed = now
+            host, _, port = self._head.rpartition(":")
+            self._unanswered = node_facts.reach(host.strip("[]"), int(port), timeout_s=1.0)
+            if not self._unanswered:
+                self._head_answered = now
+        if now - self._head_answered >= HEAD_S:
+            raise ConnectionError(f"the cluster's head has not answered for {HEAD_S:.0f} s ({self._unanswered})")
+        return self._unanswered
+
     def _alive(self) -> dict[str, dict[str, Any]]:
         """The nodes that Ray lists as alive, by identifier."""
         return {str(node["NodeID"]): node for node in self._ray.nodes() if node["Alive"]}
@@ -148,7 +171,7 @@ class Cluster:
     def _start_check(self, candidate: _Candidate) -> None:
         strategy = self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(candidate.node.node_id, soft=False)
         task = self._ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=strategy)(node_facts.facts)
-        candidate.since, candidate.tries = time.monotonic(), candidate.tries + 1
+        candidate.since, candidate.tries = self._clock(), candidate.tries + 1
         self._running_checks[task.remote(self._certificates, self._ports)] = candidate
 
     def _finish_checks(self) -> list[str]:
@@ -176,7 +199,7 @@ class Cluster:
                 del self._candidates[node.node_id]
                 self._placement.join(node)
         for check, candidate in list(self._running_checks.items()):
-            if time.monotonic() - candidate.since > ANSWER_S:
+            if self._clock() - candidate.since > ANSWER_S:
                 del self._running_checks[check]
                 text = f"{candidate.node}: has not answered for {ANSWER_S:.0f} s; look at /tmp/ray/session_latest/logs there"
                 refused += self._refuse(candidate, text, certain=self.reachable(candidate.node.node_id))
@@ -248,6 +271,7 @@ def connection_problems(facts: dict[str, Any]) -> str:
 
 
 def brief(error: BaseException) -> str:
-    """The last line of an error's message."""
+    """The last line of an error's message; of the end of a worker only how it ended, without Ray's advice."""
     lines = [line for line in str(error).splitlines() if line.strip()]
-    return lines[-1].strip()[:200] if lines else type(error).__name__
+    last = lines[-1].rpartition("Worker exit detail: ")[2].partition(" Some common causes")[0].strip() if lines else ""
+    return last[:200] or type(error).__name__

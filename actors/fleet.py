@@ -1,4 +1,4 @@
-"""Fleet: starts the workers with Ray, supervises them, and restarts them.  The only import of Ray.
+"""Fleet: starts the workers with Ray, supervises them, and restarts them, and Ray itself.  The only import of Ray.
 
 Ray places and restarts workers and carries no arrays; all data goes over the link.
 """
@@ -17,14 +17,20 @@ from actors import local
 from actors.cluster import Cluster, brief
 from actors.placement import EndedWorker, Node, Placement, check_cores
 from actors.ray_actor import WorkerActor
+from actors.running_time import RunningTime
+from actors.session import Session, SessionFailed
 from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import ray_job
+from icrl_dist.diagnostics.ray_address import require_cluster
 
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # else the end of Ray resets SIGTERM: a second one kills the command at once
     "RAY_worker_niceness": "0",  # with Ray's default of 15, any other process starves the workers
+}
+_LOCAL_SETTINGS = {
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "300",  # Ray aborts its processes, and this one, so long after the end of its GCS
 }
 JOIN_S = 600.0
 """Seconds that the nodes of a cluster have to join; they install everything when they start for the first time."""
@@ -68,8 +74,8 @@ class Fleet:
         workers with which a run starts if nodes are missing after ``REPORT_MISSING_S``; by default
         ``actors``, or 1.  Raises ConfigError if this machine has fewer cores than workers and not
         ``oversubscribe``: the remaining workers would never start.  Raises FleetFailed if Ray does not
-        start here in several attempts, or in one after which ``stopped()`` is true; ``note`` is called
-        before each new attempt.  The environment variables that Ray needs are set until ``close``.
+        start here (``session.Session`` gets ``note`` and ``stopped``), and ConfigError if there is no cluster at
+        ``address``.  The environment variables that Ray needs are set until ``close``.
         """
         local.refuse_running_session()
         self._address, self._restarts = address, restarts
@@ -80,8 +86,21 @@ class Fleet:
                 check_cores(actors)
         self._variables = local.variables()
         os.environ.update(_SETTINGS)
+        self._session: Session | None = None
         try:
-            self._ray = _connected(address, actors, note, stopped)
+            import ray
+
+            self._ray: Any = ray
+            if address is None:
+                local.forget_other_clusters()
+                local.protect_token()
+                os.environ.update(_LOCAL_SETTINGS)
+                self._session = Session(ray, note, stopped, num_cpus=actors, object_store_memory=100 << 20)
+            else:
+                _connect(ray, address)
+        except SessionFailed as error:
+            local.restore_variables(self._variables)
+            raise FleetFailed(str(error)) from error
         except BaseException:
             local.restore_variables(self._variables)
             raise
@@ -103,7 +122,11 @@ class Fleet:
         self._lives: dict[int, int] = {}
         self._endpoint = self._run_name = self._certificates = ""
         self._folder: str | None = None
+        self._clock = RunningTime()
         self._without_nodes_since: float | None = None
+        self.ray_restarts = 0
+        """Number of times that Ray was started again on this machine."""
+        self._restarts_left, self._progress_at_restart = restarts, -1
 
     def gather(
         self,
@@ -123,14 +146,14 @@ class Fleet:
         if self._cluster is None:
             return
         self._cluster.require(endpoint, connect, certificates, needed)
-        began, noted, reported = time.monotonic(), False, False
+        began, noted, reported = self._clock(), False, False
         enough_since: float | None = None
         with self._cluster.listening(endpoint, connect):
             while not stopped():
                 refused = self._cluster.refresh(note)
                 if refused:
                     raise ConfigError("; ".join(refused))
-                waited, cores, wanted = time.monotonic() - began, self._placement.capacity, self._placement.wanted
+                waited, cores, wanted = self._clock() - began, self._placement.capacity, self._placement.wanted
                 all_joined = wanted is not None or not self._cluster.missing_nodes()
                 enough = cores >= self._at_least and all_joined and cores >= (wanted or 1)
                 enough_since = None if not enough else enough_since or time.monotonic()
@@ -189,7 +212,15 @@ class Fleet:
         Raises FleetFailed when a worker has died more often than its budget allows, or when there
         has been no node for ``JOIN_S``.
         """
+        needed = self._running or self._placement.waiting
+        if self._session is not None and needed and (cause := self._session.failure()):
+            self._restart_ray(cause, note, progress)
         if self._cluster is not None:
+            try:
+                if self._cluster.lost():
+                    return self._count()
+            except ConnectionError as error:
+                raise FleetFailed(f"{error}: start the cluster again with `ray up`") from None
             for line in self._cluster.refresh(note):
                 note(f"{line}; no worker is placed there")
         elif progress and self._restarts and self._spare is None:
@@ -215,7 +246,39 @@ class Fleet:
         if assigned and self._cluster is not None:
             note(f"workers: {self._placement.summary(self._name)}")
         self._check_nodes()
+        return self._count()
+
+    def _count(self) -> int:
+        """Number of workers that are running or will run."""
         return len(self._running) + len(self._undecided) + len(self._placement.waiting)
+
+    def _restart_ray(self, cause: str, note: Callable[[str], None], progress: int) -> None:
+        """Start Ray on this machine again, and all workers, whose ends count as those of workers on a lost node.
+
+        Raises FleetFailed if there have been more than ``restarts`` restarts without progress.
+        """
+        assert self._session is not None
+        remedy = f"{cause}; `dmesg` shows whether the kernel killed it for lack of memory"
+        if progress > self._progress_at_restart:
+            self._restarts_left, self._progress_at_restart = self._restarts, progress
+        if self._restarts_left == 0:
+            raise FleetFailed(remedy)
+        self._restarts_left -= 1
+        note(f"{remedy}; starting Ray and its workers again")
+        for index, actor, _ in self._running.values():
+            self._lost_with_node(index, actor)
+        self._running.clear()
+        self._undecided.clear()
+        self._spare = None
+        node = self._placement.nodes[""]
+        self._placement.leave("")
+        node.workers.clear()
+        self._placement.join(node)
+        try:
+            self._session.restart()
+        except SessionFailed as error:
+            raise FleetFailed(f"{cause}; {error}") from error
+        self.ray_restarts += 1
 
     def _remove_workers_of_lost_nodes(self) -> None:
         lost = {work: one for work, one in self._running.items() if one[2] not in self._placement.nodes}
@@ -287,33 +350,26 @@ class Fleet:
         if self._cluster is None or self._placement.nodes:
             self._without_nodes_since = None
         elif self._without_nodes_since is None:
-            self._without_nodes_since = time.monotonic()
-        elif time.monotonic() - self._without_nodes_since > JOIN_S:
+            self._without_nodes_since = self._clock()
+        elif self._clock() - self._without_nodes_since > JOIN_S:
             raise FleetFailed(f"no node has been available for {JOIN_S:.0f} s; `ray status` shows why")
 
     def close(self) -> None:
         """End all workers, and Ray if it was started here."""
-        for actor in [actor for _, actor, _ in self._running.values()] + [self._spare] * (self._spare is not None):
-            self._kill(actor)
+        if self._session is not None:
+            self._session.close()
+        else:
+            for _, actor, _ in self._running.values():
+                self._kill(actor)
+            self._ray.shutdown()
         self._running.clear()
-        self._ray.shutdown()
         local.restore_variables(self._variables)
 
 
-def _connected(address: str | None, actors: int | None, note: Callable[[str], None], stopped: Callable[[], bool]) -> Any:
-    """Ray, started on this machine for ``actors`` workers or connected to the cluster at ``address``; as ``Fleet``."""
-    import ray
-
-    job = ray_job.job_config(ray)
-    if address is None:
-        options = {"job_config": job, "num_cpus": actors, "object_store_memory": 100 << 20, "_node_ip_address": "127.0.0.1"}
-        try:
-            local.start_ray(ray, note, stopped, **options)
-        except RuntimeError as error:
-            raise FleetFailed(str(error)) from error
-    else:
-        try:
-            ray.init(address=address, job_config=job, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, ray.exceptions.AuthenticationError) as error:
-            raise ConfigError(f"--address {address}: {error}; `ray status` there shows whether a cluster is up") from None
-    return ray
+def _connect(ray: Any, address: str) -> None:
+    """Connect to the cluster at ``address``.  Raises ConfigError if there is none."""
+    require_cluster(address)
+    try:
+        ray.init(address=address, job_config=ray_job.job_config(ray), log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.AuthenticationError) as error:
+        raise ConfigError(f"--address {address}: {brief(error)}; `ray status` there shows whether a cluster is up") from None

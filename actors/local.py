@@ -1,56 +1,15 @@
-"""Ray in this process and on this computer.  Ray is an argument: only ``fleet`` imports it."""
+"""What Ray reads and sets in this process: environment variables, the token, a running session."""
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
+import secrets
 import sys
-from collections.abc import Callable, Mapping
-from typing import Any
-
-import psutil
+from collections.abc import Mapping
 
 from icrl_dist.config.run import ConfigError
-
-TRIES = 3
-"""Attempts to start Ray before a run fails."""
-
-
-def start_ray(ray: Any, note: Callable[[str], None], stopped: Callable[[], bool] = lambda: False, **options: Any) -> None:
-    """Start Ray with these options of ``ray.init``; try again if it does not start.
-
-    Ray's node process ends for good when one of the processes that it starts takes more than 30 s, which
-    happens on a busy computer; only a new Ray helps.  ``note`` is called with a line before each new
-    attempt.  Raises RuntimeError after ``TRIES`` attempts, or after a failed one if ``stopped()`` is true.
-    Raises SystemExit at SIGTERM, by the handler that Ray sets when it starts.
-    """
-    for number in range(1, TRIES + 1):
-        before = psutil.Process().children()
-        try:
-            ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR, **options)
-            return
-        except (Exception, SystemExit) as error:  # Ray raises no specific type
-            ray.shutdown()
-            _end(set(psutil.Process().children()) - set(before))  # Ray leaves what it had already started
-            if isinstance(error, SystemExit):
-                raise
-            cause = str(error).splitlines()[0] if str(error) else type(error).__name__
-            text = f"Ray did not start on this machine ({cause})"
-            if stopped() or number == TRIES:
-                raise RuntimeError(f"{text}, tried {number} times; its logs are in /tmp/ray/session_latest/logs") from error
-            note(f"{text}: starting it again, {number + 1} of {TRIES}")
-
-
-def _end(processes: set[psutil.Process]) -> None:
-    family = list(processes)
-    for process in processes:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            family += process.children(recursive=True)
-    for process in family:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            process.kill()
-    psutil.wait_procs(family, timeout=5.0)
+from icrl_dist.diagnostics.ray_token import token_file
 
 
 def refuse_running_session() -> None:
@@ -73,3 +32,36 @@ def restore_variables(former: Mapping[str, str]) -> None:
     for name in variables():
         del os.environ[name]
     os.environ.update(former)
+
+
+def forget_other_clusters() -> None:
+    """Delete the variables that describe another Ray, such as RAY_ADDRESS, until ``restore_variables``.
+
+    Kept are those of the token, RAY_TMPDIR, and Ray's settings, whose names are in small letters after ``RAY_``.
+    """
+    for name in variables():
+        if name.isupper() and name != "RAY_TMPDIR" and not name.startswith("RAY_AUTH_"):
+            os.environ.pop(name, None)
+
+
+def protect_token() -> None:
+    """Make sure that Ray's token exists and that only this user can read it: Ray itself makes it readable for all.
+
+    Where it cannot be stored, it is in the environment until ``restore_variables``.
+    """
+    if os.environ.get("RAY_AUTH_MODE", "token") != "token" or os.environ.get("RAY_AUTH_TOKEN"):
+        return
+    token = secrets.token_hex(32)
+    try:
+        file = token_file()
+        if file.is_file() and file.stat().st_size:
+            with contextlib.suppress(OSError):  # another user's
+                file.chmod(0o600)
+            return
+        file.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    except (OSError, RuntimeError):  # there is no home folder
+        os.environ["RAY_AUTH_TOKEN"] = token
+        return
+    with os.fdopen(descriptor, "w") as opened:
+        opened.write(token)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 
@@ -10,7 +9,7 @@ from torch import nn
 
 from icrl_dist.models.weights import load_weights
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Link, Refused, StreamKeys, Unanswered
+from icrl_dist.stream.link import LOST, Link, Refused, StreamKeys, Unanswered
 from icrl_dist.types import Weights
 
 _VERSIONS = 4
@@ -44,14 +43,19 @@ class WeightCache:
         """The model of this version and its weights digest.
 
         Waits for the broadcast, and repeatedly requests the version from the learner.  Raises Unanswered if it
-        does not arrive in time, or if the learner has only newer versions.
+        does not arrive in time, or if the learner has lost it or has only newer versions.
         """
         deadline = time.monotonic() + self._timeout_s
         request = wire.encode_message("weights", version=version)
         while (weights := self._cached.get(version)) is None:
             newest = -1
-            with contextlib.suppress(Refused, Unanswered):  # not published yet, or no learner: wait below
+            try:
                 newest = self._add(self._link.request(self._keys.weights_latest, request, timeout_s=5.0)).version
+            except Refused as error:
+                if LOST in str(error):
+                    raise Unanswered(f"weights version {version}: {error}") from None
+            except Unanswered:  # no learner: wait below
+                pass
             if newest > version:
                 raise Unanswered(f"weights version {version} is gone; the learner is at {newest}")
             with self._arrived:

@@ -38,7 +38,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int16, Int64
 
 from icrl_dist.stream.link import Link
-from icrl_dist.types import Adversary, Identity, Job, Payload, Spec, Split, Step, Task, Trajectory, Variation
+from icrl_dist.types import NULL, Adversary, Identity, Job, Payload, Spec, Split, Step, Task, Trajectory, Variation
 
 if TYPE_CHECKING:
     import torch
@@ -192,6 +192,24 @@ class Behaviors:
     """``make(names, rngs, env)``: row r follows the policy ``names[r]``, which draws from ``rngs[r]``."""
 
 
+@dataclass(frozen=True)
+class Limits:
+    """What values the trajectories of a problem can have, beyond its spec; others are refused."""
+
+    reward: tuple[float, float] = (-1e6, 1e6)
+    """Smallest and largest reward of a step."""
+    slack: float = 0.0
+    """By how many times its range an observation component may exceed that range, on either side."""
+    disturbances: int | None = None
+    """Components of an adversary's action, with vector actions; None: any number."""
+
+    def disturbance(self, adversary: Adversary) -> float:
+        """Largest component of this adversary's action, with vector actions: its ``strength`` if it has one."""
+        if adversary == NULL:
+            return 0.0
+        return adversary.number("strength") * (1 + 1e-6) if "strength" in dict(adversary.params) else 1e6
+
+
 MakeDrawing = Callable[[np.ndarray, np.ndarray, Mapping[str, Any], int], dict[str, Any]]
 """See ``Problem.drawing``."""
 
@@ -336,6 +354,11 @@ class Problem(abc.ABC):
     def spec(self) -> Spec:
         """The spec that all of the problem's tasks share."""
         return self.spec_of(self.split.train[0])
+
+    @property
+    def limits(self) -> Limits:
+        """The values that its trajectories can have."""
+        return Limits()
 
     @property
     def horizon(self) -> int:

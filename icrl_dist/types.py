@@ -248,6 +248,17 @@ class Weights:
     digest: str
 
 
+class LabelCounts(NamedTuple):
+    """The labels that a job asks for in each of its trajectories."""
+
+    queries: int
+    """Query states, Q."""
+    window_steps: int
+    """Those of them that belong to action windows, R."""
+    origin: str
+    """Their source: see ``Trajectory.origin``."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Payload:
     """Settings of one kind of job; each kind has its own subclass, which is decoded strictly."""
@@ -259,6 +270,12 @@ class Payload:
     arrives_at_once: ClassVar[bool] = False
     """Whether all trajectories of a job arrive together, after hours of training or immediately from a cache.
     The time between two trajectories then does not predict when the next one arrives."""
+
+    @property
+    def labels(self) -> LabelCounts | None:
+        """The labels of each trajectory: ``label_counts`` of the payload's ``labelling``; None where that does not say."""
+        found: LabelCounts | None = getattr(getattr(self, "labelling", None), "label_counts", None)
+        return found
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from icrl_dist.stream import wire
-from icrl_dist.stream.link import Link, Query, StreamKeys
+from icrl_dist.stream.link import LOST, Link, Query, StreamKeys
 from icrl_dist.stream.validation import integer
 from icrl_dist.types import Weights
 
@@ -14,7 +14,7 @@ from icrl_dist.types import Weights
 class Broadcast:
     """Publishes policy versions of T_theta and answers requests for them, also for older ones.
 
-    ``older`` loads a version that was published before; it raises for a version that does not exist.
+    ``older`` loads a version that was published before; if it raises an error, the run must end.
     """
 
     def __init__(self, link: Link, keys: StreamKeys, older: Callable[[int], Weights]) -> None:
@@ -60,6 +60,10 @@ class Broadcast:
                 return
             if 0 <= version < newest:
                 if self._loaded[0] != version:
-                    self._loaded = version, wire.encode_weights(self._older(version))
+                    try:
+                        self._loaded = version, wire.encode_weights(self._older(version))
+                    except Exception as error:  # ``older`` has ended the run
+                        query.refuse(f"{LOST}: {error}")
+                        return
                 payload = self._loaded[1]
         query.reply(payload)

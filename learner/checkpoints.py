@@ -15,7 +15,7 @@ from icrl_dist.agent.loading import spec_from
 from icrl_dist.config.run import ConfigError, Run, dumps
 from icrl_dist.models.weights import load_weights, weights_of
 from icrl_dist.problems import registry
-from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_format, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, DamagedCheckpoint, load_checkpoint, require_format, save_checkpoint
 from icrl_dist.stream import wire
 from icrl_dist.stream.validation import VERSION
 from icrl_dist.telemetry import provenance
@@ -67,32 +67,30 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
 def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping[str, Any]:
     """Load a checkpoint of ``save`` into model and optimizer; returns the manifest.
 
-    Raises ConfigError for a checkpoint of another spec, data format, model size or optimizer.
+    Raises ConfigError, and changes neither, for a checkpoint of another spec, data format, model size or optimizer.
     """
     checkpoint = load_checkpoint(path)
     require_format(checkpoint.manifest, str(path))
     found = spec_from(checkpoint.manifest["spec"])
     if found != spec:
         raise ConfigError(f"{path}: a checkpoint of another spec ({found}), this run needs {spec}: use another --out")
+    arrays, state = checkpoint.part("model"), checkpoint.part("optimizer")
+    own = {name: tuple(value.shape) for name, value in model.state_dict().items()}
+    if own != {name: array.shape for name, array in arrays.items()}:
+        raise ConfigError(f"{path}: a checkpoint of another model, its arrays have other names or shapes: use another --out")
     try:
-        load_weights(model, checkpoint.part("model"))
-    except RuntimeError as error:
-        raise ConfigError(
-            f"{path}: a checkpoint of another model ({' '.join(str(error).split())}): use another --out"
-        ) from None
-    try:
-        opt.load({name: torch.from_numpy(np.array(value)) for name, value in checkpoint.part("optimizer").items()})
+        opt.load({name: torch.from_numpy(np.array(value)) for name, value in state.items()})
     except ValueError as error:
         raise ConfigError(f"{path}: a checkpoint of another optimizer ({error}): it has the run's optim.muon") from None
+    load_weights(model, arrays)
     return checkpoint.manifest
 
 
-def quarantined(folder: Path, version: int) -> dict[str, str]:
-    """The variations that were quarantined up to a version: name and cause of each."""
-    return dict(read_manifest(version_file(folder, version)).get("quarantined", {})) if version >= 0 else {}
-
-
 def weights_of_file(path: Path, version: int) -> Weights:
-    """The weights in a checkpoint, with their digest.  Raises StoreError if there is no checkpoint."""
-    arrays = load_checkpoint(path).part("model")
-    return Weights(version, arrays, wire.weights_digest(arrays))
+    """The weights in a checkpoint, with their digest.  Raises StoreError for a missing or damaged one."""
+    checkpoint = load_checkpoint(path)
+    arrays = checkpoint.part("model")
+    digest = wire.weights_digest(arrays)
+    if digest != checkpoint.manifest.get("weights_digest", digest):
+        raise DamagedCheckpoint(f"{path}: damaged, its weights do not have the digest that it names")
+    return Weights(version, arrays, digest)

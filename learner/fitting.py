@@ -2,33 +2,64 @@
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw, Method, Phase
+from icrl_dist.models.weights import weights_of
 from icrl_dist.storage import checkpoint
 from icrl_dist.training import fit
 from icrl_dist.types import Spec, Weights
 from learner import checkpoints
+from learner.recovery import continues
 
 SAVE_STEPS = 1000
 """Optimizer steps between checkpoints of a fit that is not finished."""
+EXPLODED = 10.0
+"""A fit has diverged if its last mean loss is more than this many times its first loss, or than 1 if that is more."""
+
+
+class RunFailed(RuntimeError):  # noqa: N818
+    """The run cannot continue; the message is one line for the user."""
+
+
+def device_of(name: str) -> torch.device:
+    """The device of ``learner.device``.  Raises RunFailed if it is ``cuda`` and torch finds no GPU."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise RunFailed("learner.device = 'cuda': torch finds no GPU; use auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 class Fitting:
     """Trains the newest policy version of a run; continues a fit that was interrupted."""
 
-    def __init__(self, run: Run, folder: Path, method: Method, spec: Spec, device: torch.device, threads: int) -> None:
-        """Builds an untrained model; ``resume`` loads the newest checkpoint of ``folder``.
+    def __init__(
+        self,
+        run: Run,
+        folder: Path,
+        method: Method,
+        spec: Spec,
+        device: torch.device,
+        threads: int,
+        intact: Mapping[int, Mapping[str, Any]],
+        note: Callable[[str], None],
+    ) -> None:
+        """Builds an untrained model; ``load`` loads the newest checkpoint of ``folder``.
 
-        ``threads``: CPU threads of fits.
+        ``threads``: CPU threads of fits; ``intact``: the manifests of the versions whose checkpoints can be used;
+        ``note`` is told of an unfinished fit that cannot be continued.
         """
         self._run, self._folder, self._spec, self._threads = run, folder, spec, threads
+        self._intact = intact
+        self.note = note
+        """Called with what cannot be used."""
         self.device_name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
         """``cpu``, or the name of the GPU."""
         self.method = method
@@ -39,22 +70,32 @@ class Fitting:
         self._model = method.build(spec, run).to(device)
         self._optimizer = fit.Optimizer(self._model, run.optim)
         self._steps_done = 0
-        self.version = checkpoint.newest_version(folder)
-        """The newest policy version that was fitted; -1 before the first."""
+        self._first_loss = math.nan
+        self.version = -1
+        """The newest policy version that was fitted or loaded; -1 before the first."""
 
-    def resume(self) -> Weights | None:
-        """Load the newest version, and the unfinished fit of the next one if there is one.
+    @property
+    def steps_done(self) -> int:
+        """Optimizer steps of the next version that are done."""
+        return self._steps_done
 
-        Returns the weights of the newest version; None before the first.
+    def load(self) -> Weights | None:
+        """Load the newest version that follows the present one without a gap, and the unfinished fit of the next one.
+
+        Returns the weights of the version that was loaded; None if there is none.
         """
-        newest = None
-        if self.version >= 0:
-            file = checkpoint.version_file(self._folder, self.version)
+        newest, loaded = self.version, None
+        while newest + 1 in self._intact:
+            newest += 1
+        if newest > self.version:
+            file = checkpoint.version_file(self._folder, newest)
             checkpoints.restore(file, self._spec, self._model, self._optimizer)
-            newest = self._weights()
-        if self._partial.exists() and checkpoints.read_manifest(self._partial)["next_version"] == self.version + 1:
-            self._steps_done = checkpoints.restore(self._partial, self._spec, self._model, self._optimizer)["step"]
-        return newest
+            self.version = newest
+            loaded = Weights(newest, weights_of(self._model), str(self._intact[newest]["weights_digest"]))
+        if continues(self._partial, self._run, self.version, self.note):
+            manifest = checkpoints.restore(self._partial, self._spec, self._model, self._optimizer)
+            self._steps_done, self._first_loss = manifest["step"], float(manifest.get("first_loss", math.nan))
+        return loaded
 
     def fit(
         self,
@@ -68,7 +109,8 @@ class Fitting:
 
         ``draw``: draws the batches; None for a phase without steps.  ``report`` is called after each step with
         its number and its loss, then ``check``, which raises an error to end the fit.  A checkpoint is written
-        before that if ``stop`` is set.
+        before that if ``stop`` is set.  Raises FloatingPointError for a fit that diverged: a loss or a parameter is not
+        finite, or the loss has become ``EXPLODED`` times as large as at the first step (or as 1, if that is more).
         """
 
         def loss_of(step: int) -> torch.Tensor:
@@ -79,9 +121,12 @@ class Fitting:
 
         def progress(step: int, loss: float) -> None:
             self._steps_done = step  # if damaged data ends this fit, the next call continues from here
+            if step == 1:
+                self._first_loss = loss
             report(step, loss)
             if stop.is_set() or (step % SAVE_STEPS == 0 and step < phase.steps):
-                self._save(self._partial, self._weights(), next_version=phase.next_version, step=step)
+                about = {"next_version": phase.next_version, "step": step, "first_loss": self._first_loss}
+                self._save(self._partial, self._weights(), **about)
             check()
 
         torch_threads, first = torch.get_num_threads(), self._steps_done
@@ -92,12 +137,21 @@ class Fitting:
         finally:
             torch.set_num_threads(torch_threads)
         self._steps_done = 0
+        remedy = f"lower the learning rate ({phase.learning_rate:g})"
+        if phase.steps and loss > EXPLODED * max(1.0, self._first_loss):
+            raise FloatingPointError(f"the loss rose from {self._first_loss:g} to {loss:g}: {remedy}")
+        if not all(bool(parameter.isfinite().all()) for parameter in self._model.parameters()):
+            raise FloatingPointError(f"a parameter is infinite or not a number after the last step: {remedy}")
         self.version = phase.next_version
         return loss
 
-    def save(self, **fields: object) -> Weights:
-        """Write the checkpoint of the newest version, with these fields in its manifest; returns its weights."""
+    def save(self, accept: Callable[[Weights], None], **fields: object) -> Weights:
+        """Write the checkpoint of the newest version, with these fields in its manifest; returns its weights.
+
+        ``accept`` is called with them before anything is written; it raises an error if they cannot be used.
+        """
         weights = self._weights()
+        accept(weights)
         self._save(checkpoint.version_file(self._folder, self.version), weights, **fields)
         self._partial.unlink(missing_ok=True)
         return weights

@@ -14,58 +14,17 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
+from icrl_dist.collect.checks import Rejected, check
+from icrl_dist.interfaces import Limits
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import batching, wire
-from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.link import Query
-from icrl_dist.stream.messages import is_name
 from icrl_dist.types import Identity, Job, Spec, Trajectory
 
 _log = logging.getLogger(__name__)
 
 REASONS = (*wire.REASONS, "spec", "not-finite", "unexpected", "stale-weights", "duplicate", "busy")
 """Why a message was not stored.  A ``duplicate`` is acknowledged; the others are refused."""
-
-
-class Rejected(Exception):  # noqa: N818
-    """A well-formed trajectory that this run cannot use."""
-
-    def __init__(self, reason: str, detail: str) -> None:
-        super().__init__(f"{reason}: {detail}")
-        self.reason = reason
-
-
-def check(trajectory: Trajectory, job: Job, spec: Spec, weights_digest: str) -> None:
-    """Raises Rejected if the trajectory does not match its job, the spec or the weights of the job's policy version."""
-    identity, size = trajectory.identity, (spec.horizon + 1, spec.observation)
-    if trajectory.observations.shape != size:
-        raise Rejected("spec", f"{identity}: observations have shape {trajectory.observations.shape}, this run needs {size}")
-    if trajectory.queries.shape[1] != spec.observation or trajectory.labels.shape[1] != spec.actions:
-        raise Rejected("spec", f"{identity}: queries have shape {trajectory.queries.shape}, labels {trajectory.labels.shape}")
-    if (trajectory.actions.ndim == 1) != spec.discrete:
-        kind = "discrete" if spec.discrete else "continuous"
-        raise Rejected("spec", f"{identity}: actions have shape {trajectory.actions.shape}, this run has {kind} actions")
-    low, high = (0, spec.actions - 1) if spec.discrete else (-1, 1)
-    for chosen in (trajectory.actions, trajectory.prev_actions, *(() if spec.discrete else (trajectory.labels,))):
-        if len(chosen) and (chosen.min() < low or chosen.max() > high):
-            raise Rejected("spec", f"{identity}: an action lies outside {low}..{high}")
-    if not all(map(_finite, trajectory.arrays().values())):
-        raise Rejected("not-finite", f"{identity}: a value is infinite or not a number")
-    if not is_name(trajectory.worker):
-        raise Rejected("spec", f"{identity}: its worker's name {show(trajectory.worker)} is not one")
-    if trajectory.variation != job.variation(identity):
-        raise Rejected("unexpected", f"{identity}: its variation is not the one of its job")
-    if (trajectory.policy_version, trajectory.weights_digest) != (job.policy_version, weights_digest):
-        made = f"policy version {trajectory.policy_version} with weights {trajectory.weights_digest[:8]!r}"
-        wanted = f"{job.policy_version} with weights {weights_digest[:8]!r}"
-        raise Rejected("stale-weights", f"{identity}: made by {made}, its job names {wanted}")
-
-
-def _finite(array: np.ndarray) -> bool:
-    """Whether every value is finite; a finite sum of squares proves it faster."""
-    return bool(np.isfinite(np.vdot(array, array)) or np.isfinite(array).all())
 
 
 class Ingest:
@@ -80,10 +39,11 @@ class Ingest:
         digest_of: Callable[[int], str],
         stored: Callable[[Trajectory], None],
         failed: Callable[[BaseException], None],
+        limits: Limits = Limits(),  # noqa: B008
         capacity: int = 256,
         capacity_bytes: int = 64 << 20,
     ) -> None:
-        """``limit``: the largest message in bytes.
+        """``limit``: the largest message in bytes; ``limits``: the values that trajectories can have.
 
         ``pending_job`` returns the job in which a trajectory is missing, None if no job needs it.
         ``digest_of`` returns the weights digest of a policy version.  ``stored`` is called after a
@@ -93,7 +53,7 @@ class Ingest:
         self.drops: Counter[str] = Counter()
         self.commits = 0
         """Number of groups stored, with one fsync each."""
-        self._store, self._spec, self._limit = store, spec, limit
+        self._store, self._spec, self._limit, self._limits = store, spec, limit, limits
         self._pending_job, self._digest_of, self._stored, self._failed = pending_job, digest_of, stored, failed
         self._load = _QueueLoad(capacity, capacity_bytes)
         self._queue: queue.SimpleQueue[Query | None] = queue.SimpleQueue()
@@ -165,7 +125,7 @@ class Ingest:
                 elif job is None:
                     raise Rejected("unexpected", f"{identity}: no open job contains it")
                 else:
-                    check(trajectory, job, self._spec, self._digest_of(job.policy_version))
+                    check(trajectory, job, self._spec, self._digest_of(job.policy_version), self._limits)
                     good[identity] = trajectory
             except (wire.WireError, Rejected) as error:
                 self._refuse(query, error)

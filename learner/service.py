@@ -17,16 +17,16 @@ from icrl_dist.interfaces import Phase
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
 from icrl_dist.results import training_rows
-from icrl_dist.storage import checkpoint, files
+from icrl_dist.storage import checkpoint, files, layout
 from icrl_dist.storage.dataset import Damaged, Dataset
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.stream.link import Link, StreamKeys
 from icrl_dist.telemetry import provenance
 from icrl_dist.telemetry.metrics import Metrics
 from icrl_dist.types import Identity, Job, Trajectory, Weights
-from learner import checkpoints
+from learner import checkpoints, recovery
 from learner.broadcast import Broadcast
-from learner.fitting import Fitting
+from learner.fitting import Fitting, RunFailed, device_of
 from learner.ingest import Ingest
 from learner.past import PastServer
 from learner.phases import PhasePlan
@@ -34,11 +34,9 @@ from learner.reporter import Reporter
 from learner.scheduler import LeaseScheduler
 from learner.worker_api import WorkerAPI
 
+__all__ = ["Interrupted", "RunFailed", "Service"]
+
 Report = Callable[[dict[str, Any]], None]
-
-
-class RunFailed(RuntimeError):  # noqa: N818
-    """The run cannot continue; the message is one line for the user."""
 
 
 class Interrupted(Exception):  # noqa: N818
@@ -54,6 +52,7 @@ class Service:
         Raises StoreError if another learner uses the folder, or if its files cannot be used.
         """
         self._run, self._folder, self._link, self._report = run, folder, link, report
+        layout.refuse_odd_files(folder)
         with contextlib.ExitStack() as closing:
             closing.enter_context(files.hold(folder))
             self._open(closing)
@@ -66,9 +65,14 @@ class Service:
         self._spec = registry.of(run).spec
         lineage = Lineage.of(folder, run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
-        self._device = _device(run.learner.device)
+        self._device = device_of(run.learner.device)
         self._method = methods.of(run)
-        self._fitting = Fitting(run, folder, self._method, self._spec, self._device, self._threads)
+        notes = list[str]()
+        self._plan = PhasePlan(run, lineage, self._method)
+        found = recovery.intact(folder, run, lineage, self._plan.phases[-1].next_version, notes.append)
+        self._data = recovery.DataCheck(folder, found)
+        self._fitting = Fitting(run, folder, self._method, self._spec, self._device, self._threads, found, notes.append)
+        newest = self._fitting.load()
         self._metrics = Metrics(folder, prometheus=run.learner.prometheus)
         closing.callback(self._metrics.close)
         self._reporter = Reporter(run, folder, link, self._keys, self._metrics, report, lambda: self.version)
@@ -80,11 +84,14 @@ class Service:
         self._error: BaseException | None = None
         self._lag = 0
         self._repairs = 0
-        self.store = Dataset(folder / "dataset")
+        for text in notes:
+            self._note(text)
+        self._fitting.note = self._note
+        self.store = self._plan.store = Dataset(folder / "dataset", check=self._plan.refusal)
         closing.callback(self.store.close)
         self._report_repairs()
-        self._plan = PhasePlan(run, lineage, self.store, self._method)
-        self._plan.quarantine(checkpoints.quarantined(folder, self.version))
+        self._data.weights(self.store)
+        self._plan.quarantine(dict(found[max(found)].get("quarantined", {})) if found else {})
         self._open_phases: set[Phase] = set()
         self._broadcast = Broadcast(link, self._keys, self._load_weights)
         self.ingest = Ingest(
@@ -95,6 +102,7 @@ class Service:
             self._broadcast.digest_of,
             self._stored,
             self.fail,
+            registry.of(run).limits,
         )
         closing.callback(self.ingest.close)
         policy_version = lambda job: self._plan.policy_version(job, self.version)  # noqa: E731
@@ -104,11 +112,17 @@ class Service:
         closing.callback(self.worker_api.close)
         closing.callback(PastServer(link, self._keys, run, folder, self.store).close)
         self._serving = False
-        if newest := self._fitting.resume():
+        if newest is not None:
             self._broadcast.publish(newest)
         made_by = provenance.record(run.problem, run.method, self._threads, self._fitting.device_name)
         if changed := provenance.add_session(folder, self.version, made_by):
-            self._reporter.event({"event": "note", "text": changed})
+            self._note(changed)
+            self._data.excused = changed
+        elif run.stream.staleness:
+            self._data.excused = "rounds overlap (stream.staleness), so other versions may have collected it"
+
+    def _note(self, text: str) -> None:
+        self._reporter.event({"event": "note", "text": text})
 
     @property
     def version(self) -> int:
@@ -154,8 +168,16 @@ class Service:
             self._changed.set()
 
     def _load_weights(self, version: int) -> Weights:
-        """The weights of an earlier version, from its checkpoint."""
-        return checkpoints.weights_of_file(checkpoint.version_file(self._folder, version), version)
+        """The weights of an earlier version, from its checkpoint.  Ends the run if they are lost."""
+        file = checkpoint.version_file(self._folder, version)
+        try:
+            return checkpoints.weights_of_file(file, version)
+        except files.StoreError as error:
+            self.fail(RunFailed(f"{error}: T^{version} was lost while the run was active; --resume fits it again"))
+            raise
+        except Exception as error:  # else workers would ask for ever
+            self.fail(error)
+            raise
 
     # Called from the thread of ``run``.
 
@@ -178,16 +200,17 @@ class Service:
 
     def _run_phases(self) -> dict[str, Any]:
         self._reporter.describe(self._plan.phases, [job for phase in self._plan.phases for job in self._plan.ask(phase)])
-        while (phase := self._plan.next(self.version)) is not None:
+        while (phase := self._next_phase()) is not None:
             if phase.next_version <= self.version:
                 jobs = ", ".join(job.label for job in self._plan.incomplete(phase))
-                self._reporter.event({"event": "note", "text": f"trajectories of {jobs} are missing: collecting them again"})
+                self._note(f"trajectories of {jobs} are missing: collecting them again")
+                self._data.collected = True
             try:
                 self._collect(phase)
                 if phase.next_version > self.version:
                     self._fit(phase)
             except Damaged as error:
-                self._reporter.event({"event": "note", "text": str(error)})
+                self._note(str(error))
                 self.store.repair()
                 self._report_repairs()
                 self._plan.recheck()
@@ -208,6 +231,13 @@ class Service:
             "threads": self._threads,
             "instruction_set": torch.backends.cpu.get_cpu_capability(),
         }
+
+    def _next_phase(self) -> Phase | None:
+        """The next phase to collect or fit; compares the data of fitted versions with their checkpoints once it is complete."""
+        phase = self._plan.next(self.version)
+        if self._data.manifests and (phase is None or phase.next_version > max(self._data.manifests)):
+            self._data.data(self.store, self._plan.quarantined, self._note)
+        return phase
 
     def close(self) -> None:
         """Stop storing trajectories and close all files."""
@@ -257,17 +287,16 @@ class Service:
                 f"{phase.stage}/{phase.round}: no trajectory was stored, and {len(causes)} of its variations are "
                 f"quarantined; first: {next(iter(causes.values()))}"
             )
-        self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
+        self._metrics.write(phase.next_version, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         if phase.next_version > self.version:
             rated = self._method.label_quality(self._run, phase, self.store)
-            quality = training_rows.rate_labels(
-                self._run, self._folder, phase, rated, lambda text: self._reporter.event({"event": "note", "text": text})
-            )
+            quality = training_rows.rate_labels(self._run, self._folder, phase, rated, self._note)
             if quality is not None:
                 self._reporter.labels_rated(phase.round, quality)
 
     def _fit(self, phase: Phase) -> None:
         """Fit the model to the data of a phase, write its checkpoint and publish its weights."""
+        self._metrics.continue_from(self.version, self._fitting.steps_done)
         draw = self._method.data(self._run, phase, self.store) if phase.steps else None
         began = time.monotonic()
 
@@ -276,21 +305,27 @@ class Service:
             if step % 50 == 0 or step == phase.steps:
                 self._metrics.write(step, f"fit/{phase.next_version}", loss=loss)
 
-        loss = self._fitting.fit(phase, draw, report, self._stop, self._check)
+        try:
+            loss = self._fitting.fit(phase, draw, report, self._stop, self._check)
+        except FloatingPointError as error:
+            text = f"the fit of T^{phase.next_version} diverged: {error}"
+            self._reporter.diverged(text)
+            raise RunFailed(text + recovery.largest_values(self.store, self._spec, phase.next_version)) from None
         self.store.seal()
         weights = self._fitting.save(
+            self._data.accept(self.store),
             loss=loss,
             dataset=self.store.manifest(),
             dataset_digest=self.store.digest(self.version),
             quarantined=self._plan.quarantined,
         )
-        self._broadcast.publish(weights)
+        self._broadcast.publish(self._fitting.load() or weights)
         self._reporter.fitted(loss, time.monotonic() - began)
 
     def _report_repairs(self) -> None:
         """Report the damaged data that was removed when the dataset was opened."""
-        self._repairs += len(self.store.repaired)
-        for note in self.store.repaired:
+        self._repairs += len(self.store.damage)
+        for note in self.store.damage:
             self._reporter.event({"event": "repaired", "text": note})
 
     def _check(self) -> None:
@@ -317,10 +352,3 @@ class Service:
             **values,
         }
         self._reporter.progress(fields, force, self.worker_api.known.totals)
-
-
-def _device(name: str) -> torch.device:
-    """The device of ``learner.device``.  Raises RunFailed if it is ``cuda`` and torch finds no GPU."""
-    if name == "cuda" and not torch.cuda.is_available():
-        raise RunFailed("learner.device = 'cuda': torch finds no GPU; use auto or cpu")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -7,7 +7,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from icrl_dist.agent.in_context_agent import InContextAgent
@@ -15,12 +14,14 @@ from icrl_dist.agent.ood_score import calibrate
 from icrl_dist.agent.threads import torch_threads, whole_or_none
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.paths import path_of
-from icrl_dist.config.run import ConfigError, Deployment, parse_written
+from icrl_dist.config.run import ConfigError, Deployment, load_folder, parse_written
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
 from icrl_dist.models.weights import load_weights
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, newest_version, version_file
 from icrl_dist.storage.files import StoreError
+from icrl_dist.storage.fork import Lineage
+from icrl_dist.storage.held import check_weights, hold
 from icrl_dist.types import Spec
 
 _AGENTS = Path(str(resources.files("icrl_dist.agent.shipped")))
@@ -46,12 +47,9 @@ def load_agent(
     below 1 or ``seed`` below 0, StoreError if the file was not written by this system or its weights are no finite numbers.
     Loading executes no code from the file.
     """
-    path = shipped(what) if what in SHIPPED else checkpoint_file(path_of("what", what))
     threads = whole_or_none("threads", threads, 1)
-    checkpoint = agent_checkpoint(path)
+    checkpoint = agent_checkpoint(shipped(what)) if what in SHIPPED else open_checkpoint(path_of("what", what))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    if broken := [name for name, array in checkpoint.part("model").items() if not np.isfinite(array).all()]:
-        raise StoreError(f"{what}: weights {broken[0]} are no finite numbers, so its training diverged; load another version")
     with torch_threads(threads):  # a forked process cannot use the threads that this one started
         return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
 
@@ -104,6 +102,22 @@ def checkpoint_file(what: Path, version: int | None = None) -> Path:
     if not found.is_file():
         raise ConfigError(f"{what}: holds no {'checkpoint' if version is None else f'version {version}'} yet")
     return found
+
+
+def open_checkpoint(what: Path, version: int | None = None) -> Checkpoint:
+    """The checkpoint at ``checkpoint_file(what, version)``; in a run folder it is held to its run.
+
+    Raises ConfigError if it is missing, StoreError if it is damaged or of another run or version.
+    """
+    path = checkpoint_file(what, version)
+    folder, number = path.absolute().parent.parent, path.stem.removeprefix("version-")
+    checkpoint = agent_checkpoint(path)
+    if path.absolute().parent.name == "checkpoints" and number.isdigit() and (folder / "run.toml").is_file():
+        run = load_folder(folder)
+        hold(checkpoint, path, int(number), Lineage.of(folder, run).run_of(int(number)))
+    else:
+        check_weights(checkpoint, path)
+    return checkpoint
 
 
 def agent_checkpoint(path: Path) -> Checkpoint:

@@ -170,7 +170,7 @@ class _LearnerSide:
     def _open(self, store: Dataset, stored: list[float]) -> Ingest:
         trajectory = example()
         size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
-        spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))
+        spec = Spec((-9.0,) * size, (9.0,) * size, actions, len(trajectory.actions))
         job = Job("adapt", *trajectory.identity[:3], (trajectory.variation,), 1, trajectory.policy_version, seed=0)
 
         def note(_: Trajectory) -> None:

@@ -196,7 +196,7 @@ def _cpu(process: psutil.Process) -> float:
 def _ingest(store: Dataset, count: int, stored: list[float], failures: queue.SimpleQueue[BaseException]) -> Ingest:
     trajectory = example()
     size, actions = trajectory.observations.shape[1], trajectory.labels.shape[1]
-    spec = Spec((0.0,) * size, (1.0,) * size, actions, len(trajectory.actions))
+    spec = Spec((-9.0,) * size, (9.0,) * size, actions, len(trajectory.actions))
     variations = (trajectory.variation,) * count
     job = Job("adapt", *trajectory.identity[:2], 0, variations, 1, trajectory.policy_version, seed=0, tasks=count)
 

@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from actors import local
-from icrl_dist.diagnostics import ray_job
+from actors.session import Session
 from icrl_dist.stream import batching, wire
 from icrl_dist.stream.credit import CreditSender
 from icrl_dist.stream.link import Query, StreamKeys
@@ -38,6 +37,7 @@ def example(trial: int = 0) -> Trajectory:
     """A trajectory of the size of a walker episode: H = 200, S = 24, A = 6, and 30 labels; about 24 KB."""
     steps, observation, actions, queries = 200, 24, 6, 30
     rng = np.random.default_rng(0)
+    labels = rng.random((queries, actions), np.float32)
     return Trajectory(
         identity=Identity("adapt", 0, 0, 0, trial),
         variation=Variation(Task.of("dmc", problem="walker-run", mass=5.0), Adversary.of("force", strength=1.0)),
@@ -49,7 +49,7 @@ def example(trial: int = 0) -> Trajectory:
         rewards=rng.random(steps, np.float32),
         adversary=np.full(steps, -1, np.int16),
         queries=rng.normal(size=(queries, observation)).astype(np.float32),
-        labels=rng.random((queries, actions), np.float32),
+        labels=labels / labels.sum(axis=1, keepdims=True),
         prev_actions=np.zeros(0, np.int16),
         prev_rewards=np.zeros(0, np.float32),
         origin="heuristic",
@@ -218,8 +218,8 @@ def local_ray() -> Iterator[Any]:
 
     if ray.is_initialized():
         raise RuntimeError("Ray is already initialized in this process: run this benchmark in a new process")
-    local.start_ray(ray, _log.warning, address="local", job_config=ray_job.job_config(ray), num_cpus=2, configure_logging=False)
+    session = Session(ray, _log.warning, num_cpus=2, configure_logging=False)
     try:
         yield ray
     finally:
-        ray.shutdown()
+        session.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import time
 from collections.abc import Callable
@@ -222,6 +223,54 @@ def strangers(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     )
 
 
+def stop_run(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGSTOP of the command's process group for 15 s; the learner and the workers, in groups of their own, go on."""
+    training.start()
+    where = _reach(training, strike)
+    group = training.group()
+    training.signal(signal.SIGSTOP)
+    try:
+        time.sleep(STOP_S)
+        stopped = sum(process.is_running() and process.status() == psutil.STATUS_STOPPED for process in group)
+        learner_finished = training.learner() is None
+    finally:
+        training.signal(signal.SIGCONT)
+    result = training.result()
+    evidence = f"processes that were stopped: {stopped} of {len(group)}; the learner finished meanwhile: {learner_finished}"
+    return Struck(where, 0 < stopped == len(group), evidence, result)
+
+
+def kill_raylet(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGKILL of the raylet, then of the workers, as the kernel does when memory runs out."""
+    return _kill_ray(training, strike, "raylet", and_workers=True)
+
+
+def kill_gcs(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """SIGKILL of Ray's GCS, without which Ray ends this command after a while."""
+    return _kill_ray(training, strike, "gcs_server", and_workers=False)
+
+
+def _kill_ray(training: Training, strike: Strike, name: str, and_workers: bool) -> Struck:
+    """The run goes on with a new session of Ray, or ends with a line about it, and ``--resume`` finishes it."""
+    training.start()
+    where = _reach(training, strike)
+    victims = [process for process in training.tree() if process.name() == name]
+    if not victims:
+        raise Missed(f"there was no {name}")
+    for process in [*victims, *(training.workers() if and_workers else ())]:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+    code, line = training.wait(), f"Ray's process {name} ({victims[0].pid}) has ended"
+    ended = training.output
+    if code and (code != 1 or ended.count(line) != 1 or "Traceback" in ended):
+        raise TrainingFailed(f"without its {name}: exit code {code}; the last line: {ended.splitlines()[-1]}")
+    result = _resume(training) if code else training.result()
+    how = (
+        "the run ended and was resumed" if code else "Ray was started again" if line in ended else "the run finished without it"
+    )
+    return Struck(where, all(map(gone, victims)), f"{name} {victims[0].pid} is gone; {how}", result)
+
+
 FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
     "kill-worker": kill_worker,
     "kill-learner": kill_learner,
@@ -232,6 +281,9 @@ FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
     "flip-byte": flip_byte,
     "full-disk": full_disk,
     "strangers": strangers,
+    "stop-run": stop_run,
+    "kill-raylet": kill_raylet,
+    "kill-gcs": kill_gcs,
 }
 
 

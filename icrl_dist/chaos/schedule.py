@@ -19,8 +19,14 @@ FAULTS = {
     "flip-byte": "a byte of a sealed segment changes, after kill-tree or during the run",
     "full-disk": "a disk too small for the run, enlarged, then --resume",
     "strangers": "1,500 connections to the learner's port that send nothing",
+    "stop-run": "SIGSTOP of the command and of Ray for 15 s, as Ctrl-Z does",
+    "kill-raylet": "SIGKILL of Ray's raylet and of all workers",
+    "kill-gcs": "SIGKILL of Ray's GCS",
 }
-"""Every fault with its description."""
+"""Every fault with its description.  A new one comes last: its number is part of the key of its schedule."""
+
+IN_FITS = ("kill-learner", "stop-run", "kill-raylet", "kill-gcs")
+"""The faults that strike during a fit too."""
 
 _AFTER = (0.1, 0.5)
 """Range of the share of a phase after which a strike falls, so that it interrupts the phase."""
@@ -68,6 +74,6 @@ def draw(run: Run, seed: int, fault: str, attempt: int = 0) -> Strike:
     phase = phases[number]
     share, place = rng.uniform(*_AFTER), float(rng.random())
     worker, variant = int(rng.integers(1 << 16)), bool(rng.integers(2))
-    fit = fault == "kill-learner" and variant and phase.steps > 1
+    fit = fault in IN_FITS and variant and phase.steps > 1
     of = phase.steps if fit else sum(job.trials * len(job.variations) for job in method.ask(run, phase))
     return Strike(fault, number, f"{phase.stage}/{phase.round}", fit, max(1, round(share * of)), of, worker, place, variant)

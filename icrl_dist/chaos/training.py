@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import threading
 import time
@@ -125,6 +126,21 @@ class Training:
     def learner(self) -> psutil.Process | None:
         """Its learner process, if there is one."""
         return next((p for p in self.tree() if is_learner(p)), None)
+
+    def group(self) -> list[psutil.Process]:
+        """The living processes of its process group: the command, and Ray without the workers."""
+        assert self._process is not None
+        found = list[psutil.Process]()
+        for process in self.tree():
+            with contextlib.suppress(ProcessLookupError):
+                found += [process] * (os.getpgid(process.pid) == self._process.pid)
+        return found
+
+    def signal(self, number: int) -> None:
+        """Send a signal to its process group, as a terminal does."""
+        assert self._process is not None
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, number)
 
     def kill(self) -> list[psutil.Process]:
         """SIGKILL all processes at once; returns those that are still alive."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +20,7 @@ from icrl_dist.types import Identity
 class ExplainArguments:
     """Show the origin of a training example: task, adversary, weights, seed, worker, labels, bytes.
 
-    Without IDENTITY: print all trajectories, one JSON line each.
+    Without IDENTITY: print all trajectories, one JSON line each, and on standard error every file that is damaged or missing.
     """
 
     what: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
@@ -33,13 +34,16 @@ class ExplainArguments:
 
 
 def explain(arguments: ExplainArguments, console: Console) -> int:
-    """Print the origin of one trajectory, or of all.  Returns FAILED if a stored byte has changed."""
+    """Print the origin of one trajectory, or of all and each damaged file.  Returns FAILED if a stored byte has changed."""
     from icrl_dist.diagnostics import explain as origin
 
     if arguments.identity is None:
         for line in origin.ledger(arguments.what):
             print(json.dumps(line))
-        return OK
+        damage = origin.damage(arguments.what)
+        for text in damage:
+            print(f"icrl-dist: {text}", file=sys.stderr)
+        return FAILED if damage else OK
     try:
         identity = Identity.parse(arguments.identity)
     except ValueError as error:

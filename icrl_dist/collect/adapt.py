@@ -13,7 +13,7 @@ from icrl_dist.config.ranges import Positive
 from icrl_dist.config.sections import ContextConfig, Deployment
 from icrl_dist.interfaces import Method, Policy, Problem, WeightSource
 from icrl_dist.rollout.episode import deploy_online
-from icrl_dist.types import Identity, Job, Payload, Trajectory, Variation
+from icrl_dist.types import Identity, Job, LabelCounts, Payload, Trajectory, Variation
 
 Look = Callable[[Policy, int, Identity, Variation], None]
 """Called after every decision with the policy, a row, and the identity and variation of that row.  It must change nothing."""
@@ -28,6 +28,10 @@ class Rollouts(Payload):
     """Most transitions in a context, as ``context.max``."""
     deploy: Deployment
     """The deployment rule."""
+
+    @property
+    def labels(self) -> LabelCounts | None:
+        return super().labels if isinstance(self, LabelledRollouts) else LabelCounts(0, 0, "none")
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Interval, Lt
+from annotated_types import Ge, Gt, Interval, Le, Lt
 
 from icrl_dist.stream.schema import Remedy
 
-_ABOVE_0 = Remedy("must be above 0 and finite")
-_NOT_NEGATIVE = Remedy("must not be negative, and be finite")
+_MOST, _LARGEST = 2**31 - 1, 1e9
+_ABOVE_0 = Remedy("must be above 0 and below 2^31")
+_NOT_NEGATIVE = Remedy("must be from 0 to 2^31 - 1")
 
-Positive = Annotated[int, Gt(0), Lt(2**63), _ABOVE_0]
-"""A whole number above 0."""
-PositiveFloat = Annotated[float, Gt(0), _ABOVE_0]
-"""A number above 0."""
-NotNegative = Annotated[int, Ge(0), Lt(2**63), _NOT_NEGATIVE]
+Positive = Annotated[int, Gt(0), Le(_MOST), _ABOVE_0]
+"""A whole number above 0.  Identities of trajectories are stored as numbers below 2^31."""
+PositiveFloat = Annotated[float, Gt(0), Le(_LARGEST), Remedy("must be above 0 and at most 1e9")]
+"""A number above 0.  Timers and float32 take at most about 1e9 without a loss."""
+NotNegative = Annotated[int, Ge(0), Le(_MOST), _NOT_NEGATIVE]
 """A whole number, 0 or more."""
-NotNegativeFloat = Annotated[float, Ge(0), _NOT_NEGATIVE]
+NotNegativeFloat = Annotated[float, Ge(0), Le(_LARGEST), Remedy("must be from 0 to 1e9")]
 """A number, 0 or more."""
+Rate = Annotated[float, Gt(0), Le(1e6), Remedy("a rate must be above 0 and at most 1e6")]
+"""A learning rate; float32 parameters take no larger steps."""
+Rounds = Annotated[int, Ge(0), Le(9000), Remedy("must be from 0 to 9000; the files of versions have four digits")]
+"""A number of rounds; each makes a version of the weights."""
 Probability = Annotated[float, Interval(ge=0, le=1), Remedy("a probability lies in [0, 1]")]
 """A probability."""
 Share = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0, 1]")]

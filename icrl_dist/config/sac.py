@@ -9,16 +9,16 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 
 from icrl_dist.stream.schema import Remedy
 
-_LAYERS = Remedy("must be at least one layer, of at least 1 unit each")
-AboveZero = Annotated[float, Gt(0), Remedy("must be above 0")]
-WholeAboveZero = Annotated[int, Gt(0), Remedy("must be above 0")]
+_LAYERS = Remedy("must be at least one layer, of 1 to 2^31 - 1 units each")
+AboveZero = Annotated[float, Gt(0), Le(1e6), Remedy("must be above 0 and at most 1e6")]
+WholeAboveZero = Annotated[int, Gt(0), Le(2**31 - 1), Remedy("must be above 0 and below 2^31")]
 
 
 @dataclass(frozen=True)
 class SACConfig:
     """Training of the SAC experts: Table 1 of the paper, or QARL's code where the table has no value or a misprint."""
 
-    hidden: Annotated[tuple[Annotated[int, Gt(0), _LAYERS], ...], MinLen(1), _LAYERS] = (256, 256, 256)
+    hidden: Annotated[tuple[Annotated[int, Gt(0), Le(2**31 - 1), _LAYERS], ...], MinLen(1), _LAYERS] = (256, 256, 256)
     """Widths of the hidden layers, ReLU, of the actor and of each of the two critics (Table 1)."""
     actor_rate: AboveZero = 1e-4
     """Adam's learning rate for the actor (Table 1)."""
@@ -32,9 +32,9 @@ class SACConfig:
     """Discount per step (section 5)."""
     batch: WholeAboveZero = 256
     """Transitions per update (Table 1)."""
-    random_steps: Annotated[int, Ge(0), Remedy("must be at least 0")] = 3_000
+    random_steps: Annotated[int, Ge(0), Le(2**31 - 1), Remedy("must be from 0 to 2^31 - 1")] = 3_000
     """Steps of uniformly random actions at the start (Table 1)."""
-    warmup: Annotated[int, Ge(1), Remedy("must be at least 1")] = 5_000
+    warmup: Annotated[int, Ge(1), Le(2**31 - 1), Remedy("must be from 1 to 2^31 - 1")] = 5_000
     """Steps before the first update (Table 1)."""
     replay: WholeAboveZero = 1_000_000
     """Capacity of the replay buffer, in transitions (Table 1)."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Interval, Lt, MinLen
+from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
 
-from icrl_dist.config.ranges import NotNegative, NotNegativeFloat, Positive, PositiveFloat, Probability, Share
+from icrl_dist.config.ranges import NotNegative, Positive, PositiveFloat, Probability, Rate, Rounds, Share
 from icrl_dist.stream.schema import Remedy
 
 Deployment = Literal["paper", "committed"]
@@ -17,7 +17,7 @@ Deployment = Literal["paper", "committed"]
 the context immediately, and T_theta also reads the agent's last actions as an action window (zeta of eq. 6).
 """
 
-_NEVER = Remedy("must not be negative; 0 turns the alert off")
+_NEVER = Remedy("must be from 0 to 1e9; 0 turns the alert off")
 _AlertShare = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0, 1]; 0 turns the alert off")]
 
 
@@ -25,7 +25,7 @@ _AlertShare = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0,
 class AdversaryConfig:
     """The adversaries of training tasks (appendix C.1)."""
 
-    count: Annotated[int, Ge(1), Remedy("at least 1, the null adversary")] = 8
+    count: Annotated[int, Ge(1), Le(2**31 - 1), Remedy("at least 1, the null adversary, and below 2^31")] = 8
     """K, adversaries per task including phi_0 (appendix D.1 chooses 8)."""
     p_max: Probability = 0.2
     """Dark Room: an adversary overrides an action with probability p ~ U(0, p_max)."""
@@ -62,13 +62,13 @@ class DAggerConfig:
     as T_theta does.  Therefore in round j T^j is deployed in every training variation (Algorithm 1).
     """
 
-    rounds: NotNegative = 0
+    rounds: Rounds = 0
     """Number of rounds; the paper's ICAG has 0."""
     trials: Positive = 20
     """Episodes per history; a training context is a random number of its first episodes."""
     steps: Positive = 4000
     """Optimizer steps per round."""
-    learning_rate: PositiveFloat = 1e-3
+    learning_rate: Rate = 1e-3
     """Peak learning rate of a round."""
     new_fraction: Share = 0.5
     """Share of the training batches whose contexts are histories; the other batches come from D_pre."""
@@ -78,7 +78,7 @@ class DAggerConfig:
 class ICAAConfig:
     """In-Context Adversarial Adaptation (Algorithm 3)."""
 
-    rounds: NotNegative = 3
+    rounds: Rounds = 3
     """J: there are J + 1 rounds j = 0..J of collecting and fine-tuning."""
     trials: Positive = 40
     """N: each variation is rolled out for N + 1 trials."""
@@ -93,7 +93,7 @@ class ICAAConfig:
     ``trial``: a context is any of the trials, a single one with optim.episodes = 1 (Algorithm 3, line 13)."""
     steps: Positive = 4000
     """Fine-tuning steps per round."""
-    learning_rate: PositiveFloat = 1e-3
+    learning_rate: Rate = 1e-3
     """Peak learning rate of fine-tuning."""
     new_fraction: Share = 0.5
     """Share of the fine-tuning batches that come from self-labelled data; the other batches come from D^0."""
@@ -112,7 +112,7 @@ class ModelConfig:
     fourier: NotNegative = 0
     """Sine and cosine pairs added to each observation component.  0: scaled values only, with which
     training and held-out goals have similar returns (docs/decisions/008-contexts-first.md)."""
-    window: Annotated[int, Ge(1), Remedy("at least 1; 1 means no action windows")] = 1
+    window: Annotated[int, Ge(1), Le(2**31 - 1), Remedy("at least 1 and below 2^31; 1 means no action windows")] = 1
     """States per action window.  T_theta also reads the actions and rewards of the window so far (zeta of
     eq. 6), so it can keep acting on one hypothesis.  1: no action windows, as in the paper's experiments."""
     dropout: Annotated[float, Ge(0), Lt(1), Remedy("a probability below 1")] = 0.0
@@ -123,12 +123,12 @@ class ModelConfig:
 class OptimConfig:
     """The optimizer (appendix B.2: AdamW, weight decay 1e-4, learning rate 1e-3, batch 128)."""
 
-    learning_rate: PositiveFloat = 1e-3
+    learning_rate: Rate = 1e-3
     """Peak learning rate."""
-    muon: NotNegativeFloat = 0.0
+    muon: Annotated[float, Ge(0), Le(1e6), Remedy("must be from 0 to 1e6")] = 0.0
     """Learning rate of Muon as a multiple of AdamW's, for the matrices of attention and feed-forward
     layers; AdamW trains the other parameters.  0: AdamW trains all, as in the paper."""
-    weight_decay: NotNegativeFloat = 1e-4
+    weight_decay: Annotated[float, Ge(0), Le(1e6), Remedy("must be from 0 to 1e6")] = 1e-4
     """AdamW's decoupled weight decay."""
     beta2: Annotated[float, Ge(0), Lt(1), Remedy("must lie in [0, 1)")] = 0.999
     """AdamW's decay rate of the average of squared gradients; 0.98 suits short fits with high learning rates."""
@@ -144,7 +144,7 @@ class OptimConfig:
     """Maximum number of episodes in a training context; each step draws the number at random."""
     warmup: NotNegative = 200
     """Steps of linear warm-up; then the learning rate falls to a tenth along a cosine."""
-    clip: PositiveFloat = 1.0
+    clip: Annotated[float, Gt(0), Le(1e30), Remedy("must be above 0 and at most 1e30")] = 1.0
     """Maximum gradient norm; larger gradients are scaled down."""
 
 
@@ -227,9 +227,9 @@ class AlertsConfig:
     collapse: _AlertShare = 0.5
     """Alert if the mean return of the newest policy version is below this share of that of the previous
     version in the same trials of the same variations."""
-    zero_episodes: Annotated[int, Ge(0), _NEVER] = 40
+    zero_episodes: Annotated[int, Ge(0), Le(10**9), _NEVER] = 40
     """Alert if this many successive episodes of a variation all returned 0."""
-    silent_s: Annotated[float, Ge(0), _NEVER] = 5.0
+    silent_s: Annotated[float, Ge(0), Le(1e9), _NEVER] = 5.0
     """Alert if no heartbeat of a worker has arrived for this many seconds."""
     ingest: _AlertShare = 0.5
     """Alert if the workers could send during less than this share of the last ten seconds, because they

@@ -26,6 +26,7 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import cluster_file, cluster_nodes, node_facts, ray_job, surroundings
 from icrl_dist.diagnostics.checks import Check
 from icrl_dist.diagnostics.modules import check_modules
+from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.diagnostics.surroundings import existing, writable
 from icrl_dist.stream import endpoints
@@ -206,9 +207,10 @@ def diagnose_cluster(address: str, endpoint: str, certificates: str) -> list[Che
     except ValueError as error:
         raise ConfigError(f"--endpoint {endpoint}: {error}") from None
     require_ray_token(address)
+    require_cluster(address)
     try:
         ray.init(address=address, job_config=ray_job.job_config(ray), log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(
             f"--address {address}: {error}; `ray status` on the head shows whether a cluster is running"
         ) from None

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
-from icrl_dist.agent.loading import checkpoint_file, trained
+from icrl_dist.agent.loading import open_checkpoint, trained
 from icrl_dist.collect import kinds
 from icrl_dist.config.run import ConfigError, Run, load_folder
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
-from icrl_dist.storage.checkpoint import load_checkpoint, newest_version
-from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage import layout
+from icrl_dist.storage.checkpoint import newest_version
+from icrl_dist.storage.dataset import Dataset, segments
+from icrl_dist.storage.files import StoreError, held
 from icrl_dist.storage.fork import Lineage
+from icrl_dist.storage.held import opened
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import wire
 from icrl_dist.telemetry import provenance
@@ -26,13 +29,15 @@ from icrl_dist.types import Adversary, Identity, Task
 def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, Any]:
     """The origin of one trajectory of a run; ``rerun`` repeats its job and compares the bytes.
 
-    Raises ConfigError if the run has no such trajectory, Damaged if its bytes cannot be decoded.
+    Raises ConfigError if the run has no such trajectory, StoreError if a file of it is damaged.
     """
     store, lineage = _open(folder)
     try:
         row = store.index[identity]
         trajectory = store.read(identity)
     except KeyError:
+        if lost := damage(folder):
+            raise StoreError(f"{folder}: has no trajectory {identity}; {len(lost)} damages, first: {lost[0]}") from None
         raise ConfigError(f"{folder}: has no trajectory {identity}; `icrl-dist explain {folder}` lists all of them") from None
     finally:
         store.close()
@@ -51,7 +56,7 @@ def explain(folder: Path, identity: Identity, rerun: bool = False) -> dict[str, 
         "sessions": provenance.sessions(folder),
     }
     if row.policy_version >= 0:
-        manifest = load_checkpoint(checkpoint_file(folder, row.policy_version)).manifest
+        manifest = open_checkpoint(folder, row.policy_version).manifest
         answer["weights_intact"] = manifest["weights_digest"] == row.weights_digest
     if rerun:
         answer["rerun_equal"] = _repeat(folder, lineage.run_of(version), row) == row.sha256
@@ -66,6 +71,37 @@ def ledger(folder: Path) -> Iterator[dict[str, Any]]:
             yield ledger_line(row, lineage.run_of(row.identity.next_version).seed)
     finally:
         store.close()
+
+
+def damage(folder: Path) -> list[str]:
+    """Every damaged or missing file of a run folder, a line each; ``icrl-dist train --resume`` mends what it can.
+
+    While a learner is active, what it has not finished is no damage.
+    """
+    store, lineage = _open(folder)
+    active, newest, found = held(folder), newest_version(folder), list[str]()
+    lines = [line for line in store.damage if not (active and "torn tail" in line)]
+    intact: dict[int, Mapping[str, Any]] = {}
+    for version in range(newest + 1):
+        try:
+            intact[version] = opened(folder, version, lineage).manifest
+        except StoreError as error:
+            found.append(str(error))
+    version = max(intact, default=-1)
+    fitted = intact.get(version, {})
+    quarantined = {tuple(name.split("/")) for name in fitted.get("quarantined", {})}
+    for stage, *numbers in quarantined:
+        round_, task, variation = map(int, numbers)
+        store.index.drop((stage, round_, task, variation))
+    if not active and store.digest(version) != fitted.get("dataset_digest", store.digest(version)):
+        known = {path.name for path in segments(store.folder).values()}
+        missing = [one["segment"] for one in fitted.get("dataset", ()) if one["segment"] not in known]
+        lines += [f"{name}: is missing" for name in missing if f"{name}: is missing" not in lines]
+        lines.append(f"its trajectories are not those that T^{version} was fitted to: some are missing or of another run")
+    store.close()
+    if (folder / provenance.FILE).exists() and not provenance.readable(folder):
+        found.append(f"{folder / provenance.FILE}: damaged, it is no list of sessions")
+    return [f"{store.folder}/{line}" if line.startswith("segment") else f"{store.folder}: {line}" for line in lines] + found
 
 
 def ledger_line(row: Row, seed: int) -> dict[str, Any]:
@@ -121,6 +157,7 @@ def describe(answer: dict[str, Any]) -> str:
 def _open(folder: Path) -> tuple[Dataset, Lineage]:
     if not (folder / "run.toml").is_file():
         raise ConfigError(f"{folder}: no such run folder")
+    layout.refuse_odd_files(folder)
     run = load_folder(folder)
     return Dataset(folder / "dataset", readonly=True), Lineage.of(folder, run)
 
@@ -136,7 +173,7 @@ class _Checkpoints:
     folder: Path
 
     def at(self, version: int) -> tuple[nn.Module, str]:
-        checkpoint = load_checkpoint(checkpoint_file(self.folder, version))
+        checkpoint = open_checkpoint(self.folder, version)
         return trained(checkpoint).model, str(checkpoint.manifest["weights_digest"])
 
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from icrl_dist.config.ranges import NotNegative, Positive, Share
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.types import Payload
+from icrl_dist.types import LabelCounts, Payload
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,11 @@ class ExpertLabelling:
     """Action windows per trajectory."""
     decoy_fraction: Share
     """Share of the windows in which another task's expert acts."""
+
+    @property
+    def label_counts(self) -> LabelCounts:
+        """The labels of each trajectory."""
+        return LabelCounts(self.queries + self.windows * self.window, self.windows * self.window, "expert")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Run folders: the files that a run writes, the allowed places, and the replacement of one run by another.
 
 User files are never deleted.  Only files that this program writes are removed; the list of their
-names is in this file only.  A folder with any other file is refused, and the message names the file.
+names is in ``storage/layout.py``.  A folder with any other file is refused, and the message names the file.
 A replaced run is kept beside its folder as ``.NAME.replaced`` until the new run has its first
 checkpoint, and is restored if the new run ends before that.  Both folders hold the same random token
 meanwhile, so that after a kill no other folder is mistaken for one of the two.
@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import secrets
 import threading
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.console.display import ReportEvent
 from icrl_dist.storage.checkpoint import newest_version
 from icrl_dist.storage.files import StoreError, held, hold
+from icrl_dist.storage.layout import NAMES, owned
 
 WAIT_S = 10.0
 """Seconds to wait for the processes of a killed run to end before its folder counts as in use."""
@@ -31,29 +31,40 @@ WAIT_S = 10.0
 LONGEST_NAME, LONGEST_PATH = 240, 4095 - 300
 """Bytes of a run folder's name and path.  File systems allow 255 and 4,095; ``.NAME.replaced`` and reports are longer."""
 
-_REPORTS = r"(online|posterior)-(.+-)?T\d+-[0-9a-f]*-.+\.(json|png)|(online|posterior)\.json|(adaptation|posterior)\.png"
-_NAMES = {
-    "checkpoints/report": _REPORTS,
-    "checkpoints": r"version-\d+\.npz|partial\.npz|agent\.npz",
-    "crashes": r".+-\d+\.json|.+\.stacks",
-    "dataset": r"segment-\d+\.frames",
-    "report": _REPORTS,
-    "results": r"(online|offline|posterior|label_quality|experts)-[0-9a-f]{8}-\d{8}T\d{6}\.\d{6}Z\.parquet",
-    "tensorboard": r"events\.out\.tfevents\..+",
-    "": r"(run\.toml|(env|fork|result)\.json|metrics\.jsonl|agent\.npz|learner\.(log|err)|endpoint|\.lock|\.replacement)",
-}
-"""The folders within a run folder, the deepest first, each with a pattern of the file names that this program writes."""
 _TOKEN = ".replacement"
 """In a replaced run and in the run that replaces it: a random text that only these two folders hold."""
+_BEGINNING = ".beginning"
+"""In a folder that was empty and whose run has not begun: all files there are first files of that run, and none is lost."""
 
 
-def owned(place: str, name: str) -> bool:
-    """Whether this program writes a file of this name into ``place``, a folder within a run folder ("": the run folder).
+@contextlib.contextmanager
+def beginning(folder: Path) -> Iterator[None]:
+    """The first files of a run are written into an empty folder within this context.
 
-    This includes the ``.part`` files that a killed ``files.atomic_write`` leaves behind.
+    After a kill in between, ``recover`` removes them, so that the same command can be repeated.  Raises ConfigError if
+    another command begins a run there at the same time, OSError if the folder cannot be written.
     """
-    pattern = _NAMES[place]
-    return re.fullmatch(rf"(?s:{pattern}|\.({pattern})\.\d+\.part)", name) is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = hold(folder, 0.0, _BEGINNING)
+    except StoreError:
+        raise ConfigError(f"--out {folder}: another command begins a run in this folder; use another --out") from None
+    with lock:
+        yield
+        (folder / _BEGINNING).unlink(missing_ok=True)
+
+
+def _sweep_beginning(folder: Path) -> None:
+    """Remove the files of a run that was killed before it began."""
+    if folder.is_symlink() or not (folder / _BEGINNING).is_file():
+        return
+    if held(folder, _BEGINNING):
+        raise ConfigError(f"--out {folder}: another command begins a run in this folder; use another --out")
+    token = _token(folder)
+    remove(folder)
+    if token:  # the old run is restored only where ``recover`` finds the token
+        folder.mkdir()
+        (folder / _TOKEN).write_bytes(token)
 
 
 def foreign(folder: Path) -> list[str]:
@@ -72,7 +83,7 @@ def _foreign(folder: Path, place: str) -> Iterator[str]:
         for entry in entries:
             path = f"{place}/{entry.name}" if place else entry.name
             if entry.is_dir(follow_symlinks=False):
-                if path in _NAMES:
+                if path in NAMES:
                     yield from _foreign(folder, path)
                 else:
                     yield f"{path}/"
@@ -93,12 +104,12 @@ def remove(folder: Path) -> None:
         raise ConfigError(f"{folder}: is a symbolic link, which is never removed; remove it yourself, or use another --out")
     require_owned(folder)
     (folder / "run.toml").unlink(missing_ok=True)
-    for place in _NAMES:
+    for place in NAMES:
         directory = folder / place
         if directory.is_dir():
             with os.scandir(directory) as entries:
                 names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False) and owned(place, entry.name)]
-            for name in sorted(names, key=_TOKEN.__eq__):
+            for name in sorted(names, key=lambda name: (name == _TOKEN, name == _BEGINNING)):
                 (directory / name).unlink(missing_ok=True)
             directory.rmdir()  # fails if another file has appeared meanwhile
 
@@ -158,12 +169,15 @@ def aside_of(folder: Path) -> Path:
 
 
 def recover(folder: Path) -> None:
-    """Finish a replacement of the run in ``folder`` that was interrupted by a kill.
+    """Finish a beginning of a run in ``folder``, or a replacement of it, that was interrupted by a kill.
+
+    A run that had not begun is removed; its folder was empty before.
 
     If the run in ``folder`` replaced the old one and has a checkpoint, the old run is removed.  If
     ``folder`` does not exist or holds nothing of a run, the old run is restored.  In every other case nothing is
     changed and ConfigError is raised; also while the command that replaces the run is still active.
     """
+    _sweep_beginning(folder)
     aside = aside_of(folder)
     if not os.path.lexists(aside):
         return
@@ -203,11 +217,10 @@ def _has_only(folder: Path, token: bytes) -> bool:
 def _has_checkpoint(folder: Path) -> bool:
     """Whether the run in a folder has a checkpoint of its own, beyond those of its fork, or has ended.
 
-    A folder without ``run.toml`` holds an incomplete fork: the file is written after the parent's
-    checkpoints are linked and ``fork.json`` is complete.  If ``fork.json`` is damaged, nobody knows
+    The run in a folder without ``run.toml`` or with ``.beginning`` has not begun.  If ``fork.json`` is damaged, nobody knows
     whose the checkpoints are, and the answer is no, so that no run is removed.
     """
-    if not (folder / "run.toml").is_file():
+    if not (folder / "run.toml").is_file() or (folder / _BEGINNING).exists():
         return False
     first, record = -1, folder / "fork.json"
     if record.exists():

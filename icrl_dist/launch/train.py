@@ -15,6 +15,7 @@ from typing import Any
 
 import psutil
 
+from actors.running_time import RunningTime
 from icrl_dist.config import plugins
 from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, load_folder
@@ -22,14 +23,19 @@ from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.signals import on_signals
 from icrl_dist.diagnostics.modules import hidden_packages
 from icrl_dist.diagnostics.ray_token import require_ray_token
-from icrl_dist.launch import learner_process, run_folder
+from icrl_dist.launch import learner_process, run_folder, watching
+from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.storage.files import atomic_write
+from icrl_dist.storage import layout
+from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry import provenance
+
+FINISH_S = 10.0
+"""Seconds within which the learner's last event arrives after its workers have ended."""
 
 
 class TrainInterrupted(Exception):  # noqa: N818
@@ -39,6 +45,8 @@ class TrainInterrupted(Exception):  # noqa: N818
         super().__init__(text)
         self.resumable = resumable
         """Whether the run can be resumed in its folder."""
+        self.kept = "the last checkpoint"
+        """What it would continue from."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (str(self), self.resumable)
@@ -68,6 +76,10 @@ def prepare(
         StreamKeys(folder.name)
     except ValueError as error:
         raise ConfigError(f"--out {folder}: {error}") from None
+    try:
+        layout.refuse_odd_files(folder)
+    except StoreError as error:
+        raise ConfigError(str(error)) from None
     run_folder.recover(folder)
     resume = resume or (resume_or_begin and (folder / "run.toml").is_file())
     transaction = FolderTransaction(folder, source[1] if source and not resume else -1)
@@ -98,20 +110,28 @@ def _create(run: Run, folder: Path, resume: bool, source: tuple[Path, int] | Non
             f"as `icrl-dist train --resume {folder}` does, or use another --out"
         )
     if resume:
-        run_folder.take(folder).close()
+        with run_folder.take(folder):
+            layout.sweep(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if source is not None and not resume:
-            _fork(*source, run, folder)
         if before is None:
-            file.write_text(dumps(run))
-        elif before != run:
+            with run_folder.beginning(folder):
+                atomic_write(file, lambda to: to.write(dumps(run).encode()))
+                provenance.create(folder)
+                if source is not None:
+                    _fork(*source, run, folder)
+            return
+        if before != run:
             status = file.stat()
             atomic_write(file, lambda to: to.write(dumps(run).encode()))
             os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))  # its time is the start of the run
         provenance.create(folder)
     except OSError as error:
         raise ConfigError(f"--out {folder}: cannot be written ({error.strerror}); choose another folder") from None
+    except StoreError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+        cause = error.__cause__.strerror
+        raise ConfigError(f"--out {folder}: cannot be written ({cause}); choose another folder") from None
 
 
 def _fork(source: Path, version: int, run: Run, folder: Path) -> None:
@@ -224,29 +244,28 @@ def train_ray(
 
     certificates = security.folder(run.stream.certificates)  # an absolute path: workers have another working directory
     interrupted = threading.Event()
-    with contextlib.ExitStack() as stack:
+    with _true_end(folder, interrupted), contextlib.ExitStack() as stack:
         handle_again = stack.enter_context(on_signals(interrupted.set))
         if address is None:  # without a cluster both start at once; on a cluster the nodes are checked first
             learner = stack.enter_context(learner_process.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
-        with _remove_if_refused(folder) if address is not None else contextlib.nullcontext():
-            try:
-                fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
-            except FleetFailed as error:
-                raise (TrainInterrupted if interrupted.is_set() else TrainFailed(str(error))) from None
-            except SystemExit:  # raised by Ray's handler of SIGTERM
-                raise TrainInterrupted from None
-            stack.callback(fleet.close)
-            handle_again()  # Ray replaces the handlers
-            needed = plugins.of_run(run.problem, run.method)
-            fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed)
-            if address is not None and interrupted.is_set():
-                raise TrainInterrupted
+        try:
+            fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
+        except SystemExit:  # raised by Ray's handler of SIGTERM
+            raise TrainInterrupted from None
+        stack.callback(fleet.close)
+        handle_again()  # Ray replaces the handlers
+        needed = plugins.of_run(run.problem, run.method)
+        fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed)
         if address is not None:
+            if interrupted.is_set():
+                raise TrainInterrupted
             learner = stack.enter_context(learner_process.running(run, folder))
         result: dict[str, Any] | None = None
         started = False
-        stored = quarantined = 0
+        stored = quarantined = ray_restarts = 0
+        failure: Exception | None = None
+        clock, patience_s = RunningTime(), 0.0
         while True:
             for event in learner.events():
                 report(event)
@@ -255,6 +274,7 @@ def train_ray(
                         learner.end_after_driver(psutil.Process().children(recursive=True))
                     fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
+                    report({"event": "note", "text": watching.hint(run.stream, folder, learner.endpoint)})
                 elif event["event"] == "progress":
                     stored = event["trajectories"]
                 elif event["event"] in ("quarantine", "released"):
@@ -264,30 +284,42 @@ def train_ray(
             if interrupted.is_set():
                 learner.interrupt(report)
                 raise TrainInterrupted
-            if result is not None:
+            if result is not None:  # whatever has happened to the workers
                 break
             learner.watch(report)
-            if started:
+            if failure is not None and clock() >= patience_s:
+                raise failure
+            if started and failure is None:
                 try:
-                    working = fleet.watch(note, stored + quarantined)
+                    if not fleet.watch(note, stored + quarantined):
+                        failure = TrainFailed(
+                            "every worker ended before the run did; the cause is in learner.log in the run folder"
+                        )
+                        patience_s = clock() + FINISH_S  # the learner ends its workers when it has finished
                 except FleetFailed as error:
-                    if interrupted.is_set():  # the signal reached Ray's processes too
-                        continue
-                    raise TrainFailed(str(error)) from None
+                    failure = error
                 learner.excuse(fleet.lost)
-                if not working:
-                    raise TrainFailed("every worker ended before the run did; the cause is in learner.log in the run folder")
+                if fleet.ray_restarts != ray_restarts:
+                    ray_restarts = fleet.ray_restarts
+                    learner.end_after_driver(psutil.Process().children(recursive=True))
     if interrupted.is_set():  # during the shutdown
         raise TrainInterrupted
     return {**result, "learner_deaths": learner.deaths, "worker_deaths": fleet.deaths}
 
 
 @contextlib.contextmanager
-def _remove_if_refused(folder: Path) -> Iterator[None]:
-    """Remove the run folder if the run was refused before it started, so that the same command can be repeated."""
+def _true_end(folder: Path, interrupted: threading.Event) -> Iterator[None]:
+    """Outside the contexts of all processes: say what the folder of a failed run holds, or remove it if that is nothing."""
+    from actors.fleet import FleetFailed
+
     try:
         yield
-    except (ConfigError, TrainInterrupted):
-        if {file.name for file in folder.iterdir()} <= {"run.toml", provenance.FILE}:
-            run_folder.remove(folder)
+    except ConfigError:
+        remove_if_empty(folder)
         raise
+    except FleetFailed as error:
+        empty, kept = remove_if_empty(folder), holdings(folder)
+        if interrupted.is_set():  # the signal reached Ray's processes too
+            raise TrainInterrupted from None
+        nothing = f"; nothing has been stored yet{'' if empty else f', see {folder}'}"
+        raise TrainFailed(f"{error}{'' if kept else nothing}") from None

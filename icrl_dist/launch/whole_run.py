@@ -16,6 +16,7 @@ from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, overri
 from icrl_dist.console.display import ReportEvent, Show, reporting
 from icrl_dist.console.signals import interruptible
 from icrl_dist.launch import train as launch
+from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.resuming import place
 from icrl_dist.launch.run_folder import FolderTransaction
@@ -121,6 +122,7 @@ def train(
             evaluated = {**evaluation.summary, "evaluate": as_data(settings.evaluate)}
             result = _final_result(folder, result, evaluated)
             write_json(folder / "result.json", result)
+            _record_heldout(settings, folder, evaluation, show)
     except (launch.TrainInterrupted, KeyboardInterrupt):
         raise _interrupted(folder, transaction) from None
     except TrainFailed as error:
@@ -158,13 +160,24 @@ def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
     return reports.online(run, folder / "report" / heldout.report_name(run, folder), frame)
 
 
+def _record_heldout(run: Run, folder: Path, evaluation: Evaluation, show: ReportEvent) -> None:
+    from icrl_dist.launch import heldout_metrics  # it imports torch
+
+    heldout_metrics.record(run, folder, evaluation.summary, show)
+
+
 def _interrupted(folder: Path, transaction: FolderTransaction | None) -> launch.TrainInterrupted:
     """The exception that says what the folder of an interrupted run holds."""
     if transaction is not None and transaction.rolled_back:
         return launch.TrainInterrupted(f"{folder} is as it was before", resumable=False)
-    if not (folder / "run.toml").is_file():
+    if remove_if_empty(folder) or not (folder / "run.toml").is_file():
         return launch.TrainInterrupted("nothing had been done yet", resumable=False)
-    return launch.TrainInterrupted(f"{folder} holds the checkpoint: resume=True, or --resume, continues from it")
+    kept = holdings(folder)
+    if not kept:
+        return launch.TrainInterrupted(f"{folder} holds nothing to continue from", resumable=False)
+    error = launch.TrainInterrupted(f"resume=True, or --resume, continues from {kept} in {folder}")
+    error.kept = kept
+    return error
 
 
 _PRODUCED = ("dataset_digest", "weights_digest", "version", "trajectories")

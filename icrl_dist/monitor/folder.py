@@ -27,6 +27,7 @@ from icrl_dist.stream import security
 from icrl_dist.stream.excerpts import plain
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
+from icrl_dist.telemetry import metric_rows
 
 MAX_OPEN = 8
 """Runs that are watched at once; a run that nobody watches makes room for another."""
@@ -64,6 +65,7 @@ class _Watched:
     def __init__(self, run: ListedRun, open_run: OpenFeed) -> None:
         self.run, self.asked = run, time.monotonic()
         self._stack, self._over = contextlib.ExitStack(), threading.Event()
+        self._written = _written(run)
         self._feed, self._opened = self._stack.enter_context(open_run(run)), time.monotonic()
         self.publisher = SnapshotPublisher(self._feed)
         self._thread = threading.Thread(target=self.publisher.run, args=(self._over,), name="publisher", daemon=True)
@@ -75,9 +77,7 @@ class _Watched:
         replay = self._feed.replay()
         if not self.run.held or replay is None or replay["at"] < replay["end"] or time.monotonic() - self._opened < _REOPEN_S:
             return False
-        with contextlib.suppress(OSError):
-            return (self.run.folder / "metrics.jsonl").stat().st_mtime > replay["end"] + 1.0
-        return False
+        return _written(self.run) != self._written
 
     @property
     def watched(self) -> bool:
@@ -91,6 +91,14 @@ class _Watched:
         self._over.set()
         self._thread.join(5.0)
         self._stack.close()
+
+
+def _written(run: ListedRun) -> float:
+    """When the metrics of a run were written last."""
+    try:
+        return (run.folder / metric_rows.NAME).stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 class FolderViews:

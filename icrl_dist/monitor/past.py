@@ -13,12 +13,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from icrl_dist.config.run import Run
-from icrl_dist.monitor.metric_messages import Message, MetricMessages, Row, read
+from icrl_dist.monitor.metric_messages import Message, MetricMessages, Row
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.validation import WireError, as_list, text, typed
+from icrl_dist.telemetry import metric_rows
 from icrl_dist.types import Trajectory
 
 REQUEST_BYTES = 512
@@ -30,7 +31,7 @@ _TRIALS = 256
 _PAGE = (48, 512)
 """Variations and trajectories of one page; it ends after the variation that reaches either number."""
 _METRICS_BYTES = 4 << 20
-"""Bytes at the end of ``metrics.jsonl`` that are read."""
+"""Bytes at the end of the metrics that are read."""
 _PROGRESS_S = 900.0
 """Seconds of progress with every row, as long as a view keeps every second."""
 _MAX_PROGRESS = 1200
@@ -88,7 +89,7 @@ class Past:
         return _reply(*self._returns(stage, int(number), tuple(map(int, after.split("/"))) if after else (-1,)))
 
     def _metrics(self) -> list[Message]:
-        rows = sorted(read(self._folder / "metrics.jsonl", _METRICS_BYTES), key=lambda row: float(row["time"]))
+        rows = sorted(metric_rows.read(self._folder, _METRICS_BYTES), key=lambda row: float(row["time"]))
         events = [row for row in rows if row["stage"] in ("event", "alert")][-_MAX_EVENTS:]
         newest = rows[-1]["time"] if rows else 0.0
         progress = [row for row in rows if row["stage"] == "ingest" or row["stage"].startswith("fit/")]

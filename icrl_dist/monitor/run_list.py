@@ -12,9 +12,9 @@ from typing import Any
 from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.monitor import headline
 from icrl_dist.monitor.evaluation import held_out
-from icrl_dist.monitor.metric_messages import read
 from icrl_dist.storage.files import StoreError, held
 from icrl_dist.stream.excerpts import plain
+from icrl_dist.telemetry import metric_rows
 
 _log = logging.getLogger(__name__)
 
@@ -23,7 +23,7 @@ MAX_RUNS = 200
 _PERIOD_S = 2.0
 """Seconds between two looks at the folder."""
 _TAIL_BYTES = 1 << 16
-"""Bytes at the end of ``metrics.jsonl`` in which the event that ended the run is searched."""
+"""Bytes at the end of the metrics in which the event that ended the run is searched."""
 _ENDS = ("finished", "interrupted", "failed")
 
 
@@ -81,7 +81,7 @@ def state(run: ListedRun) -> str:
     """``training``, ``evaluating``, ``starting``, ``finished``, ``interrupted`` or ``failed``."""
     if run.live:
         return "training"
-    rows = list(read(run.folder / "metrics.jsonl", _TAIL_BYTES))
+    rows = list(metric_rows.read(run.folder, _TAIL_BYTES))
     ends = [row["what"] for row in rows if row.get("what") in _ENDS]
     if not run.held:
         return str(ends[-1]) if ends else "interrupted"

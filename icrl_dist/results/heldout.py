@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from icrl_dist.agent import ood_score
-from icrl_dist.agent.loading import agent_checkpoint, calibrated, checkpoint_file, outcomes_of, trained
+from icrl_dist.agent.loading import calibrated, checkpoint_file, open_checkpoint, outcomes_of, trained
 from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment, Run
@@ -35,11 +35,10 @@ if TYPE_CHECKING:
 
 def models(what: Path, deploy: Deployment | None = None) -> dict[Agent, TrainedModel]:
     """The newest model and, in a run folder with adapted versions, T^0, each with the rule that deploys it."""
-    file = checkpoint_file(what)
-    files = [file]
-    if what.is_dir() and agent_checkpoint(file).manifest["version"] > 0:
-        files.append(checkpoint_file(what, 0))
-    return dict(_agent(agent_checkpoint(file), deploy) for file in files)
+    found = [open_checkpoint(what)]
+    if what.is_dir() and found[0].manifest["version"] > 0:
+        found.append(open_checkpoint(what, 0))
+    return dict(_agent(checkpoint, deploy) for checkpoint in found)
 
 
 def _agent(checkpoint: Checkpoint, deploy: Deployment | None = None) -> tuple[Agent, TrainedModel]:
@@ -55,14 +54,14 @@ def calibrate(what: Path, report: ReportEvent) -> Checkpoint:
         event = {"event": "progress", "stage": "evaluate", "phase": "calibrating surprise"}
         report(event | {"step": episodes, "steps": 2 * ood_score.EPISODES})
 
-    return calibrated(agent_checkpoint(checkpoint_file(what)), progress)
+    return calibrated(open_checkpoint(what), progress)
 
 
 def save_calibrated(folder: Path, report: ReportEvent) -> None:
     """Calibrate the newest checkpoint of a run; the file is written only if it was not calibrated before."""
     calibrated = calibrate(folder, report)
     file = checkpoint_file(folder)
-    if calibrated.part("outcomes") and not agent_checkpoint(file).part("outcomes"):
+    if calibrated.part("outcomes") and not open_checkpoint(folder).part("outcomes"):
         save_checkpoint(file, calibrated)
 
 
@@ -73,7 +72,7 @@ def report_name(run: Run, what: Path, suite: str = "online", deploy: Deployment 
     its weights digest.  The report of a checkpoint file begins with the name of that file; a long list of
     strengths p is replaced by its SHA-256.
     """
-    manifest = agent_checkpoint(checkpoint_file(what)).manifest
+    manifest = open_checkpoint(what).manifest
     settings = run.evaluate
     levels = "_".join(repr(float(p)).removesuffix(".0") for p in settings.p)
     if len(levels) > 60:
@@ -106,7 +105,7 @@ def online(
     }
     newest, model = next(iter(found.items()))
     scores: list[Surprise] = []
-    if outcomes := outcomes_of(agent_checkpoint(checkpoint_file(what))):
+    if outcomes := outcomes_of(open_checkpoint(what)):
 
         def scored(rows: Sequence[Variation], env: Batch) -> Policy:
             scores.append(Surprise(outcomes, model.spec, len(rows)))
@@ -196,7 +195,7 @@ def posterior(
 
     Returns the online returns, which are written as result rows to the folder ``results``, and the numbers.
     """
-    agent, model = _agent(agent_checkpoint(checkpoint_file(what)), "paper")
+    agent, model = _agent(open_checkpoint(what), "paper")
     suite, split = registry.of(run).posterior, registry.of(run).split
     assert suite is not None, "``check_suite`` refuses problems without one"
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from icrl_dist.agent.loading import SHIPPED, agent_checkpoint, checkpoint_file, shipped
+from icrl_dist.agent.loading import SHIPPED, open_checkpoint, shipped
 from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
@@ -55,7 +55,7 @@ def evaluate(
     for option, value, choices in (("suite", suite, Suite), ("deploy", deploy, Deployment), ("prior", prior, Prior)):
         if value is not None and value not in get_args(choices):
             raise ConfigError(f"--{option} {value}: choose one of {', '.join(get_args(choices))}")
-    run = parse_written(str(agent_checkpoint(checkpoint_file(source)).manifest["run"]), str(source))
+    run = parse_written(str(open_checkpoint(source).manifest["run"]), str(source))
     chosen: dict[str, Any] = {
         "episodes": episodes,
         "seeds": seeds,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from icrl_dist.config.toml import ConfigError
-from icrl_dist.storage.files import StoreError, atomic_write
+from icrl_dist.storage.files import StoreError, atomic_write, require_file
 from icrl_dist.stream.validation import VERSION
 
 FORMAT = 1
@@ -65,6 +66,10 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     atomic_write(path, lambda file: np.savez(file, file_format=np.array(FORMAT), manifest=manifest, **arrays))
 
 
+class DamagedCheckpoint(StoreError):  # noqa: N818
+    """A checkpoint that is missing, or whose bytes changed after they were written; the fit can make it again."""
+
+
 class _OtherFormat(Exception):  # noqa: N818
     """A checkpoint of another file format, whose number is the message."""
 
@@ -89,9 +94,10 @@ _FORMER_PREFIX = re.compile("^optimiser/")
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint, also of an older version, without executing anything in it.
 
-    Raises StoreError if it is missing, cannot be read, is of another format, or is not a checkpoint.
+    Raises StoreError if it is of another format or cannot be read, DamagedCheckpoint if it is missing or not a checkpoint.
     """
     try:
+        require_file(path)
         with path.open("rb") as opened, _archive(opened) as file:
             size, unpacked = path.stat().st_size, sum(member.file_size for member in file.zip.infolist())
             if unpacked > size:
@@ -108,18 +114,24 @@ def load_checkpoint(path: Path) -> Checkpoint:
             manifest = {_RENAMED.get(name, name): value for name, value in manifest.items()}
             arrays = {_FORMER_PREFIX.sub("optimizer/", name): array for name, array in arrays.items()}
     except FileNotFoundError:
-        raise StoreError(f"{path}: no such checkpoint") from None
+        raise DamagedCheckpoint(f"{path}: no such checkpoint") from None
     except IsADirectoryError:
         raise StoreError(f"{path}: is a folder; name a run folder or a checkpoint file") from None
     except (PermissionError, NotADirectoryError) as error:
-        raise StoreError(f"{path}: the checkpoint cannot be read ({error.strerror})") from None
+        raise StoreError(f"{path}: the checkpoint cannot be read ({error.strerror}): make it readable") from None
     except _OtherFormat as error:
         raise StoreError(
             f"{path}: checkpoint of file format {error}, this version of icrl-dist reads format {FORMAT}: "
             "use the version that wrote it, or train again with this one"
         ) from None
+    except StoreError:
+        raise
+    except OSError as error:
+        if error.errno != errno.EIO:  # a disk that lost the bytes
+            raise StoreError(f"{path}: cannot be read ({error.strerror or error}): make it readable") from None
+        raise DamagedCheckpoint(f"{path}: cannot be read ({error.strerror})") from None
     except Exception as error:
         # Messages of numpy and zipfile stay out: one advises to allow pickle, which could execute code of the file.
         reason = str(error) if isinstance(error, _NotOurs) else "its content is damaged, or another program wrote it"
-        raise StoreError(f"{path}: not a checkpoint of this system ({reason})") from None
+        raise DamagedCheckpoint(f"{path}: not a checkpoint of this system ({reason})") from None
     return Checkpoint(arrays, manifest)

@@ -8,20 +8,47 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 from icrl_dist.copies import NotCopied
 from icrl_dist.storage import segment
-from icrl_dist.storage.files import StoreError, atomic_write, sync_folder, unwritten
+from icrl_dist.storage.files import StoreError, atomic_write, require_plain, sync_folder, unwritten
 from icrl_dist.storage.index import Index, Row
 from icrl_dist.stream.validation import VERSION
 from icrl_dist.types import Identity, Trajectory
 
-_PATTERN = "segment-*.frames"
+_NAME = re.compile(r"segment-(\d{6})\.frames")
+
+Check = Callable[[Trajectory], str]
+"""Why a stored trajectory cannot be used; empty if it can."""
+
+
+def segment_path(folder: Path, number: int) -> Path:
+    """The file of a segment of the dataset in this folder."""
+    return folder / f"segment-{number:06d}.frames"
+
+
+def segments(folder: Path) -> dict[int, Path]:
+    """The segment files of a dataset's folder by number, in order.
+
+    Raises StoreError, with the name, for a folder, a link or a pipe in place of a file, and for a segment whose name is
+    not one that this program gives; FileNotFoundError is no error: a new run has no folder yet.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise StoreError(f"{folder}: is not a folder (a link or a file), expected the folder of the dataset: move it away")
+    found: dict[int, Path] = {}
+    for path in sorted(folder.glob("segment-*")):
+        name = _NAME.fullmatch(path.name)
+        if name is None:
+            raise StoreError(f"{path}: no name of a segment; they are segment-000000.frames and so on: move it away")
+        require_plain(path)
+        found[int(name[1])] = path
+    return found
 
 
 class Damaged(StoreError):  # noqa: N818
@@ -31,55 +58,85 @@ class Damaged(StoreError):  # noqa: N818
 class Dataset(NotCopied):
     """A run's dataset: one process appends to it, and trajectories are durable when ``append`` returns.
 
-    Unless it is opened ``readonly``, damage by a crash or a disk is removed on opening;
-    ``repaired`` lists what was removed.
+    Unless it is opened ``readonly``, damage by a crash or a disk is removed on opening.
     """
 
     instead = "it holds open files; open its folder a second time with readonly=True"
 
-    def __init__(self, folder: Path, seal_bytes: int = 256 << 20, durable: bool = True, readonly: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        seal_bytes: int = 256 << 20,
+        durable: bool = True,
+        readonly: bool = False,
+        check: Check = lambda trajectory: "",
+    ) -> None:
         """``readonly`` changes nothing on disk; ``durable=False`` omits the fsync, to measure its cost.
 
-        Raises StoreError for files of another format, and for files that cannot be written.
+        ``check`` is called with each stored trajectory; one that cannot be used is removed like damaged ones, or left out
+        if ``readonly``.  Raises StoreError for files of another format, for odd files, and for files that cannot be written.
         """
         self.folder, self._seal_bytes, self._durable, self._readonly = folder, seal_bytes, durable, readonly
+        self._check = check
         self._lock = threading.RLock()
         self._open()
 
     def _open(self) -> None:
         if not self._readonly:
             self.folder.mkdir(parents=True, exist_ok=True)
-        self.repaired: list[str] = []
+        self.damage: list[str] = []
+        """What is damaged or missing, a line each; a dataset that is not ``readonly`` has removed it."""
         self.index = Index()
         self._names: dict[int, segment.Names] = {}
         self._sealed: dict[int, str] = {}
         self._readers: dict[int, int] = {}
         self._file: FileIO | None = None
         self._hash = hashlib.sha256()
-        paths = sorted(self.folder.glob(_PATTERN))
-        for path in paths:
-            self._load(path, last=path == paths[-1])
+        found = segments(self.folder)
+        self._fill(found)
+        for number, path in sorted(found.items()):
+            self._load(path, number, last=number == max(found))
         self._count = max(self._names, default=-1) + 1
         last = self._path(self._count - 1)
         if not self._readonly and self._count and self._count - 1 not in self._sealed:
             self._file = last.open("ab", buffering=0)
             self._hash = hashlib.sha256(last.read_bytes())
 
-    def _load(self, path: Path, last: bool) -> None:
+    def _fill(self, found: dict[int, Path]) -> None:
+        """Note the missing segments; unless ``readonly``, put empty ones in their places.
+
+        Raises StoreError for a segment whose number is out of order: more are missing before it than are there.
+        """
+        missing = [number for number in range(max(found, default=-1)) if number not in found]
+        if len(missing) > len(found):
+            raise StoreError(
+                f"{found[max(found)]}: out of order, {len(missing)} segments before it are missing: restore them, or move it "
+                "away; `icrl-dist train --resume` then collects its data again"
+            )
+        for number in missing:
+            path = self._path(number)
+            self.damage.append(f"{path.name}: is missing")
+            if not self._readonly:
+                atomic_write(path, lambda file: file.write(segment.seal(hashlib.sha256().digest())))
+                found[number] = path
+
+    def _load(self, path: Path, number: int, last: bool) -> None:
         """Check a segment, remove damage, and add its trajectories to the index."""
+        done = "" if self._readonly else "removed "
         try:
-            number = int(path.stem.removeprefix("segment-"))
             found = segment.scan(path)
-            if found.damaged and not self._readonly:
-                torn = last and not found.sealed and [end for _, end in found.damaged] == [found.size]
-                for start, end in found.damaged:
-                    what = "cut off a torn tail of" if torn else "removed a damaged range of"
-                    self.repaired.append(f"{path.name}: {what} {end - start} bytes at byte {start}")
+            cut = not last and not found.sealed
+            if cut and not found.damaged:
+                self.damage.append(f"{path.name}: its end is missing after byte {found.size}")
+            for start, end in found.damaged:
+                torn = last and not found.sealed and [found.damaged[-1][1]] == [found.size] and len(found.damaged) == 1
+                what = ("a torn tail of" if torn else "a damaged range of") + f" {end - start} bytes at byte {start}"
+                self.damage.append(f"{path.name}: {'cut off ' if torn and done else done}{what}")
+            if (found.damaged or cut) and not self._readonly:
                 found = self._remove_damage(path, found, sealed=not last)
-            unnamed = self._add(path, number, found)
-            if unnamed and not self._readonly:
-                self.repaired.append(f"{path.name}: removed {len(unnamed)} trajectories whose names were damaged")
-                found = self._remove_damage(path, found.without(unnamed), sealed=not last)
+            unusable = self._add(path, number, found)
+            if unusable and not self._readonly:
+                found = self._remove_damage(path, found.without(unusable), sealed=not last)
         except segment.OtherFormat as error:
             raise StoreError(f"{path}: {error}") from None
         except (ValueError, OSError) as error:
@@ -96,20 +153,33 @@ class Dataset(NotCopied):
         return segment.scan(path)
 
     def _add(self, path: Path, number: int, found: segment.Scan) -> list[tuple[int, int]]:
-        """Add a segment's trajectories to the index; returns the frames whose names were damaged."""
+        """Add a segment's trajectories to the index; returns the frames that cannot be used."""
         unnamed: list[tuple[int, int]] = []
+        refused: list[tuple[int, int]] = []
+        done = "" if self._readonly else "removed "
 
         def rows() -> Iterator[Row]:
             with path.open("rb") as file:
                 for offset, length in found.frames:
                     file.seek(offset)
                     try:
-                        yield Row.of(segment.decode(file.read(length), found.names), number, offset, length)
+                        trajectory = segment.decode(file.read(length), found.names)
                     except segment.MissingName:
                         unnamed.append((offset, length))
+                        continue
+                    if reason := self._check(trajectory):
+                        refused.append((offset, length))
+                        self.damage.append(f"{path.name}: {done}a trajectory at byte {offset}, {reason}")
+                    else:
+                        yield Row.of(trajectory, number, offset, length)
 
+        before = len(self.index)
         self.index.add(rows())
-        return unnamed
+        if found.frames and len(self.index) == before and not unnamed and not refused:
+            raise StoreError(f"{path}: holds only trajectories that other segments hold: it is a copy of one, move it away")
+        if unnamed:
+            self.damage.append(f"{path.name}: {done}{len(unnamed)} trajectories whose names were damaged")
+        return unnamed + refused
 
     def append(self, trajectories: Sequence[Trajectory]) -> None:
         """Append trajectories; all of them are durable on return (one fsync).
@@ -179,7 +249,7 @@ class Dataset(NotCopied):
         with self._lock:
             self.close()
             self._open()
-            return self.repaired
+            return self.damage
 
     def close(self) -> None:
         with self._lock:
@@ -239,4 +309,4 @@ class Dataset(NotCopied):
         ]
 
     def _path(self, number: int) -> Path:
-        return self.folder / f"segment-{number:06d}.frames"
+        return segment_path(self.folder, number)

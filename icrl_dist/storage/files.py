@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
 import os
+import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,15 +18,42 @@ class StoreError(RuntimeError):
     """A run folder or a file of it cannot be used; the message says which, why, and the remedy."""
 
 
-def hold(folder: Path, timeout_s: float = 10.0) -> IO[bytes]:
-    """Lock a run folder until the returned file is closed or this process ends.
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFLNK: "a link",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFBLK: "a device",
+    stat.S_IFCHR: "a device",
+}
+
+
+def require_file(path: Path, follow: bool = True) -> None:
+    """Raises StoreError unless ``path`` is a file, or with ``follow`` a link to one; FileNotFoundError if it does not exist.
+
+    Opening a named pipe would wait for ever.
+    """
+    mode = path.stat().st_mode if follow else path.lstat().st_mode
+    if not stat.S_ISREG(mode):
+        raise StoreError(f"{path}: is {_KINDS.get(stat.S_IFMT(mode), 'no file')}, expected a file: move it away")
+
+
+def require_plain(path: Path) -> None:
+    """Raises StoreError if ``path`` exists and is not a file; a link, which can lead out of the run folder, is refused too."""
+    with contextlib.suppress(FileNotFoundError):
+        require_file(path, follow=False)
+
+
+def hold(folder: Path, timeout_s: float = 10.0, name: str = ".lock") -> IO[bytes]:
+    """Lock a run folder, by its file ``name``, until the returned file is closed or this process ends.
 
     Another process may move or replace the folder while this one waits, so the lock must be on
     the file that is in the folder afterwards.  Raises StoreError if another process still has the
     lock after ``timeout_s``; a process that was just killed needs a moment to end.  On a file system
     without locks the file is returned unlocked; see ``without_locks``.
     """
-    path = folder / ".lock"
+    path = folder / name
+    require_plain(path)
     deadline = time.monotonic() + timeout_s
     while True:
         file = path.open("ab")
@@ -62,10 +91,11 @@ def without_locks(folder: Path) -> str:
     return ""
 
 
-def held(folder: Path) -> bool:
-    """Whether a process has locked a run folder, as far as this node and this user can see.  Changes nothing."""
+def held(folder: Path, name: str = ".lock") -> bool:
+    """Whether a process has locked a run folder by its file ``name``, as far as this node can see.  Changes nothing."""
     try:
-        with (folder / ".lock").open("rb") as file:
+        require_plain(folder / name)
+        with (folder / name).open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a shared lock, so simultaneous calls do not see each other
     except BlockingIOError:
         return True

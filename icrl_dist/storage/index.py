@@ -146,6 +146,14 @@ class Index:
             )
         ]
 
+    def made_by(self) -> list[tuple[int, str, Identity]]:
+        """The policy versions with their weights digests that made trajectories, each with the first such trajectory."""
+        found = self._all(
+            f"SELECT {_KEY}, policy_version, weights_digest FROM trajectories WHERE policy_version >= 0 "
+            f"GROUP BY policy_version, weights_digest ORDER BY {_KEY}"
+        )
+        return [(row[5], row[6], _identity(row[:5])) for row in found]
+
     def lags(self) -> dict[int, int]:
         """The number of trajectories of adaptation rounds j made by T^(j - lag), by lag; only 0 unless rounds overlap."""
         where = f"stage = {STAGES.index('adapt')}"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from icrl_dist.storage import segment
+from icrl_dist.storage.dataset import segment_path, segments
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.types import Identity
 
@@ -22,12 +23,13 @@ def adopt(theirs: Path, folder: Path, keep: Callable[[Identity], bool]) -> int:
     another format.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shared = 0
-    for source in sorted(theirs.glob("segment-*.frames")):
-        target, found = folder / source.name, _checked(source)
+    shared = number = 0
+    for source in segments(theirs).values():
+        target, found = segment_path(folder, number), _checked(source)
         unwanted = _unwanted(source, found, keep)
         if len(unwanted) == len(found.frames):
             continue
+        number += 1
         if found.sealed and not unwanted:
             _link(source, target)
             shared += found.size

@@ -100,6 +100,10 @@ class LinkError(OSError):
     """A link cannot be opened, or is closed; the message names the link and the remedy."""
 
 
+LOST = "lost"
+"""In the reason of a refused request for weights: they do not exist any more, so asking again is useless."""
+
+
 class Refused(Exception):  # noqa: N818
     """The other side refused the request and gave a reason."""
 

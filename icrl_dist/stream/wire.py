@@ -174,10 +174,16 @@ def encode_weights(weights: Weights) -> bytes:
 
 
 def decode_weights(data: bytes, limit: int) -> Weights:
-    """The weights in ``data``, of at most ``limit`` bytes.  Raises WireError if their digest is not that of their arrays."""
+    """The weights in ``data``, of at most ``limit`` bytes.
+
+    Raises WireError if their digest is not that of their arrays, or if a value is infinite or not a number.
+    """
     fields = _decode(_WeightsFields, data, limit, "weights")
     arrays = {text(n, "arrays"): to_array(n, a, WEIGHT_DTYPES, None) for n, a in as_map(fields.arrays, "arrays").items()}
     _check_digest(fields.digest, arrays)
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise WireError("schema", f"{show(name)} holds a value that is infinite or not a number")
     return Weights(fields.version, arrays, fields.digest)
 
 

@@ -100,6 +100,15 @@ def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
 
 def sessions(folder: Path) -> list[dict[str, Any]]:
     """The records of a run's sessions, oldest first; empty if ``env.json`` is missing or damaged."""
+    return _read(folder) or []
+
+
+def readable(folder: Path) -> bool:
+    """Whether ``env.json`` holds records of sessions, or none of them yet."""
+    return _read(folder) is not None
+
+
+def _read(folder: Path) -> list[dict[str, Any]] | None:
     try:
         found = json.loads((folder / FILE).read_text())
         if "versions" in found:  # version 0.1.0 wrote one record, with other names
@@ -107,9 +116,9 @@ def sessions(folder: Path) -> list[dict[str, Any]]:
             package = versions.pop("icrl-dist", "")
             others = {name: found[name] for name in ("platform", "cores") if name in found}
             return [{"package_version": package, "libraries": {"python": found.get("python", ""), **versions}, **others}]
-        return [dict(one) for one in found.get("sessions", [])]
-    except (OSError, ValueError, TypeError, AttributeError):
-        return []
+        return [dict(one) for one in found["sessions"]]
+    except (OSError, ValueError, TypeError, AttributeError, KeyError):
+        return None
 
 
 def create(folder: Path) -> None:
@@ -121,12 +130,16 @@ def create(folder: Path) -> None:
 def add_session(folder: Path, policy_version: int, made_by: Mapping[str, Any]) -> str:
     """Add a session that begins now, at this policy version, to ``env.json``.
 
-    Returns how its record differs from the one that the run began with, as one line for the user; empty if it does not.
+    Returns how its record differs from the one that the run began with, or that the file was damaged, as one line for the
+    user; empty if there is nothing to say.
     Raises StoreError if the file cannot be written.
     """
+    damaged = (folder / FILE).exists() and not readable(folder)
     before = sessions(folder)
     began = {"began": datetime.now(UTC).isoformat(timespec="seconds"), "policy_version": policy_version}
     _write(folder, [*before, {**began, "cores": len(os.sched_getaffinity(0)), **made_by}])
+    if damaged:
+        return f"{folder / FILE}: was damaged, so its earlier sessions are lost; it is written anew"
     changed = differences(before[0], made_by) if before else ""
     return f"this run began with {changed}: digests can differ from those of an uninterrupted run" if changed else ""
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from actors import cluster, fleet, missing
+from actors import cluster, fleet, local, missing
 from icrl_dist.diagnostics import node_facts
 
 REACH = node_facts.reach
@@ -45,6 +45,9 @@ class FakeRay:
     def init(self, address=None, **options):
         if address == "192.0.2.99:6379":
             raise ConnectionError("no answer")
+
+    def get_runtime_context(self):
+        return SimpleNamespace(gcs_address="10.0.0.250:6379")
 
     def nodes(self):
         return [
@@ -98,11 +101,34 @@ class FakeRay:
         pass
 
 
+class FakeSession:
+    """Ray's processes on this machine; ``cause``: why only a restart helps."""
+
+    made: "FakeSession"
+
+    def __init__(self, ray, note, stopped, **options):
+        FakeSession.made = self
+        self.cause, self.restarts, self.closed = "", 0, False
+
+    def failure(self):
+        return self.cause
+
+    def restart(self):
+        self.cause, self.restarts = "", self.restarts + 1
+
+    def close(self):
+        self.closed = True
+
+
 @pytest.fixture
 def new_fleet(monkeypatch):
     """``new_fleet(ray, actors)``: a fleet on a fake Ray, without waiting times."""
     monkeypatch.setattr(fleet, "_SETTINGS", {})  # they would stay set for the other tests of this process
+    monkeypatch.setattr(fleet, "_LOCAL_SETTINGS", {})
     monkeypatch.setattr(fleet, "_PAUSE_S", 0.001)
+    monkeypatch.setattr(fleet, "Session", FakeSession)
+    monkeypatch.setattr(fleet, "require_cluster", lambda address: None)
+    monkeypatch.setattr(local, "protect_token", lambda: None)
     monkeypatch.setattr(cluster, "REFRESH_S", 0.0)
     monkeypatch.setattr(cluster, "RETRY_S", 0.0)
     monkeypatch.setattr(cluster, "UNREACHED_S", 0.0)

@@ -1,11 +1,14 @@
 """Where and when a fleet starts its workers, and which deaths it counts, on a fake Ray."""
 
+import time
+from types import SimpleNamespace
+
 import pytest
 
-from actors import cluster
+from actors import cluster, running_time
 from actors import fleet as fleet_module
 from actors.fleet import FleetFailed
-from tests.actors.fake_ray import LOOPBACK, FakeRay, gather, local_name, new_fleet, placements
+from tests.actors.fake_ray import LOOPBACK, FakeRay, FakeSession, gather, local_name, new_fleet, placements
 
 __all__ = ["local_name", "new_fleet"]
 
@@ -140,3 +143,53 @@ def test_missing_nodes_are_reported_and_the_run_starts_with_at_least_the_minimum
     gather(fleet, notes)
     assert [n for n in notes if n.startswith("10.0.0.7 has not joined")] and "starting with 2 workers" in notes[-1]
     assert fleet.watch(notes.append, 0) == 6 and len(ray.placed) == 2  # four wait for a node
+
+
+def test_after_the_end_of_a_process_of_ray_all_workers_start_in_a_new_session_and_no_death_is_counted(new_fleet):
+    ray, notes = FakeRay(), list[str]()
+    fleet = new_fleet(ray, 2, address=None, restarts=1, oversubscribe=True)
+    fleet.start(LOOPBACK, "run")
+    assert fleet.watch(notes.append, 0) == 2
+    FakeSession.made.cause = "Ray's process raylet (7) has ended"
+    assert fleet.watch(notes.append, 0) == 2 and FakeSession.made.restarts == 1
+    assert "Ray's process raylet (7) has ended; `dmesg` shows" in notes[-1] and notes[-1].endswith(
+        "starting Ray and its workers again"
+    )
+    assert len(ray.placed) == 4 and fleet.lost == ["w0", "w1"] and fleet.deaths == 0
+    assert fleet._name(0) == "w0-1", "every life of a worker has its own name"
+    FakeSession.made.cause = "Ray's process gcs_server (8) has ended"
+    with pytest.raises(FleetFailed, match=r"gcs_server \(8\) has ended; `dmesg`"):
+        fleet.watch(notes.append, 0)
+    assert fleet.watch(notes.append, 1) == 2 and FakeSession.made.restarts == 2, "after progress it may be restarted again"
+    fleet.close()
+    assert FakeSession.made.closed
+
+
+def test_ray_is_not_started_again_for_workers_that_the_learner_has_stopped(new_fleet, monkeypatch):
+    ray = FakeRay()
+    fleet = new_fleet(ray, 1, address=None, restarts=1, oversubscribe=True)
+    fleet.start(LOOPBACK, "run")
+    fleet.watch(print, 0)
+    monkeypatch.setattr(ray, "wait", lambda running, **_: (running, []))
+    monkeypatch.setattr(ray, "get", lambda work: None)
+    assert fleet.watch(print, 0) == 0
+    FakeSession.made.cause = "Ray's process raylet (7) has ended"
+    assert fleet.watch(print, 0) == 0 and FakeSession.made.restarts == 0
+
+
+def test_a_cluster_whose_head_does_not_answer_is_lost_before_ray_aborts_the_process(new_fleet, local_name, monkeypatch):
+    ray, notes = FakeRay(0, 1), list[str]()
+    fleet = new_fleet(ray, 1)
+    gather(fleet, notes)
+    fleet.watch(notes.append, 0)
+    began = now = time.monotonic()
+    monkeypatch.setattr(running_time, "time", SimpleNamespace(monotonic=lambda: now))
+    ray.unreachable.add(250)
+    monkeypatch.setattr(ray, "nodes", lambda: pytest.fail("a call to Ray would not return"))
+    for step in (2.0, 4.0, 3600.0, 3602.0):  # a stop of an hour does not count
+        now = began + step
+        assert fleet.watch(notes.append, 0) == 1
+    with pytest.raises(FleetFailed, match=r"head has not answered for 30 s \(timed out\): start the cluster again"):
+        for step in range(3604, 3640, 2):
+            now = began + step
+            fleet.watch(notes.append, 0)

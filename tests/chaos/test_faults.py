@@ -91,8 +91,7 @@ def test_metrics_on_a_full_disk_name_the_remedy(tmp_path):
     remedy = r"metrics.jsonl: could not be written \(No space left on device\): free space, then use --resume"
     with pytest.raises(StoreError, match=remedy):
         metrics.write(1, "fit", loss=1.0)
-    with pytest.raises(StoreError, match=remedy):
-        metrics.close()  # its buffer cannot be written either
+    metrics.close()
 
 
 def test_a_full_disk_is_reported_in_one_line_with_the_remedy(capsys, monkeypatch):

@@ -36,7 +36,7 @@ def refused(capsys, *arguments):
         ("[darkroom]\nsiz = 4", r"unknown key darkroom.siz; did you mean 'size'\?"),
         ("[darkrom]\nsize = 4", r"unknown key darkrom; did you mean 'darkroom'\?"),
         ('[darkroom]\nsize = "7"', r"darkroom.size = '7': expected int, got str"),
-        ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has at least 2 cells"),
+        ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has 2 to 1000 cells"),
         ("[adversary]\np_max = 1.5", r"adversary.p_max = 1.5: a probability lies in \[0, 1\]"),
         ("[evaluate]\np = [0.0, -0.1]", r"evaluate.p = -0.1: a probability lies in \[0, 1\]"),
         ('method = "ppo"', r"method = 'ppo': choose one of dpt, experts, icaa, icag"),
@@ -95,7 +95,7 @@ def test_a_port_in_use(capsys, tmp_path):
         ("a.b.c=1", "SECTION.NAME=VALUE"),
         ("seed.x=1", "seed is not a section"),
         ("adversary.count=two", "adversary.count = 'two': expected int"),
-        ("stream.staleness=-1", "stream.staleness = -1: must not be negative"),
+        ("stream.staleness=-1", "stream.staleness = -1: must be from 0 to 2^31 - 1"),
     ],
 )
 def test_an_invalid_setting(capsys, tmp_path, setting, expected):
@@ -233,12 +233,17 @@ def test_a_stopped_evaluation_prints_the_command_that_resumes(monkeypatch, tmp_p
         signal.raise_signal(getattr(signal, name))
         pytest.fail("the signal was ignored")
 
-    monkeypatch.setattr(train, "train_inline", lambda *_: {})
+    def trained(run, folder, report):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "version-0000.npz").touch()
+        return {}
+
+    monkeypatch.setattr(train, "train_inline", trained)
     monkeypatch.setattr(heldout, "save_calibrated", stopped)
     assert main.main(["train", "smoke", "--engine", "inline", "--out", str(tmp_path / "run")]) == 130
     printed = capsys.readouterr().out
     assert (
-        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the checkpoint"
+        f"interrupted; `icrl-dist train smoke --resume --engine inline --out {tmp_path}/run` continues from the last checkpoint"
         in printed
     )
     assert (tmp_path / "run" / "run.toml").exists()

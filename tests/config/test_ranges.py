@@ -77,7 +77,7 @@ def _outside(one: Range) -> list[Any]:
             case at.Ge(int() | float() as limit):
                 values.append(limit - step)
             case at.Le(int() | float() as limit):
-                values.append(limit + step)
+                values.append(limit + max(step, 0 if one.whole else 0.001 * limit))
             case at.MinLen(length):
                 values.append((0.1,) * (length - 1))
     return [float(value) if not one.whole and not isinstance(value, tuple) else value for value in values]
@@ -113,6 +113,7 @@ def test_every_number_of_every_section_has_a_range() -> None:
             of = typing.get_args(hint)[0] if one.item else hint
             if of in (int, float) or float in typing.get_args(of):
                 assert any(isinstance(bound, (at.Gt, at.Ge)) for bound in one.bounds), f"{one.where} has no lower bound"
+                assert any(isinstance(bound, (at.Lt, at.Le)) for bound in one.bounds), f"{one.where} has no upper bound"
                 assert any(isinstance(bound, Remedy) for bound in one.bounds), f"{one.where} has no remedy"
     assert {one.section for one in RANGES} == {"", *_sections()}, "each section has a range"
 
@@ -139,3 +140,24 @@ def test_a_value_outside_its_range_is_refused_by_name_with_the_remedy(one: Range
 def test_a_value_on_the_edge_of_its_range_is_read(one: Range, value: Any) -> None:
     read: Any = schema.read(_sections().get(one.section, config.Run), {one.field: [value] if one.item else value}, "x")
     assert getattr(read, one.field) == ((value,) if one.item else value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "range_named"),
+    [
+        ("seed=9223372036854775808", "0 to 2^63 - 1"),
+        ("darkroom.split_seed=9223372036854775808", "0 to 2^63 - 1"),
+        ("optim.learning_rate=1e300", "above 0 and at most 1e6"),
+        ("icaa.learning_rate=1e300", "above 0 and at most 1e6"),
+        ("dagger.learning_rate=1e7", "above 0 and at most 1e6"),
+        ("optim.weight_decay=1e300", "from 0 to 1e6"),
+        ("stream.lease_s=1e300", "above 0 and at most 1e9"),
+        ("pretrain.contexts=2147483648", "above 0 and below 2^31"),
+        ("icaa.rounds=9999", "from 0 to 9000"),
+        ("icaa.trials=1e300", "expected int"),
+    ],
+)
+def test_numbers_beyond_what_the_machinery_takes_are_refused_with_the_range(setting: str, range_named: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        override(make_run(), [setting], "x")
+    assert range_named in str(refused.value) and "\n" not in str(refused.value)

@@ -139,6 +139,10 @@ def test_ray_token_is_required_in_token_mode(tmp_path: Path, monkeypatch: pytest
     token.write_text("\n")
     assert check_named("Ray token").ok is False, "an empty file is no token"
     token.write_text("secret-of-this-test")
+    token.chmod(0o644)
+    check = check_named("Ray token")
+    assert check.ok is None and check.remedy == f"chmod 600 {token}"
+    token.chmod(0o600)
     check = check_named("Ray token")
     assert check.ok is True
     assert "secret-of-this-test" not in table([check])

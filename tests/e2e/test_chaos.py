@@ -21,6 +21,13 @@ def reference(tmp_path_factory):
     return folder
 
 
+EVIDENCE = {
+    "kill-worker": "worker deaths: 1",
+    "torn-tail": "segment-",
+    "kill-raylet": "is gone; ",
+}
+
+
 def chaos(capsys, reference, out, *arguments):
     against = ["--reference", str(reference), "--out", str(out)]
     code = main.main(["chaos", "smoke", *SMALL, "--actors", "1", *against, "--json", *arguments])
@@ -34,12 +41,12 @@ def child_processes():
     return [p.pid for p in psutil.Process().children(recursive=True)]
 
 
-@pytest.mark.parametrize("fault", ["kill-worker", "torn-tail"])
+@pytest.mark.parametrize("fault", ["kill-worker", "torn-tail", "kill-raylet"])
 def test_a_fault_lands_and_changes_no_digest(capsys, reference, tmp_path, fault):
     before = child_processes()
     code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", fault)
     assert code == 0 and row["landed"] and row["equal"], text
-    assert {"kill-worker": "worker deaths: 1", "torn-tail": "segment-"}[fault] in row["evidence"]
+    assert EVIDENCE[fault] in row["evidence"]
     assert row["struck"] and fault in text and "all 1 faults landed" in text
     assert not list((tmp_path / "seed-0").iterdir()) and child_processes() == before
 

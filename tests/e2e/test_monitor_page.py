@@ -81,18 +81,18 @@ class MonitorPlane:
         self.progress()
         wait_for(lambda: self.feed.state.snapshot(0.0)["run"]["name"], "the name of the run", SHORT_S)
 
-    def put(self, payload, topic="any", run=None):
+    def put(self, payload, topic, run=None):
         self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
 
     def send(self, kind, **fields):
-        self.put(wire.encode_message(kind, **{"time": time.time(), "worker": "w0", **fields}))
+        self.put(wire.encode_message(kind, **{"time": time.time(), "worker": "w0", **fields}), kind)
 
     def progress(self, **fields):
         counts = {"round": 0, "step": 5, "steps": 10, "version": 0, "trajectories": 5, "workers": 1, "lag": 0}
         self.send("learner", **{"stage": "collect", "phase": "adapt", "drops": {}, "doing": [], **counts, **fields})
 
     def send_return(self, *positional, **fields):
-        self.put(self.trajectories(*positional, **fields))
+        self.put(self.trajectories(*positional, **fields), "trajectories")
 
     def trajectories(self, variation, trial, total, kind="uniform", problem="darkroom", round=0, p=0.25, **fields):
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
@@ -203,10 +203,13 @@ def test_hostile_messages_are_shown_as_text_or_ignored(page):
         run.send("event", what="alert", alert=MARKUP, active=True, text=MARKUP)
         run.send("run", **ABOUT | {"method": MARKUP, "problem": MARKUP})
         run.send("run", **ABOUT | {"began": 1e308})
-        run.put(b"\xff" * 100)
-        run.put(msgpack.packb({"v": wire.VERSION, "kind": "event", "text": "x" * (2 << 20)}))
-        run.put(msgpack.packb({"v": wire.VERSION, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
-        run.put(wire.encode_message("event", time=1.0, what="x", text="x"), run="another")
+        run.put(b"\xff" * 100, "event")
+        run.put(msgpack.packb({"v": wire.VERSION, "kind": "event", "text": "x" * (2 << 20)}), "event")
+        run.put(
+            msgpack.packb({"v": wire.VERSION, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}),
+            "trajectories",
+        )
+        run.put(wire.encode_message("event", time=1.0, what="x", text="x"), "event", run="another")
         page.goto(url)
         page.locator("#worker-table").get_by_text(MARKUP).first.wait_for()
         expect(page, "#name").to_have_text(name)

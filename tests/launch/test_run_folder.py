@@ -32,6 +32,7 @@ OURS = (
         "dataset/.segment-000001.frames.9.part",
     ),
     *("checkpoints/version-0000.npz", "checkpoints/partial.npz", "checkpoints/.version-0001.npz.7.part"),
+    *("metrics.jsonl.1", "metrics.jsonl.4", "learner.log.2", "learner.err.1"),
     *("crashes/w0-1.json", "crashes/w0.stacks", "tensorboard/events.out.tfevents.1.host.2.0"),
     *("report/online-T2-0a1b2c3d-paper-unseen-p0_0.2-3episodes-2seeds.json", "report/adaptation.png", "report/online.json"),
 )
@@ -410,7 +411,7 @@ def test_after_a_kill_during_a_fork_the_old_run_is_never_removed(tmp_path, modul
     assert files(folder) == before
 
 
-def test_a_kill_while_a_fork_is_made_keeps_the_old_run(tmp_path, module_run, monkeypatch):
+def test_a_kill_while_a_fork_is_made_restores_the_old_run(tmp_path, module_run, monkeypatch):
     class Killed(BaseException):
         """Stands for SIGKILL: nothing is cleaned up."""
 
@@ -427,9 +428,8 @@ def test_a_kill_while_a_fork_is_made_keeps_the_old_run(tmp_path, module_run, mon
     with pytest.raises(Killed):
         launch.prepare(module_run, folder, resume=False, overwrite=True, source=(tmp_path / "parent", 1))
     monkeypatch.undo()
-    with pytest.raises(ConfigError, match="was killed"):
-        launch.prepare(module_run, folder, resume=False, overwrite=True)
-    assert replaced(folder) == before
+    launch.prepare(module_run, folder, resume=True, overwrite=False)
+    assert files(folder) == before
 
 
 def test_an_interrupted_removal_leaves_no_run(tmp_path, monkeypatch):

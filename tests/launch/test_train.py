@@ -1,5 +1,6 @@
 """Run folders that are resumed or refused, and the learner as a child process: messages to it, and a restart."""
 
+import contextlib
 import os
 import sys
 import time
@@ -11,6 +12,7 @@ import pytest
 from actors import fleet
 from icrl_dist.config.run import ConfigError, load, override
 from icrl_dist.launch import learner_process, train
+from icrl_dist.launch.learner_process import TrainFailed
 from learner.__main__ import _read_driver
 from learner.service import Service
 
@@ -77,3 +79,89 @@ def test_an_absent_cluster_leaves_no_run_folder(small_run, tmp_path, monkeypatch
     with pytest.raises(ConfigError, match="no cluster"):
         train.train_ray(small_run, tmp_path / "run", None, "auto", print)
     assert not (tmp_path / "run").exists()
+
+
+class FakeLearner:
+    """A learner process whose events are given, one list for each look at them."""
+
+    endpoint, deaths = "tcp/127.0.0.1:1", 0
+
+    def __init__(self, *looks):
+        self.looks = list(looks)
+
+    def events(self):
+        return self.looks.pop(0) if self.looks else []
+
+    def watch(self, report):
+        pass
+
+    excuse = end_after_driver = watch
+
+
+@pytest.fixture
+def run_with(small_run, tmp_path, monkeypatch):
+    """``run_with(outcome, *looks)``: train with a fleet whose ``watch`` returns or raises ``outcome``."""
+    folder = tmp_path / "run"
+
+    def run(outcome, *looks, files=()):
+        class Fleet:
+            deaths, ray_restarts, lost = 0, 0, ()
+
+            def __init__(self, *_):
+                if outcome == "does not start":
+                    raise fleet.FleetFailed("Ray did not start")
+
+            def watch(self, *_):
+                if isinstance(outcome, Exception):
+                    raise outcome
+                return outcome
+
+            gather = start = close = lambda self, *_: None
+
+        learner = FakeLearner(*looks)
+        monkeypatch.setattr(fleet, "Fleet", Fleet)
+        monkeypatch.setattr(train, "FINISH_S", 0.05)
+        monkeypatch.setattr(learner_process, "running", lambda *_: contextlib.nullcontext(learner))
+        train.prepare(small_run, folder, resume=False, overwrite=False)
+        for name, content in files:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(content)
+        return train.train_ray(small_run, folder, 1, None, lambda event: None)
+
+    return run
+
+
+LISTENING, FINISHED = {"event": "listening"}, {"event": "finished", "version": 1}
+
+
+@pytest.mark.parametrize("outcome", [0, fleet.FleetFailed("Ray's process raylet (7) has ended")])
+def test_a_run_whose_learner_has_finished_is_finished_whatever_its_workers_did(run_with, outcome):
+    """A command that was stopped sees the end of the workers first, although the learner ended them."""
+    result = run_with(outcome, [LISTENING], [FINISHED])
+    assert result == {"version": 1, "learner_deaths": 0, "worker_deaths": 0}
+
+
+def test_a_run_whose_workers_all_ended_fails_if_its_learner_does_not_finish(run_with):
+    with pytest.raises(TrainFailed, match="every worker ended before the run did"):
+        run_with(0, [LISTENING])
+
+
+@pytest.mark.parametrize(
+    ("files", "end", "kept"),
+    [
+        ([("checkpoints/version-0000.npz", b"x")], "", True),
+        ([("checkpoints/partial.npz", b"x")], "", True),
+        ([("learner.log", b"a line\n"), ("learner.err", b"")], "; nothing has been stored yet", False),
+        ([("learner.err", b"a cause\n")], "; nothing has been stored yet, see {folder}", True),
+        ([("dataset/segment-000000.frames", b"damaged")], "; nothing has been stored yet, see {folder}", True),
+        ([("notes.md", b"mine")], "; nothing has been stored yet, see {folder}", True),
+    ],
+)
+@pytest.mark.parametrize("outcome", ["does not start", fleet.FleetFailed("Ray did not start")])
+def test_a_failed_run_says_what_its_folder_holds_and_is_removed_if_that_is_nothing(
+    run_with, tmp_path, files, end, kept, outcome
+):
+    with pytest.raises(TrainFailed) as failed:
+        run_with(outcome, [LISTENING], files=files)
+    assert str(failed.value) == "Ray did not start" + end.format(folder=tmp_path / "run")
+    assert (tmp_path / "run").exists() is kept

@@ -7,6 +7,8 @@ import fcntl
 import inspect
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +22,7 @@ import torch
 
 import icrl_dist
 from actors import fleet, local
+from actors.session import SessionFailed
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps
 from icrl_dist.console.signals import SIGNALS, interruptible
@@ -144,16 +147,23 @@ def test_a_real_session_of_ray_still_works_after_the_refusal(tmp_path):
 
 @pytest.mark.parametrize("start_fails", [False, True])
 def test_the_environment_is_as_it_was_after_a_fleet(monkeypatch, start_fails):
-    def start(ray, *_, **__):
-        assert os.environ["RAY_worker_niceness"] == "0"  # noqa: SIM112 - Ray's name
-        os.environ |= {"RAY_AUTH_MODE": "token", "PYTHONBREAKPOINT": "ray"}  # as Ray does
-        if start_fails:
-            raise RuntimeError("Ray did not start")
+    class Session:
+        def __init__(self, ray, *_, **__):
+            assert os.environ["RAY_worker_niceness"] == "0"  # noqa: SIM112 - Ray's name
+            assert "RAY_ADDRESS" not in os.environ
+            os.environ |= {"RAY_AUTH_MODE": "token", "PYTHONBREAKPOINT": "ray"}  # as Ray does
+            if start_fails:
+                raise SessionFailed("Ray did not start")
+
+        def close(self):
+            pass
 
     ray = FakeRay(1)
     monkeypatch.setitem(sys.modules, "ray", ray)
-    monkeypatch.setattr(local, "start_ray", start)
+    monkeypatch.setattr(fleet, "Session", Session)
+    monkeypatch.setattr(local, "protect_token", lambda: None)
     monkeypatch.setenv("RAY_worker_niceness", "5")
+    monkeypatch.setenv("RAY_ADDRESS", "192.0.2.1:6379")
     for name in ("RAY_USAGE_STATS_ENABLED", "RAY_AUTH_MODE", "PYTHONBREAKPOINT"):
         monkeypatch.delenv(name, raising=False)
     before = dict(os.environ)
@@ -199,17 +209,32 @@ def test_a_folder_that_exists_needs_resume_or_overwrite(made, module_run):
         icrl_dist.train(module_run, made.result.folder, engine="inline")
 
 
-def test_an_interrupted_run_says_what_its_folder_holds(module_run, tmp_path, monkeypatch):
-    def interrupted(run, folder, report):
-        raise launch.TrainInterrupted
+def test_an_interrupted_run_says_what_its_folder_holds(made, module_run, tmp_path, monkeypatch):
+    """ "continues from the last checkpoint" is said only where there is one; a folder that holds nothing is removed."""
+    folder, segments = tmp_path / "run", sorted((made.result.folder / "dataset").iterdir())
 
-    monkeypatch.setattr(launch, "train_inline", interrupted)
-    with pytest.raises(icrl_dist.TrainInterrupted, match=r"holds the checkpoint: resume=True") as stopped:
-        icrl_dist.train(module_run, tmp_path / "run", engine="inline")
-    assert stopped.value.resumable
-    with pytest.raises(icrl_dist.TrainInterrupted, match=r"run is as it was before$") as stopped:
-        icrl_dist.train(module_run, tmp_path / "run", engine="inline", overwrite=True)
-    assert not stopped.value.resumable and (tmp_path / "run" / "run.toml").exists()
+    def interrupted(*left):
+        def train_inline(run, folder, report):
+            (folder / "learner.log").write_text("a line\n")
+            for path in left:
+                (folder / path.parent.name).mkdir(exist_ok=True)
+                shutil.copy(path, folder / path.parent.name)
+            raise launch.TrainInterrupted
+
+        monkeypatch.setattr(launch, "train_inline", train_inline)
+        with pytest.raises(icrl_dist.TrainInterrupted) as stopped:
+            icrl_dist.train(module_run, folder, engine="inline", overwrite=folder.exists())
+        return stopped.value
+
+    error = interrupted()
+    assert not error.resumable and str(error) == "nothing had been done yet" and not folder.exists()
+    error = interrupted(segments[0])
+    assert error.resumable and re.fullmatch(r"the \d+ stored trajectories", error.kept) and error.kept in str(error)
+    shutil.rmtree(folder)
+    error = interrupted(made.result.folder / "checkpoints" / "version-0000.npz")
+    assert error.resumable and error.kept == "the last checkpoint" and "resume=True" in str(error)
+    error = interrupted()
+    assert not error.resumable and str(error).endswith("run is as it was before") and (folder / "run.toml").exists()
 
 
 @pytest.mark.parametrize("number", SIGNALS)

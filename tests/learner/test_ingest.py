@@ -8,12 +8,13 @@ import msgpack
 import numpy as np
 import pytest
 
+from icrl_dist.collect.checks import Rejected, check
 from icrl_dist.problems import registry
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import batching, wire
 from icrl_dist.types import Identity, Spec
-from learner.ingest import REASONS, Ingest, Rejected, check
+from learner.ingest import REASONS, Ingest
 from tests.calls import noting
 from tests.jobs import do, jobs_of
 
@@ -268,10 +269,10 @@ def test_numbers_too_large_for_the_ledger_are_refused(ingest, trajectories):
     assert put(ingest, wire.encode_trajectory(trajectories[0])) == "" and ingest.failures == []
 
 
-def test_the_largest_float32_values_count_as_finite(ingest, trajectories):
+def test_the_largest_float32_values_are_out_of_bounds(ingest, trajectories):
     rewards = np.full_like(trajectories[0].rewards, 3e38)
-    assert put(ingest, wire.encode_trajectory(dataclasses.replace(trajectories[0], rewards=rewards))) == ""
-    assert ingest.commits == 1
+    answer = put(ingest, wire.encode_trajectory(dataclasses.replace(trajectories[0], rewards=rewards)))
+    assert "rewards[0] = 3e+38 lies outside -1e+06..1e+06" in answer and ingest.commits == 0
 
 
 def test_on_a_full_disk_nothing_is_acknowledged_and_the_error_is_reported(ingest, trajectories, monkeypatch):

@@ -16,6 +16,7 @@ from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.problems.darkroom.problem import DarkRoomProblem
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
+from icrl_dist.storage.files import StoreError
 from icrl_dist.telemetry.metrics import Metrics
 from learner import checkpoints, reporter, service
 from tests.calls import noting
@@ -124,11 +125,11 @@ def test_an_existing_folder_and_changed_settings_are_refused(small_run, tmp_path
         train.prepare(small_run, tmp_path / "nothing", resume=True, overwrite=False)
     wide = dataclasses.replace(small_run, model=dataclasses.replace(small_run.model, width=32))
     (folder / "run.toml").write_text(dumps(wide))
-    with pytest.raises(ConfigError, match="a checkpoint of another model"):
+    with pytest.raises(StoreError, match=r"settings, model\.width = 16 \(run\.toml: 32\)"):
         run_inline(wide, folder, resume=True)
     large = dataclasses.replace(small_run, darkroom=dataclasses.replace(small_run.darkroom, horizon=9))
     (folder / "run.toml").write_text(dumps(large))
-    with pytest.raises(ConfigError, match="a checkpoint of another spec"):
+    with pytest.raises(StoreError, match=r"settings, darkroom\.horizon = 8 \(run\.toml: 9\)"):
         run_inline(large, folder, resume=True)
 
 

@@ -42,7 +42,8 @@ def test_the_plan_of_phases_asks_the_method_once_a_phase(small_run: Run, tmp_pat
 
     method = Counting()
     store = Dataset(tmp_path / "dataset")
-    plan = PhasePlan(small_run, Lineage(small_run), store, method)
+    plan = PhasePlan(small_run, Lineage(small_run), method)
+    plan.store = store
     for _ in range(3):
         for phase in plan.phases:
             assert not plan.is_complete(phase)

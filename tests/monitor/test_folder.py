@@ -271,4 +271,7 @@ def test_a_recording_of_a_run_that_goes_on_is_opened_again(tmp_path, monkeypatch
         assert views.watched("run") is first, "only every ten seconds"
         first._opened -= 20.0
         views.refresh()
+        assert views.watched("run") is first, "nothing new"
+        os.utime(path / "metrics.jsonl", (5.0, 5.0))
+        views.refresh()
         assert views.watched("run") is not first

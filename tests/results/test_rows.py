@@ -19,11 +19,11 @@ import pytest
 import icrl_dist
 from icrl_dist import read_results, version
 from icrl_dist.config.run import ConfigError
-from icrl_dist.launch import run_folder
 from icrl_dist.problems import registry
 from icrl_dist.results import evaluate, rows
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.returns import returns
+from icrl_dist.storage import layout
 from icrl_dist.storage.files import StoreError
 from tests.results.row_blocks import block
 
@@ -91,8 +91,8 @@ def test_a_second_evaluation_adds_a_file_and_changes_none(folder, monkeypatch):
 @pytest.mark.parametrize("suite", ["online", "offline", "posterior", "label_quality", "experts"])
 def test_the_run_folder_owns_its_files_and_what_a_kill_leaves(tmp_path, suite):
     name = rows.append(tmp_path, suite, {}, [block(RETURNS)]).name
-    assert run_folder.owned("results", name) and run_folder.owned("results", f".{name}.123.part")
-    assert not run_folder.owned("results", "mine.parquet")
+    assert layout.owned("results", name) and layout.owned("results", f".{name}.123.part")
+    assert not layout.owned("results", "mine.parquet")
 
 
 def test_what_a_kill_leaves_is_not_read(folder):

@@ -50,7 +50,7 @@ def test_reopening_gives_the_appended_trajectories_in_canonical_order(Dataset, t
     dataset.append(trajectories[5:])
     dataset.append(trajectories[:5])
     again = Dataset(tmp_path)
-    assert len(again) == len(trajectories) and not again.repaired
+    assert len(again) == len(trajectories) and not again.damage
     assert [t.identity for t in everything(again)] == [t.identity for t in trajectories]
     for t in trajectories:
         back = again.read(t.identity)
@@ -143,7 +143,7 @@ def test_a_torn_tail_is_cut_off_and_reported(Dataset, tmp_path, trajectories):
     for cut in (len(whole) - 1, begins + 3, begins + HEADER_BYTES + 3):
         path.write_bytes(whole[:cut])
         torn = Dataset(tmp_path)
-        assert torn.repaired == [f"{path.name}: cut off a torn tail of {cut - begins} bytes at byte {begins}"]
+        assert torn.damage == [f"{path.name}: cut off a torn tail of {cut - begins} bytes at byte {begins}"]
         assert len(torn) == len(trajectories) - 1 and trajectories[-1].identity not in torn
         torn.append(trajectories[-1:])
         torn.close()
@@ -169,9 +169,9 @@ def test_any_changed_byte_is_found_and_reported_and_costs_only_its_frame(Dataset
         changed[at] ^= 1 << int(rng.integers(8))
         (folder / "segment-000000.frames").write_bytes(changed)
         unchanged = Dataset(folder, readonly=True)
-        assert segment_of(folder).read_bytes() == changed and not unchanged.repaired
+        assert segment_of(folder).read_bytes() == changed and unchanged.damage
         repaired_dataset = Dataset(folder)
-        assert repaired_dataset.repaired and "segment-000000.frames" in repaired_dataset.repaired[0], at
+        assert repaired_dataset.damage and "segment-000000.frames" in repaired_dataset.damage[0], at
         lost = [r.identity for r in rows if r.identity not in repaired_dataset]
         hit = [r.identity for r in rows if r.offset - HEADER_BYTES <= at < r.offset + r.length]
         assert lost == hit or (not hit and len(lost) in (0, len(lost))), at
@@ -179,7 +179,7 @@ def test_any_changed_byte_is_found_and_reported_and_costs_only_its_frame(Dataset
         repaired_dataset.append([by_identity[i] for i in lost])
         repaired_dataset.close()
         again = Dataset(folder)
-        assert not again.repaired and list(again.index.digests()) == [r.sha256 for r in rows], at
+        assert not again.damage and list(again.index.digests()) == [r.sha256 for r in rows], at
         again.close()
 
 
@@ -194,7 +194,7 @@ def test_a_damaged_name_costs_the_trajectories_that_refer_to_it(Dataset, tmp_pat
     repaired_dataset = Dataset(tmp_path)
     first = [t.identity for t in trajectories if t.variation == trajectories[0].variation]
     assert [t.identity for t in trajectories if t.identity not in repaired_dataset] == first
-    assert "whose names were damaged" in repaired_dataset.repaired[1] and str(len(first)) in repaired_dataset.repaired[1]
+    assert "whose names were damaged" in repaired_dataset.damage[1] and str(len(first)) in repaired_dataset.damage[1]
     repaired_dataset.append([t for t in trajectories if t.identity in first])
     assert [t.identity for t in everything(Dataset(tmp_path))] == [t.identity for t in trajectories]
 
@@ -333,7 +333,7 @@ def test_segments_of_another_run_are_shared_without_unwanted_trajectories(Datase
     assert [t.identity for t in everything(fork)] == [t.identity for t in early]
     assert bytes_shared == manifest[0]["bytes"]
     linked = {f.name: f.samefile(parent.folder / f.name) for f in sorted((tmp_path / "fork").iterdir())}
-    assert linked == {f"segment-{n:06d}.frames": n == 0 for n in (0, 2, 3)}
+    assert linked == {f"segment-{n:06d}.frames": n == 0 for n in (0, 1, 2)}
     fork.append([dataclasses.replace(trajectories[0], identity=Identity("adapt", 0, 0, 0, 0))])
     assert Dataset(parent.folder, readonly=True).manifest() == manifest, "what the fork appends does not change the parent"
     one = parent.folder / "segment-000000.frames"

@@ -211,6 +211,9 @@ def test_a_run_folder_with_pickles_in_every_file_but_the_checkpoint(tmp_path, bo
         (folder / name).write_bytes(code(bomb).encode() if name.endswith(".py") else pickle.dumps(bomb))
     for name in ("version-evil.npz", "version-99999.npz", "version-9999.pkl", "version--001.npz"):
         (folder / "checkpoints" / name).write_bytes(pickle.dumps(bomb))
+    with pytest.raises(ConfigError, match=r"run\.toml'?: cannot be read"):
+        load_agent(folder)
+    (folder / "run.toml").unlink()
     agent = load_agent(folder)
     agent.reset_context(batch=2)
     assert agent.act(np.zeros((2, 2))).shape == (2,)
@@ -255,4 +258,4 @@ def test_a_malicious_dataset(bomb, dataset, what, after_valid):
         return
     with contextlib.closing(dataset):
         assert len(dataset) == (count if after_valid else 0)
-        assert dataset.repaired, "it neither raised an error nor reported a repair"
+        assert dataset.damage, "it neither raised an error nor reported a repair"

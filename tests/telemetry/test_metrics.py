@@ -83,3 +83,14 @@ def test_the_page_is_generated_from_the_list():
 def test_an_invalid_endpoint_is_refused(where):
     with pytest.raises(ConfigError, match=r"learner.prometheus = .*use HOST:PORT, such as 127.0.0.1:9464"):
         parse(f'[learner]\nprometheus = "{where}"', "x")
+
+
+@pytest.mark.parametrize("lines", [0, 1, 900])
+@pytest.mark.parametrize("half", ["", '{"time": 1.0, "stage": "fi', "x" * 9000])
+def test_a_half_last_line_is_cut_off_and_later_rows_have_lines_of_their_own(tmp_path, lines, half):
+    path, whole = tmp_path / "metrics.jsonl", '{"time": 1.0}\n' * lines
+    path.write_text(whole + half)
+    metrics = Metrics(tmp_path, tensorboard=False)
+    metrics.write_text(2.0, 0, "event", what="x")
+    metrics.close()
+    assert path.read_text() == whole + json.dumps({"time": 2.0, "stage": "event", "step": 0, "what": "x"}) + "\n"

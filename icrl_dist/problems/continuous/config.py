@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Interval
+from annotated_types import Ge, Interval, Le
 
 from icrl_dist.config.ranges import NotNegative, Positive, Seed
 from icrl_dist.stream.schema import Remedy
@@ -24,7 +24,7 @@ class ControlConfig:
     """Number of test tasks: other tasks of the grid, or the next tasks of ML1."""
     horizon: NotNegative = 0
     """Steps per episode; 0: the problem's default, 200 in DeepMind Control, 500 in Meta-World."""
-    strength: Annotated[float | str, Ge(0), Remedy("must not be negative, and be finite")] = 1.0
+    strength: Annotated[float | str, Ge(0), Le(1e6), Remedy("must be from 0 to 1e6")] = 1.0
     """Strength of a training adversary: 1 is the largest force of ``forces``, or the full ``disturbance``.
     ``drop:0.25``: the smallest strength at which experts that were trained undisturbed lose a quarter of
     their return, as ``icrl-dist bench disturbance --drop`` measured it."""

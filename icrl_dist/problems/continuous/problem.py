@@ -11,7 +11,7 @@ import numpy as np
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.config.toml import ConfigError
 from icrl_dist.experts.payloads import ExpertHistories, ExpertLabelling
-from icrl_dist.interfaces import Batch, Contexts, MakePolicy, Policy, Problem, Reference
+from icrl_dist.interfaces import Batch, Contexts, Limits, MakePolicy, Policy, Problem, Reference
 from icrl_dist.problems.continuous import calibrated_strength
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.continuous.network_adversary import network, networks
@@ -33,12 +33,19 @@ class ContinuousProblem(Problem):
     Labelling = ExpertLabelling
     free_in_forks = ("strength", "solved")
     agent_names: ClassVar[Mapping[str, str]] = {EXPERT: "SAC expert", SCRIPTED: "scripted expert"}
+    rewards: ClassVar[tuple[float, float]] = (0.0, 1.0)
+    """Smallest and largest reward of a step."""
     config: ControlConfig
 
     @property
     @abc.abstractmethod
     def disturbances(self) -> int:
         """Components of the adversary's action."""
+
+    @property
+    def limits(self) -> Limits:
+        """Simulated velocities and forces exceed the usual range that the spec states."""
+        return Limits(self.rewards, slack=100.0, disturbances=self.disturbances)
 
     @property
     def strength(self) -> float:

@@ -15,9 +15,9 @@ from icrl_dist.stream.schema import Remedy
 class DarkRoomConfig:
     """The rooms, their split, and their labels (appendix C.1)."""
 
-    size: Annotated[int, Ge(2), Remedy("a room has at least 2 cells a side")] = 10
+    size: Annotated[int, Ge(2), Le(1000), Remedy("a room has 2 to 1000 cells a side")] = 10
     """Side of the square room, in cells."""
-    horizon: Annotated[int, Ge(1), Remedy("an episode has at least 1 step")] = 100
+    horizon: Annotated[int, Ge(1), Le(10**6), Remedy("an episode has 1 to 1000000 steps")] = 100
     """Steps per episode, H."""
     train_fraction: Annotated[float, Gt(0), Lt(1), Remedy("use a share between 0 and 1")] = 0.8
     """Share of the goals that are training tasks; the other goals are test tasks."""

@@ -17,7 +17,7 @@ from icrl_dist.problems.darkroom.exact_agents import OptimalAgent
 from icrl_dist.problems.darkroom.room import DarkRoom, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, soft_labels
 from icrl_dist.rollout.episode import episode
-from icrl_dist.types import Identity, Job, Variation
+from icrl_dist.types import Identity, Job, LabelCounts, Variation
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,12 @@ class RoomLabelling:
     """Share of the windows in which the optimal policy of another goal acts."""
     decoys: tuple[int, ...]
     """Cell numbers of the goals that decoys may have."""
+
+    @property
+    def label_counts(self) -> LabelCounts:
+        """The labels of each trajectory."""
+        steps = self.windows * self.window
+        return LabelCounts(self.queries + steps, steps, "heuristic" if self.labels == "heuristic" else "optimal")
 
 
 NO_WINDOWS = np.zeros(0, np.int16), np.zeros(0, np.float32)

@@ -18,6 +18,7 @@ from icrl_dist.interfaces import (
     BeliefReader,
     Contexts,
     Labeller,
+    Limits,
     MakeDrawing,
     MakePolicy,
     Policy,
@@ -98,6 +99,10 @@ class DarkRoomProblem(Problem):
 
     def spec_of(self, task: Task) -> Spec:
         return room.spec(task)
+
+    @property
+    def limits(self) -> Limits:
+        return Limits(reward=(0.0, 1.0))
 
     @property
     def horizon(self) -> int:

@@ -35,6 +35,7 @@ class MetaWorldProblem(ContinuousProblem):
     """The agent must carry an object to a hidden goal; an adversary disturbs the observation."""
 
     template: ClassVar[str] = ""
+    rewards: ClassVar[tuple[float, float]] = (-1.0, 11.0)  # shaped, between 0 and 10
     libraries: ClassVar[tuple[str, ...]] = ("metaworld", "mujoco")
     job_kinds: ClassVar[Mapping[str, JobKind]] = {ScriptedContexts.kind: JobKind(ScriptedContexts, _scripted_context)}
 
