@@ -81,13 +81,17 @@ def state(run: ListedRun) -> str:
     """``training``, ``evaluating``, ``starting``, ``finished``, ``interrupted`` or ``failed``."""
     if run.live:
         return "training"
-    rows = list(metric_rows.read(run.folder, _TAIL_BYTES))
-    ends = [row["what"] for row in rows if row.get("what") in _ENDS]
+    newest = ""  # how the run ended, or ``training`` if it went on after that
+    for row in metric_rows.read(run.folder, _TAIL_BYTES):
+        if row.get("what") in _ENDS:
+            newest = str(row["what"])
+        elif row["stage"] == "ingest" or row["stage"].startswith("fit/"):
+            newest = "training"
     if not run.held:
-        return str(ends[-1]) if ends else "interrupted"
-    if rows and rows[-1].get("what") not in _ENDS:
-        return "training"  # in one process, which no view can connect to
-    return "evaluating" if ends and ends[-1] == "finished" else "starting"
+        return newest if newest in _ENDS else "interrupted"
+    if newest == "finished":
+        return "evaluating"
+    return "training" if newest == "training" else "starting"  # training in one process, to which no view can connect
 
 
 class RunList:

@@ -157,7 +157,7 @@ def test_sorting_filters_and_the_dialog_of_a_variation(page):
         last.focus()
         page.keyboard.press("Enter")
         expect_cells(page, 4, ["6", "5", "5", "4", "4", "3"])
-        expect(page, "th[aria-sort=descending]").to_have_text("Last")
+        expect(page, "#variation-table th[aria-sort=descending]").to_have_text("Last")
         last.click()
         expect_cells(page, 4, ["3", "4", "4", "5", "5", "6"])
         page.get_by_label("Adversary").select_option("uniform")

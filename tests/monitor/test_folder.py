@@ -18,6 +18,7 @@ from icrl_dist.monitor.run_list import RunList, find, state
 from icrl_dist.storage.files import hold
 from tests.monitor.fake_feed import FakeFeed, run_folder
 from tests.monitor.test_serve import PageClient, ViewerClient, wait_for
+from tests.optional import known
 
 
 @pytest.fixture(autouse=True)
@@ -83,10 +84,13 @@ def test_the_state_of_a_run_is_read_from_its_files(tmp_path):
     assert state(find(tmp_path)[0]) == "finished"
     with hold(path):
         assert state(find(tmp_path)[0]) == "evaluating"
+        with (path / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps({"time": 1e9, "stage": "heldout", "step": 2, "share": 0.5}) + "\n")
+        assert state(find(tmp_path)[0]) == "evaluating", "the evaluation writes rows too"
         rows = (path / "metrics.jsonl").read_text()
         (path / "metrics.jsonl").write_text("")
         assert state(find(tmp_path)[0]) == "starting"
-        (path / "metrics.jsonl").write_text(rows.rpartition('{"time"')[0])
+        (path / "metrics.jsonl").write_text("".join(row for row in rows.splitlines(True) if "finished" not in row))
         assert state(find(tmp_path)[0]) == "training", "in one process, so there is no endpoint"
     assert state(find(tmp_path)[0]) == "interrupted"
 
@@ -266,7 +270,7 @@ def test_a_recording_of_a_run_that_goes_on_is_opened_again(tmp_path, monkeypatch
     path = begun(tmp_path / "run", 1.0)
     with hold(path), contextlib.closing(FolderViews(tmp_path, open_feed)) as views:
         first = views.watched("run")
-        wait_for(lambda: first._feed.replay()["at"] == first._feed.replay()["end"])
+        wait_for(lambda: known(first._feed.replay())["at"] == known(first._feed.replay())["end"])
         views.refresh()
         assert views.watched("run") is first, "only every ten seconds"
         first._opened -= 20.0

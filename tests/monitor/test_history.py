@@ -58,10 +58,9 @@ def test_a_snapshot_has_the_history_when_it_has_changed():
 def test_a_view_that_joins_late_has_hours_without_gaps():
     """Progress before the last 15 minutes arrives at larger distances, which are no gaps; a pause is one."""
     hour = 3600
-    rows = [{"time": float(t), "stage": "ingest"} for t in range(5 * hour) if not 2 * hour < t < 3 * hour]
-    late = [row for row in rows if row["time"] >= 5 * hour - 900]
-    kept = [*past._thinned(rows[: len(rows) - len(late)], past._MAX_OLDER), *late]
-    times = [row["time"] for row in kept]
+    rows = [{"time": t} for t in range(5 * hour) if not 2 * hour < t < 3 * hour]
+    kept = [*past._thinned(rows[:-900], past._MAX_OLDER), *rows[-900:]]
+    times = [float(row["time"]) for row in kept]
     sent = [(t, "icrl/demo/mon/learner", messages.progress(time=t, trajectories=int(10 * t))) for t in times]
     state = RunState("demo")
     play(state, sent, partial=True, apart_s=past.apart_s(times))
