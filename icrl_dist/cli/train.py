@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK
-from icrl_dist.config.run import Run, override, run_type
+from icrl_dist.config.run import Run, load_folder, override, run_type
 
 if TYPE_CHECKING:
     from icrl_dist.results.reports import Evaluation
@@ -109,7 +109,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
         if run is None or isinstance(cause, OSError) or not resuming.holds(run, out):
             raise
         raise TrainFailed(f"{cause}; `{command}` continues the run") from error
-    _print_evaluation(made.evaluation, console)
+    _print_evaluation(made.evaluation, load_folder(made.folder), console)
     return _show_result(made.result, made.folder, arguments.json, console)
 
 
@@ -130,14 +130,15 @@ def _show_result(result: dict[str, Any], folder: Path, as_json: bool, console: C
     return FAILED if result["quarantined"] else OK
 
 
-def _print_evaluation(evaluation: Evaluation, console: Console) -> None:
-    """The held-out returns in four rows with a conclusion; everything about experts."""
+def _print_evaluation(evaluation: Evaluation, run: Run, console: Console) -> None:
+    """The returns of the evaluated tasks in four rows with a conclusion; everything about experts."""
+    from icrl_dist.problems import registry
     from icrl_dist.results import conclusion
 
     if set(evaluation.rows["suite"]) != {"online"}:
         console.print(evaluation)
         return
-    console.print(conclusion.table(evaluation.rows, "Held-out tasks"))
+    console.print(conclusion.table(evaluation.rows, registry.of(run).title))
     for line in (conclusion.sentence(evaluation.rows), *evaluation.notes):
         console.print(line, highlight=False, markup=False)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 _WORDS = {"higher": "a gain", "lower": "a loss", "not shown": "a gain is not shown"}
 
 
-def table(frame: pd.DataFrame, title: str) -> Table:
+def table(frame: pd.DataFrame, title: Callable[[int], str]) -> Table:
     """The newest model, T^0, the random policy and what returns are a share of, at the largest p; missing ones have no row.
 
-    ``frame``: result rows of the suite ``online``; ``title``: names the tasks.  The table fits into 80 columns.
+    ``frame``: result rows of the suite ``online``; ``title``: names so many tasks.  The table fits into 80 columns.
     """
     found = _chosen(frame)
     every = returns(frame)
@@ -28,7 +28,7 @@ def table(frame: pd.DataFrame, title: str) -> Table:
     estimates, best = summaries.intervals(every, episodes), summaries.ceilings(every, episodes)
     trainings, tasks, evaluations, _ = found[0].returns.shape
     shown = Table(
-        title=f"{title}, p = {found[0].p:g}: mean return of the last {episodes} episodes",
+        title=f"{title(tasks)}, p = {found[0].p:g}: mean return of the last {episodes} episodes",
         title_justify="left",
         caption=statistics.resampled(trainings, tasks, evaluations, episodes),
         caption_justify="left",

@@ -27,7 +27,7 @@ def test_the_table_has_four_rows_and_the_sentence_the_words_of_a_comparison(gain
     rows = agents(gain, p=0.0) + agents(gain)
     rows[5] = block(NOISE + 5 + gain + noise * RNG.normal(size=NOISE.shape), "t2", 0.2)
     found = frame(*rows)
-    header, body = cells_of(rendered(conclusion.table(found, "Held-out tasks")))
+    header, body = cells_of(rendered(conclusion.table(found, "{} held-out tasks".format)))
     assert header == ["agent", "return", "95%", "of oracle"]
     assert [row[0] for row in body] == ["T^2 (dpt)", "T^0", "random", "oracle"] and all(".." in row[2] for row in body)
     text = conclusion.sentence(found)
@@ -42,14 +42,14 @@ def test_several_trainings_speak_for_themselves():
 
 def test_a_run_without_adapted_versions_is_compared_with_the_random_policy():
     found = frame(block(NOISE + 5, "t0", 0.2), block(NOISE + 1, "random", 0.2))
-    _, body = cells_of(rendered(conclusion.table(found, "Held-out tasks")))
+    _, body = cells_of(rendered(conclusion.table(found, "{} held-out tasks".format)))
     assert [row[0] for row in body] == ["T^0 (dpt)", "random"]
     assert conclusion.sentence(found).startswith("T^0 compared with random at p = 0.2: a gain, +4.00")
 
 
 def test_a_single_evaluation_has_no_interval_and_shows_nothing():
     found = frame(block([[[1.0]]], "t1", 0.2), block([[[0.0]]], "t0", 0.2))
-    _, body = cells_of(rendered(conclusion.table(found, "Held-out tasks")))
+    _, body = cells_of(rendered(conclusion.table(found, "{} held-out tasks".format)))
     assert [row[2] for row in body] == ["-", "-"]
     assert "a gain is not shown, +1.00, in this training" in conclusion.sentence(found)
 
@@ -63,7 +63,7 @@ def test_the_model_counts_by_its_own_rule():
 @pytest.mark.parametrize("width", [80, 200])
 def test_the_table_fits_into_80_columns(width):
     output = io.StringIO()
-    Console(file=output, width=width).print(conclusion.table(frame(*agents(1000.0)), "Held-out tasks"))
+    Console(file=output, width=width).print(conclusion.table(frame(*agents(1000.0)), "{} held-out tasks".format))
     assert all(len(line.rstrip()) <= 80 for line in output.getvalue().splitlines()[2:]) and "…" not in output.getvalue()
 
 

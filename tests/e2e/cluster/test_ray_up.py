@@ -122,15 +122,16 @@ class TestJobs:
         """Both workers are disconnected in the middle of a round, so that the run cannot continue without them."""
         words = jobs.job("submit", "--submission-id", "stopped", "--", *jobs.train("stopped").split())
         with underway(tmp_path, words) as (process, printed):
-            wait_for(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "workers")
+            wait_for(lambda: jobs.stored("stopped") or process.poll() is not None, "trajectories")
             with jobs.suspended():
                 subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=250)
                 process.wait(timeout=200)
             assert re.search(r"interrupted; `icrl-dist train smoke --resume .*` continues", printed()), printed()
             assert "was stopped" in printed(), printed()
         assert not jobs.head.processes("learner") and not jobs.head.processes("icrl-dist train")
+        before = jobs.stored("stopped")
         with underway(tmp_path, jobs.exec(jobs.train("stopped", "--resume"))) as (process, printed):
-            wait_for(lambda: "adapt/0" in printed() or process.poll() is not None, "a round")
+            wait_for(lambda: jobs.stored("stopped") > before or process.poll() is not None, "more trajectories")
             with contextlib.ExitStack() as cut:
                 with jobs.suspended():
                     cut.enter_context(jobs.cut_off())
