@@ -56,7 +56,7 @@ def test_a_fault_lands_and_changes_no_digest(capsys, reference, tmp_path, fault)
 
 def test_a_fault_that_does_not_land_fails_the_command(capsys, reference, tmp_path, monkeypatch):
     draw = schedule.draw
-    late = lambda *drawn: dataclasses.replace(draw(*drawn), phase=1, fit=True, after=10**6)  # noqa: E731
+    late = lambda *drawn: dataclasses.replace(draw(*drawn), phase=2, fit=True, after=10**6)  # noqa: E731
     monkeypatch.setattr(schedule, "draw", late)
     monkeypatch.setattr(campaign, "TRIES", 1)
     code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", "kill-worker")
