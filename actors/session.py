@@ -210,36 +210,29 @@ def _final(error: BaseException) -> bool:
 
 
 @contextlib.contextmanager
-def _on_loopback(ray: Any) -> Iterator[None]:
+def _replaced(module: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
+    """Another function in a module of Ray."""
+    before = getattr(module, name)
+    setattr(module, name, function)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
+
+
+def _on_loopback(ray: Any) -> contextlib.AbstractContextManager[None]:
     """Let Ray listen on 127.0.0.1: ``ray.init`` replaces that by an address of the network, and listens on every address."""
-    services = ray._private.services
-    before, services.resolve_ip_for_localhost = services.resolve_ip_for_localhost, lambda host: host
-    try:
-        yield
-    finally:
-        services.resolve_ip_for_localhost = before
+    return _replaced(ray._private.services, "resolve_ip_for_localhost", lambda host: host)
 
 
-@contextlib.contextmanager
-def _silent(ray: Any) -> Iterator[None]:
+def _silent(ray: Any) -> contextlib.AbstractContextManager[None]:
     """Keep a thread of Ray from printing the log of a process that has ended."""
-    worker = ray._private.worker
-    before, worker.print_to_stdstream = worker.print_to_stdstream, lambda data, **_: _log.info("%s", data)
-    try:
-        yield
-    finally:
-        worker.print_to_stdstream = before
+    return _replaced(ray._private.worker, "print_to_stdstream", lambda data, **_: _log.info("%s", data))
 
 
-@contextlib.contextmanager
-def sigterm_unchanged(ray: Any) -> Iterator[None]:
+def sigterm_unchanged(ray: Any) -> contextlib.AbstractContextManager[None]:
     """Keep Ray from replacing the handler of SIGTERM: its own ends the process in the middle of native code, which aborts."""
-    utils = ray._private.utils
-    before, utils.set_sigterm_handler = utils.set_sigterm_handler, lambda handler: None
-    try:
-        yield
-    finally:
-        utils.set_sigterm_handler = before
+    return _replaced(ray._private.utils, "set_sigterm_handler", lambda handler: None)
 
 
 def _new_folder() -> tuple[Path, IO[bytes]]:
