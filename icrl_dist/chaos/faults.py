@@ -118,12 +118,11 @@ def flip_checkpoint(training: Training, strike: Strike, disk_bytes: int) -> Stru
     versions = sorted((training.view / "checkpoints").glob("version-*.npz"))
     if not versions:
         raise Missed("there was no checkpoint yet")
-    path, content = versions[-1], bytearray(versions[-1].read_bytes())
-    place = int(strike.place * len(content))
-    content[place] ^= 1 << strike.worker % 8
-    path.write_bytes(content)
+    path, size = versions[-1], versions[-1].stat().st_size
+    place = int(strike.place * size)
+    _change_bit(path, place, strike)
     again, result = f"T^{len(versions) - 1} is fitted again", resume(training)
-    change = f"{path.name}: a bit of byte {place} of {len(content)} changed"
+    change = f"{path.name}: a bit of byte {place} of {size} changed"
     return Struck(where, again in training.output, f"{change}; {again}: {again in training.output}", result)
 
 
@@ -151,13 +150,18 @@ def _flip(training: Training, strike: Strike) -> tuple[str, Path]:
         found.frames[0][0] - segment.HEADER_BYTES if strike.variant else 0
     )  # during a run only the trajectories are read again
     place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.variant else 0) - first))
+    _change_bit(path, place, strike)
+    lost = len(found.frames) - _readable(path)
+    return f"{path.name}: byte {place} of {found.size} changed, which costs {lost} of {len(found.frames)} trajectories", path
+
+
+def _change_bit(path: Path, place: int, strike: Strike) -> None:
+    """Change one bit of the byte at ``place``."""
     with path.open("r+b") as file:
         file.seek(place)
         (byte,) = file.read(1)
         file.seek(place)
         file.write(bytes([byte ^ 1 << strike.worker % 8]))
-    lost = len(found.frames) - _readable(path)
-    return f"{path.name}: byte {place} of {found.size} changed, which costs {lost} of {len(found.frames)} trajectories", path
 
 
 def _readable(path: Path) -> int:
