@@ -54,10 +54,10 @@ def sentence(frame: pd.DataFrame) -> str:
     name = newest.name.partition(" (")[0]
     low, high = effect.effect.low, effect.effect.high
     numbers = f"{effect.effect.value:+.2f}" + ("" if math.isnan(low) else f" (95% interval {low:+.2f} .. {high:+.2f})")
-    told = f"{name} compared with {others[0].name} at p = {newest.p:g}: {_WORDS[effect.verdict]}, {numbers}"
+    text = f"{name} compared with {others[0].name} at p = {newest.p:g}: {_WORDS[effect.verdict]}, {numbers}"
     if len(newest.training_seeds) > 1:
-        return told
-    return f"{told}, in this training; one training seed says nothing about other seeds"
+        return text
+    return f"{text}, in this training; one training seed says nothing about other seeds"
 
 
 def _chosen(frame: pd.DataFrame) -> list[Returns]:
