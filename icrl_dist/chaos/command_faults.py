@@ -12,7 +12,7 @@ import psutil
 from icrl_dist.chaos.schedule import Strike
 from icrl_dist.chaos.striking import Missed, Struck, reach, resume
 from icrl_dist.chaos.training import Training, TrainingFailed, gone
-from learner.checkpoints import PARTIAL
+from icrl_dist.storage.checkpoint import partial_file
 
 STRANGERS = 1500
 """Connections of a flood; the learner admits fewer."""
@@ -91,7 +91,7 @@ def kill_run(training: Training, strike: Strike, disk_bytes: int) -> Struck:
 
 
 def _partial(training: Training) -> bool:
-    return (training.view / "checkpoints" / PARTIAL).exists()
+    return partial_file(training.view).exists()
 
 
 def kill_raylet(training: Training, strike: Strike, disk_bytes: int) -> Struck:
