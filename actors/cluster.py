@@ -271,6 +271,7 @@ def connection_problems(facts: dict[str, Any]) -> str:
 
 
 def brief(error: BaseException) -> str:
-    """The last line of an error's message."""
+    """The last line of an error's message; of the end of a worker only how it ended, without Ray's advice."""
     lines = [line for line in str(error).splitlines() if line.strip()]
-    return lines[-1].strip()[:200] if lines else type(error).__name__
+    last = lines[-1].rpartition("Worker exit detail: ")[2].partition(" Some common causes")[0].strip() if lines else ""
+    return last[:200] or type(error).__name__

@@ -18,7 +18,7 @@ from actors.cluster import Cluster, brief
 from actors.placement import EndedWorker, Node, Placement, check_cores
 from actors.ray_actor import WorkerActor
 from actors.running_time import RunningTime
-from actors.session import Session, SessionFailed
+from actors.session import Session, SessionFailed, sigterm_unchanged
 from icrl_dist.config.run import ConfigError
 from icrl_dist.diagnostics import ray_job
 from icrl_dist.diagnostics.ray_address import require_cluster
@@ -370,6 +370,7 @@ def _connect(ray: Any, address: str) -> None:
     """Connect to the cluster at ``address``.  Raises ConfigError if there is none."""
     require_cluster(address)
     try:
-        ray.init(address=address, job_config=ray_job.job_config(ray), log_to_driver=False, logging_level=logging.ERROR)
+        with sigterm_unchanged(ray):
+            ray.init(address=address, job_config=ray_job.job_config(ray), log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(f"--address {address}: {brief(error)}; `ray status` there shows whether a cluster is up") from None

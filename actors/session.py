@@ -10,7 +10,6 @@ import contextlib
 import logging
 import os
 import shutil
-import signal
 import tempfile
 import threading
 import time
@@ -80,7 +79,7 @@ class Session:
         for number in range(1, TRIES + 1):
             try:
                 self._folder, self._lock = _new_folder()
-                with _on_loopback(self._ray), _sigterm_unchanged():
+                with _on_loopback(self._ray), sigterm_unchanged(self._ray):
                     self._ray.init(
                         address="local",
                         job_config=ray_job.job_config(self._ray),
@@ -91,15 +90,12 @@ class Session:
                         logging_level=logging.ERROR,
                         **self._options,
                     )
-            except (Exception, SystemExit) as error:  # Ray raises no specific type
-                terminated = isinstance(error, SystemExit)  # raised by the handler of SIGTERM that Ray sets while it starts
-                last = not terminated and (_final(error) or number == TRIES)
+            except Exception as error:  # Ray raises no specific type
+                last = _final(error) or number == TRIES
                 logs = self._end(keep_logs=last and not self._stopped())
-                if terminated:
-                    signal.raise_signal(signal.SIGTERM)
                 cause = str(error).splitlines()[0] if str(error) else type(error).__name__
                 text = f"Ray did not start on this machine ({cause})"
-                if last or terminated or self._stopped():
+                if last or self._stopped():
                     where = f"its logs are in {logs}" if logs else "`icrl-dist doctor` checks this machine"
                     times = "once" if number == 1 else f"{number} times"
                     raise SessionFailed(f"{text}, tried {times}; {where}") from error
@@ -214,36 +210,29 @@ def _final(error: BaseException) -> bool:
 
 
 @contextlib.contextmanager
-def _on_loopback(ray: Any) -> Iterator[None]:
+def _replaced(module: Any, name: str, function: Callable[..., Any]) -> Iterator[None]:
+    """Another function in a module of Ray."""
+    before = getattr(module, name)
+    setattr(module, name, function)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
+
+
+def _on_loopback(ray: Any) -> contextlib.AbstractContextManager[None]:
     """Let Ray listen on 127.0.0.1: ``ray.init`` replaces that by an address of the network, and listens on every address."""
-    services = ray._private.services
-    before, services.resolve_ip_for_localhost = services.resolve_ip_for_localhost, lambda host: host
-    try:
-        yield
-    finally:
-        services.resolve_ip_for_localhost = before
+    return _replaced(ray._private.services, "resolve_ip_for_localhost", lambda host: host)
 
 
-@contextlib.contextmanager
-def _silent(ray: Any) -> Iterator[None]:
+def _silent(ray: Any) -> contextlib.AbstractContextManager[None]:
     """Keep a thread of Ray from printing the log of a process that has ended."""
-    worker = ray._private.worker
-    before, worker.print_to_stdstream = worker.print_to_stdstream, lambda data, **_: _log.info("%s", data)
-    try:
-        yield
-    finally:
-        worker.print_to_stdstream = before
+    return _replaced(ray._private.worker, "print_to_stdstream", lambda data, **_: _log.info("%s", data))
 
 
-@contextlib.contextmanager
-def _sigterm_unchanged() -> Iterator[None]:
-    """Set the handler of SIGTERM again, which Ray replaces."""
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread() and before is not None:
-            signal.signal(signal.SIGTERM, before)
+def sigterm_unchanged(ray: Any) -> contextlib.AbstractContextManager[None]:
+    """Keep Ray from replacing the handler of SIGTERM: its own ends the process in the middle of native code, which aborts."""
+    return _replaced(ray._private.utils, "set_sigterm_handler", lambda handler: None)
 
 
 def _new_folder() -> tuple[Path, IO[bytes]]:

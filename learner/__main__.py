@@ -31,7 +31,7 @@ from icrl_dist.stream import security
 from icrl_dist.stream.credit import REQUEST_BYTES
 from icrl_dist.stream.link import LinkError
 from icrl_dist.stream.zenoh_link import ZenohLink
-from icrl_dist.telemetry.budget import log_to
+from icrl_dist.telemetry.logs import log_to
 from learner.service import Interrupted, RunFailed, Service
 
 DONE, FAILED, BAD_CONFIG, INTERRUPTED = 0, 1, 2, 130
@@ -49,7 +49,7 @@ def main() -> int:
         "--driver", type=int, default=os.getppid(), help="process that the learner ends with; default: its parent"
     )
     arguments = parser.parse_args()
-    log_to(str(arguments.folder / "learner.log"))
+    log_to(arguments.folder / "learner.log")
     os.set_inheritable(arguments.events, False)
     report = _Events(arguments.events)
     try:

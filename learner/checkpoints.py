@@ -22,9 +22,6 @@ from icrl_dist.telemetry import provenance
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.types import Spec, Weights
 
-PARTIAL = "partial.npz"
-"""File name of the checkpoint of a fit that is not finished."""
-
 
 def manifest(run: Run, spec: Spec, version: int, threads: int, device: str = "cpu") -> dict[str, Any]:
     """The manifest of a checkpoint: what its deployment needs, and its origin.

@@ -15,6 +15,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw, Method, Phase
 from icrl_dist.models.weights import weights_of
 from icrl_dist.storage import checkpoint
+from icrl_dist.storage.checkpoint import partial_file
 from icrl_dist.training import fit
 from icrl_dist.types import Spec, Weights
 from learner import checkpoints
@@ -54,7 +55,7 @@ class Fitting:
         """Builds an untrained model; ``load`` loads the newest checkpoint of ``folder``.
 
         ``threads``: CPU threads of fits; ``intact``: the manifests of the versions whose checkpoints can be used;
-        ``note`` is told of an unfinished fit that cannot be continued.
+        ``note`` gets a line about an unfinished fit that cannot be continued.
         """
         self._run, self._folder, self._spec, self._threads = run, folder, spec, threads
         self._intact = intact
@@ -64,7 +65,7 @@ class Fitting:
         """``cpu``, or the name of the GPU."""
         self.method = method
         """The method whose loss a fit minimizes."""
-        self._partial = folder / "checkpoints" / checkpoints.PARTIAL
+        self._partial = partial_file(folder)
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self._model = method.build(spec, run).to(device)
@@ -73,6 +74,11 @@ class Fitting:
         self._first_loss = math.nan
         self.version = -1
         """The newest policy version that was fitted or loaded; -1 before the first."""
+
+    @property
+    def steps_done(self) -> int:
+        """Optimizer steps of the next version that are done."""
+        return self._steps_done
 
     def load(self) -> Weights | None:
         """Load the newest version that follows the present one without a gap, and the unfinished fit of the next one.

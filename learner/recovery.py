@@ -26,7 +26,7 @@ Note = Callable[[str], None]
 
 
 def intact(folder: Path, run: Run, lineage: Lineage, last: int, note: Note) -> dict[int, Mapping[str, Any]]:
-    """The manifests of the versions whose checkpoints can be used; ``note`` is told of each that must be fitted again.
+    """The manifests of the versions whose checkpoints can be used; ``note`` gets a line about each that must be fitted again.
 
     ``last``: the last version of the run.  Raises StoreError for a checkpoint of another run, and for one that this run
     cannot fit again because another run did.

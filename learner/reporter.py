@@ -29,8 +29,10 @@ _DESCRIPTION_S = 2.0
 """Seconds between two descriptions of the run; they repeat for viewers that connect later."""
 _MAX_ALERTS = 200
 """Number of active alerts in a description."""
-_INGEST_S = 1.0
-"""Seconds between two rows of ingest metrics."""
+_INGEST_S, _MAX_INGEST_S = 1.0, 60.0
+"""Least and largest number of seconds between two rows of ingest metrics."""
+_INGEST_ROWS = 3600
+"""Rows of ingest metrics in the first hour; later rows are this share of the run's time apart, so that the file stays small."""
 
 
 class Reporter:
@@ -53,7 +55,7 @@ class Reporter:
         self._lock = threading.Lock()
         self._description: dict[str, Any] = {}
         self._version = version
-        self._last_sent = dict.fromkeys(("progress", "description", "ingest"), float("-inf"))
+        self._last_sent = dict.fromkeys(("progress", "description", "ingest", "served"), float("-inf"))
         self._rows: deque[tuple[float, str, dict[str, Any]]] = deque()
         """Rows (Unix time, stage, fields) for the metrics file, which only the thread of the run writes."""
 
@@ -122,15 +124,21 @@ class Reporter:
         self._publish("learner", "learner", **fields)
         if self._description and self._due("description", _DESCRIPTION_S):
             self._publish("run", "run", **self._description, alerts=self._active_alerts())
-        if fields["stage"] == "collect" and (self._due("ingest", _INGEST_S) or force):
-            self._write_ingest(fields, totals)
+        if fields["stage"] == "collect":
+            keep = self._due("ingest", self._ingest_period()) or force
+            if self._due("served", _INGEST_S) or keep:
+                self._write_ingest(fields, totals, keep)
         self._check_alerts(fields, totals)
         self.flush()
 
-    def _write_ingest(self, fields: dict[str, Any], totals: Mapping[str, Any]) -> None:
+    def _ingest_period(self) -> float:
+        return min(_MAX_INGEST_S, max(_INGEST_S, (time.time() - self._began) / _INGEST_ROWS))
+
+    def _write_ingest(self, fields: dict[str, Any], totals: Mapping[str, Any], keep: bool) -> None:
         self._metrics.write(
-            fields["version"] + 1,
+            0 if fields["phase"] == "pretrain" else fields["round"] + 1,
             "ingest",
+            keep=keep,
             trajectories=fields["trajectories"],
             arrived=fields["step"],
             episodes=totals["episodes"],

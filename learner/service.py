@@ -287,7 +287,7 @@ class Service:
                 f"{phase.stage}/{phase.round}: no trajectory was stored, and {len(causes)} of its variations are "
                 f"quarantined; first: {next(iter(causes.values()))}"
             )
-        self._metrics.write(self.version + 1, "collect", trajectories=arrived, per_s=per_s, leases=leases)
+        self._metrics.write(phase.next_version, "collect", trajectories=arrived, per_s=per_s, leases=leases)
         if phase.next_version > self.version:
             rated = self._method.label_quality(self._run, phase, self.store)
             quality = training_rows.rate_labels(self._run, self._folder, phase, rated, self._note)
@@ -296,6 +296,7 @@ class Service:
 
     def _fit(self, phase: Phase) -> None:
         """Fit the model to the data of a phase, write its checkpoint and publish its weights."""
+        self._metrics.continue_from(self.version, self._fitting.steps_done)
         draw = self._method.data(self._run, phase, self.store) if phase.steps else None
         began = time.monotonic()
 

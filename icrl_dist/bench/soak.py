@@ -22,6 +22,7 @@ import psutil
 
 from icrl_dist.bench.training import need_alive, training
 from icrl_dist.config.run import ConfigError
+from icrl_dist.telemetry import metric_rows
 from icrl_dist.telemetry.processes import is_learner, is_worker
 
 _SETTINGS = ("--icaa.rounds", "100000", "--icaa.steps", "10", "--learner.cache-mb", "4", "--icaa.trials", "20")
@@ -100,13 +101,11 @@ def _wait_for_weights(process: subprocess.Popen[str], folder: Path, timeout_s: f
 def _progress(folder: Path) -> str:
     """The run's progress from its metrics: trajectories and the latest policy version, as JSON."""
     trajectories, version = 0, -1
-    with contextlib.suppress(FileNotFoundError):
-        for line in (folder / "metrics.jsonl").read_text().splitlines():
-            row = json.loads(line)
-            if row["stage"] == "collect":
-                trajectories += row["trajectories"]
-            elif row["stage"] == "version":
-                version = row["step"]
+    for row in metric_rows.read(folder):
+        if row["stage"] == "collect":
+            trajectories += row["trajectories"]
+        elif row["stage"] == "version":
+            version = row["step"]
     return json.dumps({"trajectories": trajectories, "version": version})
 
 

@@ -15,8 +15,9 @@ from rich.console import Console
 
 from icrl_dist.chaos import schedule
 from icrl_dist.chaos.disk import NoDisk
-from icrl_dist.chaos.faults import FAULTS, Missed
+from icrl_dist.chaos.faults import FAULTS
 from icrl_dist.chaos.outcome import SAME, Outcome, ReferenceRun, summary, table, verdict
+from icrl_dist.chaos.striking import Missed
 from icrl_dist.chaos.training import Training, TrainingFailed
 from icrl_dist.config.run import ConfigError, load, override, validate
 from icrl_dist.launch import run_folder

@@ -4,50 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
-import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import psutil
 
+from icrl_dist.chaos.command_faults import STOP_S, hang_up, kill_gcs, kill_raylet, kill_run, stop_run, strangers
 from icrl_dist.chaos.disk import PAGE, Disk
 from icrl_dist.chaos.proxy import Proxy
 from icrl_dist.chaos.schedule import Strike
+from icrl_dist.chaos.striking import Missed, Struck, kill_all, learner_of, reach, resume
 from icrl_dist.chaos.training import Training, TrainingFailed, gone
 from icrl_dist.storage import segment
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import endpoints
 
-STRANGERS = 1500
-"""Connections of a flood; the learner admits fewer."""
-STOP_S, CUT_S = 15.0, 12.0
-"""Durations of a stopped learner and of a cut link, longer than ``stream.reply_timeout_s``."""
-
-
-@dataclass(frozen=True)
-class Struck:
-    """The effect of a fault."""
-
-    where: str
-    """The run's progress when it struck."""
-    landed: bool
-    evidence: str
-    result: dict[str, Any]
-    """The run's ``result.json``."""
-
-
-class Missed(Exception):  # noqa: N818
-    """The strike found nothing to hit; the message says why."""
+CUT_S = 12.0
+"""Seconds for which a link is cut, longer than ``stream.reply_timeout_s``."""
 
 
 def kill_worker(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """SIGKILL of a random worker, which is replaced."""
     training.start()
-    where = _reach(training, strike)
+    where = reach(training, strike)
     workers = training.workers()
     if not workers:
         raise Missed("there was no worker")
@@ -61,8 +41,8 @@ def kill_worker(training: Training, strike: Strike, disk_bytes: int) -> Struck:
 def kill_learner(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """SIGKILL of the learner during collection or a fit; it restarts from its checkpoint and its dataset."""
     training.start()
-    where = _reach(training, strike)
-    victim = _learner(training)
+    where = reach(training, strike)
+    victim = learner_of(training)
     victim.kill()
     result = training.result()
     deaths = result["learner_deaths"]
@@ -71,16 +51,16 @@ def kill_learner(training: Training, strike: Strike, disk_bytes: int) -> Struck:
 
 def kill_tree(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """SIGKILL of all processes at once, then ``--resume``."""
-    where, killed = _kill_all(training, strike)
-    result = _resume(training)
+    where, killed = kill_all(training, strike)
+    result = resume(training)
     return Struck(where, True, f"all of {killed} processes gone, resumed", result)
 
 
 def stop_learner(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """SIGSTOP of the learner for 15 s, longer than a worker waits for a reply."""
     training.start()
-    where = _reach(training, strike)
-    learner = _learner(training)
+    where = reach(training, strike)
+    learner = learner_of(training)
     learner.suspend()
     try:
         time.sleep(STOP_S)
@@ -98,7 +78,7 @@ def cut_link(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     protocol = endpoints.parse(training.run.stream.endpoint).protocol
     with Proxy(training.target) as proxy:
         training.start("--stream.connect", f"{protocol}/127.0.0.1:{proxy.port}")
-        where = _reach(training, strike)
+        where = reach(training, strike)
         before, printed = proxy.forwarded, len(training.output)
         proxy.cut()
         time.sleep(CUT_S)
@@ -112,7 +92,7 @@ def cut_link(training: Training, strike: Strike, disk_bytes: int) -> Struck:
 
 def torn_tail(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """A power cut during an append: all processes die, and the newest segment ends in half a frame."""
-    where, _ = _kill_all(training, strike)
+    where, _ = kill_all(training, strike)
     path = training.segments()[-1] if training.segments() else training.folder
     found = segment.scan(path) if path.is_file() else segment.Scan()
     if found.sealed or not found.frames:
@@ -127,20 +107,34 @@ def torn_tail(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     else:
         os.truncate(path, len(content) - cut)
         change = f"{path.name}: {cut} bytes of the last frame cut off"
-    result = _resume(training)
+    result = resume(training)
     landed = f"{path.name}: cut off a torn tail of" in training.output and result["repaired"] > 0
     return Struck(where, landed, f"{change}, repaired: {result['repaired']}", result)
+
+
+def flip_checkpoint(training: Training, strike: Strike, disk_bytes: int) -> Struck:
+    """One bit of the newest checkpoint of a killed run changes: the resumed run fits that version again."""
+    where, _ = kill_all(training, strike)
+    versions = sorted((training.view / "checkpoints").glob("version-*.npz"))
+    if not versions:
+        raise Missed("there was no checkpoint yet")
+    path, size = versions[-1], versions[-1].stat().st_size
+    place = int(strike.place * size)
+    _change_bit(path, place, strike)
+    again, result = f"T^{len(versions) - 1} is fitted again", resume(training)
+    change = f"{path.name}: a bit of byte {place} of {size} changed"
+    return Struck(where, again in training.output, f"{change}; {again}: {again in training.output}", result)
 
 
 def flip_byte(training: Training, strike: Strike, disk_bytes: int) -> Struck:
     """One byte of a sealed segment changes, in a killed run that is then resumed, or during a run."""
     if strike.variant:
         training.start()
-        where = _reach(training, strike)
+        where = reach(training, strike)
     else:
-        where, _ = _kill_all(training, strike)
+        where, _ = kill_all(training, strike)
     change, path = _flip(training, strike)
-    result = training.result() if strike.variant else _resume(training)
+    result = training.result() if strike.variant else resume(training)
     landed = f"{path.name}: removed" in training.output and result["repaired"] > 0
     how = "during the run" if strike.variant else "then resumed"
     return Struck(where, landed, f"{change} {how}, repaired: {result['repaired']}", result)
@@ -156,13 +150,18 @@ def _flip(training: Training, strike: Strike) -> tuple[str, Path]:
         found.frames[0][0] - segment.HEADER_BYTES if strike.variant else 0
     )  # during a run only the trajectories are read again
     place = first + int(strike.place * (found.size - (segment.SEAL_BYTES if strike.variant else 0) - first))
+    _change_bit(path, place, strike)
+    lost = len(found.frames) - _readable(path)
+    return f"{path.name}: byte {place} of {found.size} changed, which costs {lost} of {len(found.frames)} trajectories", path
+
+
+def _change_bit(path: Path, place: int, strike: Strike) -> None:
+    """Change one bit of the byte at ``place``."""
     with path.open("r+b") as file:
         file.seek(place)
         (byte,) = file.read(1)
         file.seek(place)
         file.write(bytes([byte ^ 1 << strike.worker % 8]))
-    lost = len(found.frames) - _readable(path)
-    return f"{path.name}: byte {place} of {found.size} changed, which costs {lost} of {len(found.frames)} trajectories", path
 
 
 def _readable(path: Path) -> int:
@@ -197,78 +196,13 @@ def full_disk(training: Training, strike: Strike, disk_bytes: int) -> Struck:
             dataset.close()
             where = f"disk of {size >> 10} KiB, {stored} trajectories stored"
             disk.grow(4 * disk_bytes + (64 << 20))
-            result = _resume(training)
+            result = resume(training)
         finally:
             training.kill()
             training.prefix, training.view = [], training.folder
     return Struck(
         where, True, f"exit code 1: {lines[0].removeprefix('icrl-dist: ').replace(f'{training.folder}/', '')}", result
     )
-
-
-def strangers(training: Training, strike: Strike, disk_bytes: int) -> Struck:
-    """A flood of connections that send nothing, held until the run ends."""
-    training.start()
-    where, made = _reach(training, strike), 0
-    target = training.target()
-    if target is None:
-        raise Missed("the learner had ended")
-    with contextlib.ExitStack() as held:
-        with contextlib.suppress(TimeoutError):
-            for made in range(STRANGERS):  # noqa: B007
-                held.enter_context(socket.create_connection(target, timeout=0.5))
-        result = training.result()
-    return Struck(
-        where, made >= 64, f"{made} connections held, then {'no' if made + 1 < STRANGERS else 'any'} more admitted", result
-    )
-
-
-def stop_run(training: Training, strike: Strike, disk_bytes: int) -> Struck:
-    """SIGSTOP of the command's process group for 15 s; the learner and the workers, in groups of their own, go on."""
-    training.start()
-    where = _reach(training, strike)
-    group = training.group()
-    training.signal(signal.SIGSTOP)
-    try:
-        time.sleep(STOP_S)
-        stopped = sum(process.is_running() and process.status() == psutil.STATUS_STOPPED for process in group)
-        learner_finished = training.learner() is None
-    finally:
-        training.signal(signal.SIGCONT)
-    result = training.result()
-    evidence = f"processes that were stopped: {stopped} of {len(group)}; the learner finished meanwhile: {learner_finished}"
-    return Struck(where, 0 < stopped == len(group), evidence, result)
-
-
-def kill_raylet(training: Training, strike: Strike, disk_bytes: int) -> Struck:
-    """SIGKILL of the raylet, then of the workers, as the kernel does when memory runs out."""
-    return _kill_ray(training, strike, "raylet", and_workers=True)
-
-
-def kill_gcs(training: Training, strike: Strike, disk_bytes: int) -> Struck:
-    """SIGKILL of Ray's GCS, without which Ray ends this command after a while."""
-    return _kill_ray(training, strike, "gcs_server", and_workers=False)
-
-
-def _kill_ray(training: Training, strike: Strike, name: str, and_workers: bool) -> Struck:
-    """The run goes on with a new session of Ray, or ends with a line about it, and ``--resume`` finishes it."""
-    training.start()
-    where = _reach(training, strike)
-    victims = [process for process in training.tree() if process.name() == name]
-    if not victims:
-        raise Missed(f"there was no {name}")
-    for process in [*victims, *(training.workers() if and_workers else ())]:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            process.kill()
-    code, line = training.wait(), f"Ray's process {name} ({victims[0].pid}) has ended"
-    ended = training.output
-    if code and (code != 1 or ended.count(line) != 1 or "Traceback" in ended):
-        raise TrainingFailed(f"without its {name}: exit code {code}; the last line: {ended.splitlines()[-1]}")
-    result = _resume(training) if code else training.result()
-    how = (
-        "the run ended and was resumed" if code else "Ray was started again" if line in ended else "the run finished without it"
-    )
-    return Struck(where, all(map(gone, victims)), f"{name} {victims[0].pid} is gone; {how}", result)
 
 
 FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
@@ -284,34 +218,7 @@ FAULTS: dict[str, Callable[[Training, Strike, int], Struck]] = {
     "stop-run": stop_run,
     "kill-raylet": kill_raylet,
     "kill-gcs": kill_gcs,
+    "hang-up": hang_up,
+    "kill-run": kill_run,
+    "flip-checkpoint": flip_checkpoint,
 }
-
-
-def _reach(training: Training, strike: Strike) -> str:
-    where = training.reach(strike)
-    if not where:
-        raise Missed(f"the run ended before {strike}")
-    return where
-
-
-def _learner(training: Training) -> psutil.Process:
-    found = training.learner()
-    if found is None:
-        raise Missed("the learner had ended")
-    return found
-
-
-def _kill_all(training: Training, strike: Strike) -> tuple[str, int]:
-    training.start()
-    where = _reach(training, strike)
-    count = len(training.tree())
-    if left := training.kill():
-        raise TrainingFailed(f"{len(left)} processes are alive after SIGKILL, such as {left[0].pid}")
-    if training.finished():
-        raise Missed("the run had ended")
-    return where, count
-
-
-def _resume(training: Training) -> dict[str, Any]:
-    training.start("--resume")
-    return training.result()

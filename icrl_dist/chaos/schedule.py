@@ -22,10 +22,13 @@ FAULTS = {
     "stop-run": "SIGSTOP of the command and of Ray for 15 s, as Ctrl-Z does",
     "kill-raylet": "SIGKILL of Ray's raylet and of all workers",
     "kill-gcs": "SIGKILL of Ray's GCS",
+    "hang-up": "SIGHUP of the command, then --resume",
+    "kill-run": "SIGKILL of the command alone, then --resume",
+    "flip-checkpoint": "kill-tree, and a bit of the newest checkpoint changes",
 }
 """Every fault with its description.  A new one comes last: its number is part of the key of its schedule."""
 
-IN_FITS = ("kill-learner", "stop-run", "kill-raylet", "kill-gcs")
+IN_FITS = ("kill-learner", "stop-run", "kill-raylet", "kill-gcs", "hang-up", "kill-run")
 """The faults that strike during a fit too."""
 
 _AFTER = (0.1, 0.5)
@@ -67,9 +70,11 @@ def draw(run: Run, seed: int, fault: str, attempt: int = 0) -> Strike:
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(list(FAULTS).index(fault), attempt)))
     method = methods.of(run)
     phases = method.phases(run)
-    first = 1 if fault == "flip-byte" else 0
+    first = 1 if fault in ("flip-byte", "flip-checkpoint") else 0
     if first >= len(phases):
-        raise ConfigError(f"--faults {fault}: {run.method} has one phase, and seals its segment at the end; list others")
+        raise ConfigError(
+            f"--faults {fault}: {run.method} has one phase, so there is nothing sealed before its end; list others"
+        )
     number = int(rng.integers(first, len(phases)))
     phase = phases[number]
     share, place = rng.uniform(*_AFTER), float(rng.random())

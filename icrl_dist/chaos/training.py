@@ -119,6 +119,11 @@ class Training:
             return [process for process in found if not gone(process)]
         return []
 
+    def command(self) -> psutil.Process:
+        """The process of the command itself."""
+        assert self._process is not None
+        return psutil.Process(self._process.pid)
+
     def workers(self) -> list[psutil.Process]:
         """Its worker processes, oldest first."""
         return sorted((p for p in self.tree() if is_worker(p)), key=lambda p: p.create_time())

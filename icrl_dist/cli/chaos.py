@@ -23,7 +23,8 @@ class ChaosArguments:
     kill-tree (SIGKILL), stop-learner (SIGSTOP for 15 s), cut-link (no traffic for 12 s), torn-tail
     and flip-byte (a damaged dataset), full-disk (needs root, or user namespaces), strangers (a flood of
     connections to the learner's port), stop-run (SIGSTOP of the command and of Ray), kill-raylet and
-    kill-gcs (SIGKILL of Ray's own processes).  The command
+    kill-gcs (SIGKILL of Ray's own processes), hang-up and kill-run (SIGHUP and SIGKILL of the command),
+    flip-checkpoint (a damaged checkpoint).  The command
     fails if a digest differs, and also if a fault had no effect: no process died, nothing was sent
     again, nothing was repaired.  ``icrl-dist chaos smoke`` takes some minutes on two cores.
     """

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
 from rich.console import Console
 
-from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, monitor, plan, play, streams, train
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, help_text, monitor, plan, play, streams, train
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
@@ -46,8 +46,11 @@ _RENAMED = {"bench": {"--bite": "--drop"}}
 
 def _help() -> str:
     lines = ["icrl-dist: robust in-context reinforcement learning, distributed", "", "usage: icrl-dist COMMAND ...", ""]
-    lines += [f"  {name:<10} {(kind.__doc__ or '').splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
-    return "\n".join([*lines, "", "`icrl-dist COMMAND --help` explains a command; start with `icrl-dist train demo`."])
+    width = min(100, shutil.get_terminal_size().columns)
+    texts = {name: (kind.__doc__ or "").splitlines()[0] for name, (kind, _) in COMMANDS.items()}
+    lines += [help_text.filled(f"  {name:<10} {text}", width, " " * 13) for name, text in texts.items()]
+    last = "``icrl-dist COMMAND --help`` explains a command; start with ``icrl-dist train demo``."
+    return "\n".join([*lines, "", help_text.filled(last, width).replace("``", "`")])
 
 
 def _parse(name: str, words: Sequence[str]) -> Any:
@@ -58,7 +61,7 @@ def _parse(name: str, words: Sequence[str]) -> Any:
             raise ConfigError(f"{option} is now called {_RENAMED[name][option]}: rename it")
     if kind is TrainArguments:
         _check_settings(words, run_type(None))
-    found: Any = tyro.cli(kind, prog=prog, args=list(words))
+    found: Any = help_text.cli(kind, prog=prog, args=list(words))
     if isinstance(found, TrainArguments) and (found.run or found.source):
         # Once more: flags override the numbers of RUN or, if only --from is given, those of the other run.
         folder = run_folder_of(found.run) if found.resume or found.resume_or_begin else None
@@ -68,7 +71,7 @@ def _parse(name: str, words: Sequence[str]) -> Any:
         if "--problem" in (word.partition("=")[0] for word in words):
             base = with_problem(base, found.config.problem)
         _check_settings(words, type(base), base.problem)
-        return tyro.cli(
+        return help_text.cli(
             kind, prog=prog, args=list(words), default=TrainArguments(run=found.run, given=tuple(words), config=base)
         )
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
 import threading
@@ -22,13 +23,14 @@ from icrl_dist.console.signals import on_signals
 class MonitorArguments:
     """Watch a run live in the terminal or in a browser, or replay a run that has ended.
 
-    Without RUN_DIR: the newest active run under runs/.  A view only reads the monitor plane, so it
+    A folder of runs, which may be empty or missing yet: the newest run in it; the page also lists the others,
+    and compares two.  Without RUN_DIR: the newest active run under runs/.  A view only reads the monitor plane, so it
     cannot slow the run down.  ``icrl-dist monitor runs/demo`` replays the run in that folder, at any
     speed, if it has ended.
     """
 
     what: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RUN_DIR]")] = None
-    """Run folder.  An active run is shown live; a run that has ended or crashed is replayed."""
+    """Run folder, or a folder of runs.  An active run is shown live; one that has ended or crashed is replayed."""
     connect: str | None = None
     """Instead, the endpoint of a learner, such as tcp/127.0.0.1:7447."""
     certificates: str | None = None
@@ -55,6 +57,8 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
     if arguments.web is None and not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
         raise ConfigError("monitor: no terminal here; use --web PORT for a web page, or `icrl-dist tap` for JSON lines")
     what = arguments.what
+    if what is not None and not arguments.connect and _holds_runs(what):
+        return _monitor_runs(what, arguments, console)
     with contextlib.ExitStack() as stack:
         if what is not None and not arguments.connect and not _is_active(what, console):
             feed: LiveFeed | ReplayFeed = stack.enter_context(ReplayFeed(what, arguments.speed))
@@ -69,7 +73,22 @@ def monitor(arguments: MonitorArguments, console: Console) -> int:
             return serve(feed, arguments.host, arguments.web, console)
         from icrl_dist.monitor.screen import watch
 
-        return watch(feed)
+        return watch(feed) or OK
+
+
+def _holds_runs(folder: Path) -> bool:
+    """Whether the path is a folder of runs and not a run; a folder that does not exist yet may become one."""
+    return not folder.exists() or (folder.is_dir() and not any((folder / name).exists() for name in ("run.toml", "dataset")))
+
+
+def _monitor_runs(what: Path, arguments: MonitorArguments, console: Console) -> int:
+    """Show the runs of a folder until the user ends the view.  Returns the exit code."""
+    from icrl_dist.monitor import folder
+
+    open_run = functools.partial(folder.open_feed, speed=arguments.speed, certificates=arguments.certificates or "")
+    if arguments.web is not None:
+        return folder.serve(what, arguments.host, arguments.web, open_run, console)
+    return folder.watch(what, open_run, console)
 
 
 @dataclass(frozen=True)

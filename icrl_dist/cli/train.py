@@ -9,13 +9,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK
-from icrl_dist.config.run import Run, override, run_type
+from icrl_dist.config.run import Run, load_folder, override, run_type
+
+if TYPE_CHECKING:
+    from icrl_dist.results.reports import Evaluation
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ def train(arguments: TrainArguments, console: Console) -> int:
         if run is None or isinstance(cause, OSError) or not resuming.holds(run, out):
             raise
         raise TrainFailed(f"{cause}; `{command}` continues the run") from error
-    console.print(made.evaluation)
+    _print_evaluation(made.evaluation, load_folder(made.folder), console)
     return _show_result(made.result, made.folder, arguments.json, console)
 
 
@@ -125,6 +128,19 @@ def _show_result(result: dict[str, Any], folder: Path, as_json: bool, console: C
     if as_json:
         print(json.dumps(result))
     return FAILED if result["quarantined"] else OK
+
+
+def _print_evaluation(evaluation: Evaluation, run: Run, console: Console) -> None:
+    """The returns of the evaluated tasks in four rows with a conclusion; everything about experts."""
+    from icrl_dist.problems import registry
+    from icrl_dist.results import conclusion
+
+    if set(evaluation.rows["suite"]) != {"online"}:
+        console.print(evaluation)
+        return
+    console.print(conclusion.table(evaluation.rows, registry.of(run).title))
+    for line in (conclusion.sentence(evaluation.rows), *evaluation.notes):
+        console.print(line, highlight=False, markup=False)
 
 
 def _resume_command(given: Sequence[str]) -> str:

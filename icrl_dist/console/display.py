@@ -1,89 +1,131 @@
-"""Progress of a run in the terminal: one bar per stage, and events as lines."""
+"""Progress of a run in the terminal: one bar for the present stage, and events as lines."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.live import Live
+from rich.text import Text
 
-from icrl_dist.console.phase_names import stage_text
+from icrl_dist.console.event_lines import EventLines
+from icrl_dist.console.stage_rows import StageRow, duration, name_of
 from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.stream.excerpts import plain
+from icrl_dist.telemetry.stamps import stamp
 
 ReportEvent = Callable[[dict[str, Any]], None]
 """Shows one event of a run, such as ``{"event": "note", "text": ...}``."""
 Show = bool | ReportEvent
 """What a function shows of its progress: True for lines and bars on standard output, False for nothing, or a receiver."""
 
-_PERIOD_S = 10.0
-"""Seconds between progress lines where there is no terminal."""
+_PERIOD_S, _MAX_PERIOD_S = 10.0, 600.0
+"""Least and largest number of seconds between progress lines where there is no terminal."""
+_LINES = 30
+"""Lines of progress in the first five minutes; later ones are this share of the time apart."""
+_LONGEST = 2_000
+"""Characters of a line."""
 
 
 class Display:
     """Shows a run's events as bars and lines, as a context.
 
-    Without a terminal it prints lines only: at the start and the end of a stage, and every ``_PERIOD_S`` seconds.
+    In a terminal the present stage has a row that is drawn again four times a second; a finished stage leaves its
+    row above.  Elsewhere, and in a terminal that cannot move its cursor, it prints lines only: at the start and the
+    end of a stage, and between them the rarer, the longer the run lasts.
     """
 
     def __init__(self, console: Console) -> None:
         self.console = console
-        self._bars: dict[str, TaskID] = {}
-        self._printed: dict[str, tuple[float, bool]] = {}
-        columns = (
-            TextColumn("{task.description:<26}", markup=False),
-            BarColumn(24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(compact=True, elapsed_when_finished=False),
-            TextColumn("{task.fields[info]}", markup=False),
-        )
-        self._progress = Progress(*columns, console=console)
+        self._lines = EventLines()
+        self._row: StageRow | None = None
+        self._ended = ""
+        """The name of the stage that has just finished, whose last event may repeat."""
+        self._began = self._printed_at = self._left_at = time.monotonic()
+        self._lock = threading.RLock()
+        self._live: Live | None = None
+        if console.is_terminal and not console.is_dumb_terminal:
+            self._live = Live(console=console, get_renderable=self._draw, transient=True)
 
     def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self._progress.start()
+        if self._live is not None:
+            self._live.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self.console.is_terminal:
-            self._progress.stop()
+        with self._lock:
+            self._print(self._lines.rest())
+            self._leave()
+        if self._live is not None:
+            self._live.stop()
 
     def report(self, event: dict[str, Any]) -> None:
         """Show one event of the learner, the fleet or an evaluation."""
-        kind = event["event"]
-        if kind == "progress":
-            self._stage(event)
-        elif kind == "labels":
-            self.console.print(
-                f"  labels of adapt/{event['round']}: {event['agreement']:.0%} optimal; return {event['label_return']:.1f}"
-                f" in the label trials, {event['context_return']:.1f} in the context trials, {event['optimum']:.1f} optimal",
-                highlight=False,
-            )
-        elif kind == "listening":
-            where = f"learner on {event['host']} ({event['device']})"
-            text = f"{where} listens at {event['endpoint']}, policy version {event['version']}"
-            self.console.print(plain(text, 2_000), highlight=False, markup=False)
-        elif kind in ("note", "worker", "alert", "crash", "quarantine", "released", "repaired", "interrupted"):
-            self.console.print(plain(event["text"], 2_000), highlight=False, markup=False)
+        now = time.monotonic()
+        with self._lock:
+            if event["event"] == "progress":
+                self._print(self._lines.due(now))
+                self._stage(event, now)
+            else:
+                self._print(self._lines.add(event, now))
 
-    def _stage(self, event: dict[str, Any]) -> None:
-        name, info = plain(_name(event)), plain(_info(event), 2_000)
-        done, total = event["step"], event["steps"]
-        if self.console.is_terminal:
-            if name not in self._bars:
-                self._bars[name] = self._progress.add_task(name, total=total, info=info)
-            self._progress.update(self._bars[name], completed=done, info=info)
+    def _print(self, lines: list[str]) -> None:
+        for line in lines:
+            self.console.print(Text(f"{stamp()} {plain(line, _LONGEST)}"), soft_wrap=self._live is None)
+
+    def _draw(self) -> Text:
+        """The row of the present stage, for the terminal."""
+        now = time.monotonic()
+        with self._lock:
+            if self._row is not None:
+                ascii_only = self.console.options.ascii_only
+                row = self._row.fit(self.console.width, now, ascii_only)
+                return Text(plain(row, _LONGEST), no_wrap=True, overflow="crop")
+            waited, what = now - self._left_at, "waits for the next stage" if self._ended else "starting"
+        return Text(f"{what}, {duration(waited)}" if waited > 2.0 else "")
+
+    def _stage(self, event: dict[str, Any], now: float) -> None:
+        name = name_of(event)
+        if self._row is None or self._row.name != name:
+            if name == self._ended and event["step"] >= event["steps"]:
+                return
+            self._leave()
+            self._row, self._ended = StageRow(event, now), ""
+            if self._live is None and not self._row.finished:
+                self._print_row(now)
+        else:
+            self._row.update(event, now)
+        if self._row.finished:
+            self._ended = name
+            self._leave()
+        elif self._live is None and now - self._printed_at >= self._period(now):
+            self._print_row(now)
+
+    def _period(self, now: float) -> float:
+        return min(_MAX_PERIOD_S, max(_PERIOD_S, (now - self._began) / _LINES))
+
+    def _print_row(self, now: float) -> None:
+        assert self._row is not None
+        self._printed_at = now
+        self._print([self._row.line(now)])
+
+    def _leave(self) -> None:
+        """Print the last row of the present stage."""
+        row, self._row = self._row, None
+        if row is None:
             return
-        printed_at, ended = self._printed.get(name, (time.monotonic(), False))
-        if not ended and (done == total or time.monotonic() - printed_at >= _PERIOD_S or name not in self._printed):
-            self._printed[name] = (time.monotonic(), done == total)
-            if done or event.get("doing"):
-                self.console.print(f"{name:<26} {done:>7}/{total:<7} {info}", highlight=False, markup=False)
+        now = self._left_at = time.monotonic()
+        if self._live is None:
+            self._print([row.line(now)])
+        else:
+            self.console.print(
+                Text(plain(row.fit(self.console.width, now, self.console.options.ascii_only), _LONGEST), no_wrap=True)
+            )
 
 
 @contextlib.contextmanager
@@ -96,22 +138,3 @@ def reporting(progress: Show) -> Iterator[ReportEvent]:
             yield display.report
     else:
         yield lambda event: None
-
-
-def _name(event: dict[str, Any]) -> str:
-    if event["stage"] == "evaluate":
-        return str(event["phase"])
-    return stage_text(event)
-
-
-def _info(event: dict[str, Any]) -> str:
-    if event["stage"] == "evaluate":
-        return ""
-    if event["stage"] == "fit":
-        return f"loss {event['loss']:.3f}"
-    drops = sum(event["drops"].values())
-    dropped = f", {drops} dropped" if drops else ""
-    policy = f", policy v{event['version']}, lag {event['lag']}" if event["phase"] == "adapt" else ""
-    if event.get("doing"):
-        return f"{event['workers']} workers{policy}{dropped}; {'; '.join(event['doing'])}"
-    return f"{event['per_s']:.0f} trajectories/s, {event['workers']} workers{policy}{dropped}"

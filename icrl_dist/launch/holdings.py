@@ -8,7 +8,7 @@ from pathlib import Path
 from icrl_dist.config.run import ConfigError
 from icrl_dist.launch import run_folder
 from icrl_dist.storage import segment
-from icrl_dist.storage.checkpoint import newest_version
+from icrl_dist.storage.checkpoint import newest_version, partial_file
 
 _WITHOUT_RESULT = {"run.toml", "env.json", "metrics.jsonl", "learner.log", "endpoint", ".lock"}
 """Files that a run writes before it has collected or fitted anything."""
@@ -16,7 +16,7 @@ _WITHOUT_RESULT = {"run.toml", "env.json", "metrics.jsonl", "learner.log", "endp
 
 def holdings(folder: Path) -> str:
     """What ``--resume`` would continue from: ``the last checkpoint``, ``the 140 stored trajectories``; empty for nothing."""
-    if newest_version(folder) >= 0 or (folder / "checkpoints" / "partial.npz").exists():
+    if newest_version(folder) >= 0 or partial_file(folder).exists():
         return "the last checkpoint"
     with contextlib.suppress(OSError):
         if count := sum(len(segment.scan(path).frames) for path in sorted((folder / "dataset").glob("segment-*.frames"))):

@@ -18,6 +18,7 @@ import psutil
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.console.display import ReportEvent
 from icrl_dist.telemetry import processes
+from icrl_dist.telemetry.logs import bound
 
 CHECKPOINT_S = 60.0
 """Seconds that a learner has to write its checkpoint when the run ends."""
@@ -124,6 +125,7 @@ class LearnerProcess:
         Raises ConfigError or TrainFailed with the learner's message if it ended with an error, and
         TrainFailed if it was killed more often than ``learner.restarts``.
         """
+        bound(self._folder / "learner.err")
         code = self._process.poll()
         if code is None or self._finished:
             return

@@ -24,7 +24,7 @@ from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.signals import on_signals
 from icrl_dist.diagnostics.modules import hidden_packages
 from icrl_dist.diagnostics.ray_token import require_ray_token
-from icrl_dist.launch import learner_process, run_folder
+from icrl_dist.launch import learner_process, run_folder, watching
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
@@ -259,10 +259,7 @@ def train_ray(
         if address is None:  # without a cluster both start at once; on a cluster the nodes are checked first
             learner = stack.enter_context(learner_process.running(run, folder))
         note = lambda text: report({"event": "note", "text": text})  # noqa: E731
-        try:
-            fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
-        except SystemExit:  # raised by Ray's handler of SIGTERM
-            raise TrainInterrupted from None
+        fleet = Fleet(actors, run.learner.restarts, address, oversubscribe, at_least, note, interrupted.is_set)
         stack.callback(fleet.close)
         handle_again()  # Ray replaces the handlers
         needed = plugins.of_run(run.problem, run.method)
@@ -284,6 +281,7 @@ def train_ray(
                         learner.end_after_driver(psutil.Process().children(recursive=True))
                     fleet.start(run.stream.connect or learner.endpoint, folder.name, folder, certificates)
                     started = True
+                    report({"event": "note", "text": watching.hint(run.stream, folder, learner.endpoint)})
                 elif event["event"] == "progress":
                     stored = event["trajectories"]
                 elif event["event"] in ("quarantine", "released"):

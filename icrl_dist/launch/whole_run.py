@@ -123,6 +123,7 @@ def train(
             evaluated = {**evaluation.summary, "evaluate": as_data(settings.evaluate)}
             result = _final_result(folder, result, evaluated)
             write_json(folder / "result.json", result)
+            _record_heldout(settings, folder, evaluation, show)
     except (launch.TrainInterrupted, KeyboardInterrupt):
         raise _interrupted(folder, transaction) from None
     except TrainFailed as error:
@@ -158,6 +159,12 @@ def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
     heldout.save_calibrated(folder, show)
     frame = heldout.online(run, folder, folder / "results", show)
     return reports.online(run, folder / "report" / heldout.report_name(run, folder), frame)
+
+
+def _record_heldout(run: Run, folder: Path, evaluation: Evaluation, show: ReportEvent) -> None:
+    from icrl_dist.launch import heldout_metrics  # it imports torch
+
+    heldout_metrics.record(run, folder, evaluation.summary, show)
 
 
 def _interrupted(folder: Path, transaction: FolderTransaction | None) -> launch.TrainInterrupted:

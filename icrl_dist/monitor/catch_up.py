@@ -24,16 +24,16 @@ _MAX_PHASES = 64
 """Phases that are requested at the start, the newest, until every variation has as many as a view keeps."""
 
 
-def play(state: RunState, messages: Iterable[Message], partial: bool = False) -> None:
-    """Receive recorded messages, with a tick after every recorded second, as in a live run; ``partial`` as in ``tick``."""
+def play(state: RunState, messages: Iterable[Message], partial: bool = False, apart_s: float = 0.0) -> None:
+    """Receive recorded messages, with a tick after every recorded second, as in a live run; the rest as in ``tick``."""
     last: float | None = None
     for at, key, payload in messages:
+        state.receive(key, payload, at)
         if last is None:
             last = at
-        if at - last >= 1.0:
+        if at - last >= 1.0:  # after the message, so that a rate is over the time in which it was counted
             last = at
-            state.tick(at, partial)
-        state.receive(key, payload, at)
+            state.tick(at, partial, apart_s)
 
 
 class CatchUp:
@@ -55,7 +55,7 @@ class CatchUp:
             _log.warning("the past of %s is missing: %s", run, error)
         self._state.clear()
         if messages is not None:
-            play(self._state, messages, partial=True)
+            play(self._state, messages, partial=True, apart_s=past.apart_s([at for at, _, _ in messages]))
         self._state.past = "missing" if messages is None else "loading"
         phases = self._state.phases_so_far[::-1][:_MAX_PHASES]
         self._wanted.put((run, self._state.epoch, phases))

@@ -4,7 +4,9 @@ A drawing is one of
 
 - ``room``: ``size``, ``goal``, ``path`` (cells, one more than steps), ``overridden`` (one flag a step);
 - ``sticks``: ``frames``, each a list of segments ``[x0, y0, x1, y1]`` in meters, ``frame_s`` seconds apart, and
-  ``force`` (0 to 1, one value a frame);
+  ``force`` (0 to 1, one value a frame), ``travel`` (meters forward, one value a frame, or empty), and ``ground``
+  (its height, or None);
+- ``arm``: ``hand`` and ``object``, ``[x, y, z]`` in meters for each frame, ``opening`` of the gripper (0 to 1), and ``goal``;
 - ``paths``: ``paths``, named lists of points from above in meters, and ``goal``.
 """
 

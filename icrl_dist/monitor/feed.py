@@ -27,7 +27,10 @@ class Feed(Protocol):
         ...
 
     def replay(self) -> dict[str, Any] | None:
-        """Position in a recording: ``begin``, ``end``, ``at`` (Unix seconds), ``speed``, ``paused``; None for a live run."""
+        """Position in a recording: ``begin``, ``end``, ``at`` (Unix seconds), ``speed``, ``paused``; None for a live run.
+
+        ``loading``: whether the state is not there yet, because reading the recording takes longer.
+        """
         ...
 
     def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
@@ -106,14 +109,20 @@ class LiveFeed:
 class ReplayFeed:
     """A run on disk, finished or crashed, played from its dataset and metrics."""
 
-    def __init__(self, folder: Path, speed: float = 10.0) -> None:
-        """``speed``: recorded seconds played in a second.  Raises ConfigError if there is nothing to play."""
+    def __init__(self, folder: Path, speed: float = 10.0, at_end: bool = False) -> None:
+        """``speed``: recorded seconds played in a second; ``at_end``: begin with the state at the end.
+
+        Raises ConfigError if there is nothing to play.
+        """
         self.state = RunState(recorded=True)
         self._recording = Recording(folder)
         self._lock = threading.Lock()
         self._speed, self._paused, self._seek = speed, False, False
         self._evaluation = EvaluationReader(folder, self.state)
-        self._at = self._recording.end if running(folder) else self._recording.begin  # not a past run: it is evaluated now
+        at_end = at_end or running(folder)  # a run that is evaluated now is not past
+        self._at = self._recording.end if at_end else self._recording.begin
+        self._played = self._recording.begin
+        """Time of the newest message that the state has received."""
         self._messages = self._recording.messages()
         self._next = next(self._messages, None)
         self._ended = threading.Event()
@@ -130,6 +139,7 @@ class ReplayFeed:
                 at, seek, self._seek = self._at, self._seek, False
             if seek:
                 self.state.clear()
+                self._played = self._recording.begin
                 self._messages = self._recording.messages()
                 self._next = next(self._messages, None)
             self._play_until(at)
@@ -139,6 +149,7 @@ class ReplayFeed:
         last_tick = None
         while self._next is not None and self._next[0] <= at and not self._ended.is_set():
             time_, key, payload = self._next
+            self._played = time_
             if last_tick is None:
                 last_tick = time_
             if time_ - last_tick >= 1.0:
@@ -146,6 +157,7 @@ class ReplayFeed:
                 self.state.tick(time_)
             self.state.receive(key, payload, time_)
             self._next = next(self._messages, None)
+        self._played = at
         self.state.tick(at)
 
     def now(self) -> float:
@@ -154,7 +166,8 @@ class ReplayFeed:
     def replay(self) -> dict[str, Any] | None:
         with self._lock:
             where = {"begin": self._recording.begin, "end": self._recording.end, "at": self._at}
-            return {**where, "speed": self._speed, "paused": self._paused}
+            loading = self._at - self._played > max(5.0, 4 * PERIOD_S * self._speed)
+            return {**where, "speed": self._speed, "paused": self._paused, "loading": loading}
 
     def control(self, speed: float | None = None, paused: bool | None = None, at: float | None = None) -> None:
         with self._lock:

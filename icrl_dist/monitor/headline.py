@@ -27,7 +27,7 @@ def headline(
     else:
         parts.append(f"{_time(run['eta_s'])} left" if run.get("eta_s") is not None else "time left not known yet")
     parts.append(_health(run, workers, alerts, over))
-    return f"{', '.join(part for part in parts if part)}; {_worth(run, evaluation, over)}."
+    return f"{', '.join(part for part in parts if part)}; {worth(run, evaluation, over)}."
 
 
 def _health(run: Mapping[str, Any], workers: Sequence[Mapping[str, Any]], alerts: int, over: bool) -> str:
@@ -39,7 +39,7 @@ def _health(run: Mapping[str, Any], workers: Sequence[Mapping[str, Any]], alerts
     return " and ".join(found) or ("" if over else "healthy")
 
 
-def _worth(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, over: bool) -> str:
+def worth(run: Mapping[str, Any], evaluation: Mapping[str, Any] | None, over: bool) -> str:
     """The held-out return of the newest model at the largest p, beside T^0, in the words of ``results.comparison``."""
     if evaluation is None:
         if run["state"] == "evaluating":

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.run import Run
@@ -17,26 +14,6 @@ from icrl_dist.telemetry.about import about
 Message = tuple[float, str, bytes]
 """Time (Unix seconds), key and payload."""
 Row = dict[str, Any]
-
-
-def read(path: Path, newest: int | None = None) -> Iterator[Row]:
-    """The valid rows of a metrics file, or of its last ``newest`` bytes; none if the file does not exist."""
-    if not path.is_file():
-        return
-    with path.open("rb") as file:
-        if newest is not None and file.seek(0, os.SEEK_END) > newest:
-            file.seek(-newest, os.SEEK_END)
-            file.readline()  # the rest of a row
-        else:
-            file.seek(0)
-        lines = file.read().decode("utf-8", "replace").splitlines()
-    for line in lines:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(row, dict) and {"time", "stage", "step"} <= row.keys():
-            yield row
 
 
 class MetricMessages:

@@ -104,7 +104,10 @@ def serving_run(feed: Feed, host: str, port: int) -> Iterator[str]:
     """Context manager: serves the page and yields its URL.  Raises ConfigError if the address cannot be used."""
     publisher, over = SnapshotPublisher(feed), threading.Event()
 
-    routes = [Route("/variation/{task}/{variation}", publisher.variation)]
+    async def runs(_: Request) -> Response:
+        return JSONResponse(None)  # a page of one run has no list
+
+    routes = [Route("/variation/{task}/{variation}", publisher.variation), Route("/runs", runs)]
     app = application("monitor.html", publisher.stream, publisher.command, routes)
     thread = threading.Thread(target=publisher.run, args=(over,), name="publisher", daemon=True)
     with serving(app, publisher.stream, host, port) as url:

@@ -9,15 +9,17 @@ from __future__ import annotations
 import re
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 from icrl_dist.config.run import Run
-from icrl_dist.monitor.metric_messages import Message, MetricMessages, read
+from icrl_dist.monitor.metric_messages import Message, MetricMessages, Row
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.validation import WireError, as_list, text, typed
+from icrl_dist.telemetry import metric_rows
 from icrl_dist.types import Trajectory
 
 REQUEST_BYTES = 512
@@ -29,10 +31,12 @@ _TRIALS = 256
 _PAGE = (48, 512)
 """Variations and trajectories of one page; it ends after the variation that reaches either number."""
 _METRICS_BYTES = 4 << 20
-"""Bytes at the end of ``metrics.jsonl`` that are read."""
+"""Bytes at the end of the metrics that are read."""
 _PROGRESS_S = 900.0
-"""Seconds of progress: as long as a view keeps it."""
+"""Seconds of progress with every row, as long as a view keeps every second."""
 _MAX_PROGRESS = 1200
+_MAX_OLDER = 900
+"""Rows of progress before that, at equal distances."""
 _MAX_EVENTS = 200
 
 
@@ -51,6 +55,17 @@ def parse_reply(reply: bytes) -> tuple[list[Message], str]:
     if kind != "past":
         raise WireError("schema", f"a reply of kind {show(kind)}, expected past")
     return found, text(fields.get("after"), "after")
+
+
+def apart_s(times: Sequence[float]) -> float:
+    """How far apart the older messages of progress in a reply for metrics are, in seconds, from its times in order."""
+    return max(0.0, times[-1] - times[0] - _PROGRESS_S) / _MAX_OLDER if times else 0.0
+
+
+def _thinned(rows: list[Row], most: int) -> list[Row]:
+    """At most ``most`` of the rows, the newest always."""
+    every = -(-len(rows) // most) or 1
+    return rows[::-1][::every][::-1]
 
 
 class Past:
@@ -74,16 +89,12 @@ class Past:
         return _reply(*self._returns(stage, int(number), tuple(map(int, after.split("/"))) if after else (-1,)))
 
     def _metrics(self) -> list[Message]:
-        rows = sorted(read(self._folder / "metrics.jsonl", _METRICS_BYTES), key=lambda row: float(row["time"]))
+        rows = sorted(metric_rows.read(self._folder, _METRICS_BYTES), key=lambda row: float(row["time"]))
         events = [row for row in rows if row["stage"] in ("event", "alert")][-_MAX_EVENTS:]
         newest = rows[-1]["time"] if rows else 0.0
-        progress = [
-            row
-            for row in rows
-            if newest - row["time"] <= _PROGRESS_S and (row["stage"] == "ingest" or row["stage"].startswith("fit/"))
-        ]
-        every = -(-len(progress) // _MAX_PROGRESS) or 1
-        kept = progress[::-1][::every]  # the newest row always
+        progress = [row for row in rows if row["stage"] == "ingest" or row["stage"].startswith("fit/")]
+        late = [row for row in progress if newest - row["time"] <= _PROGRESS_S]
+        kept = [*_thinned(progress[: len(progress) - len(late)], _MAX_OLDER), *_thinned(late, _MAX_PROGRESS)]
         began = (self._folder / "run.toml").stat().st_mtime
         first = min([newest, *(row["time"] for row in (*kept, *events))])
         return [

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from icrl_dist.monitor.history import History
+
 _POINTS = 900
-"""Points kept of each series."""
+"""Points kept of each series, one a second; a history keeps means of the older ones."""
 _PERIOD_S = 1.0
 """Time between points."""
 _GAP_S = 10.0
@@ -25,6 +27,7 @@ class RateSeries:
         """Newest value of each series."""
         self._points: deque[tuple[int, int, float, dict[str, float | None]]] = deque(maxlen=_POINTS)
         """Number of the point, ``seq`` of the run state, time, and the value of each series."""
+        self._history = History(SERIES)
         self._number = self._episodes = 0
         self._last: tuple[float, int, int] | None = None
         """Time, stored trajectories and finished episodes at the newest point."""
@@ -53,10 +56,12 @@ class RateSeries:
             else:
                 self._collected_s[run["phase"]] = run["steps"] / self._stage_per_s
 
-    def tick(self, now: float, seq: int, run: dict[str, Any], steps_per_s: float, unstored: int, partial: bool) -> None:
+    def tick(
+        self, now: float, seq: int, run: dict[str, Any], steps_per_s: float, unstored: int, partial: bool, apart_s: float = 0.0
+    ) -> None:
         """Add a point if a second has passed; after a gap also one without values, so that no line is drawn across it.
 
-        ``partial``: the values of workers are unknown.
+        ``partial``: the values of workers are unknown; ``apart_s``: the messages are this far apart, so this is no gap.
         """
         if self._last is None:
             self._last = (now, run["trajectories"], self._episodes)
@@ -65,7 +70,7 @@ class RateSeries:
         if 0 <= span < _PERIOD_S:
             return
         self._last = (now, run["trajectories"], self._episodes)
-        if span > _GAP_S and self._points:
+        if span > _GAP_S + 2 * apart_s and self._points:
             self._append(seq, before + _PERIOD_S, dict.fromkeys(SERIES))
         fitting, span = run.get("stage") == "fit", max(span, 1e-3)
         values: dict[str, float | None] = {
@@ -84,6 +89,9 @@ class RateSeries:
 
     def _append(self, seq: int, now: float, values: dict[str, float | None]) -> None:
         self._number += 1
+        if len(self._points) == _POINTS:
+            _, _, time, oldest = self._points[0]
+            self._history.add(time, oldest, seq)
         self._points.append((self._number, seq, now, values))
 
     def series(self, since: int) -> dict[str, Any]:
@@ -91,6 +99,10 @@ class RateSeries:
         points = [point for point in self._points if point[1] > since]
         columns: dict[str, Any] = {"number": [p[0] for p in points], "t": [round(p[2], 3) for p in points]}
         return columns | {name: [p[3][name] for p in points] for name in SERIES}
+
+    def history(self, since: int) -> dict[str, Any] | None:
+        """Columns of means of older points, as ``series`` without ``number``; None if nothing has changed after ``since``."""
+        return self._history.columns() if self._history.seq > since else None
 
     def stage_eta_s(self, run: dict[str, Any]) -> float | None:
         """Estimated seconds until the current stage ends, from its rate so far; None while the rate is unknown."""

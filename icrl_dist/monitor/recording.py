@@ -1,9 +1,10 @@
 """Reconstructs the monitor messages of a run from its folder.
 
 The dataset contains every trajectory in the order in which they were stored, but not the times.
-``metrics.jsonl`` contains the number of stored trajectories once a second; between two such rows
-the trajectories are spread evenly.  Heartbeats are not stored, so they are made from the
-trajectories that each worker finished.
+``metrics.jsonl`` and its older files contain the number of stored trajectories once a second, later at
+most once a minute; between two such rows the trajectories are spread evenly.  Times are those of a
+replay, without pauses (``pauses``).  Heartbeats are not stored, so they are made from the trajectories
+that each worker finished.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from icrl_dist.config.run import ConfigError, load_folder
-from icrl_dist.monitor.metric_messages import Message, MetricMessages, read
+from icrl_dist.monitor.metric_messages import Message, MetricMessages
+from icrl_dist.monitor.pauses import session_starts, without_pauses
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.index import Row
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.link import StreamKeys
+from icrl_dist.telemetry import metric_rows
 
 _HEARTBEAT_S = 1.0
 """Time between two heartbeats of a worker."""
@@ -36,7 +39,7 @@ class Recording:
         if not (folder / "run.toml").is_file():
             raise ConfigError(f"{folder}: not a run folder (no run.toml); name a run folder, or a live run with --connect")
         self._run, self._folder, self._keys = load_folder(folder), folder, StreamKeys(folder.absolute().name)
-        self._rows = sorted(read(folder / "metrics.jsonl"), key=lambda row: float(row["time"]))
+        self._rows = without_pauses(list(metric_rows.read(folder)), session_starts(folder))
         self._store = Dataset(folder / "dataset", readonly=True)
         self._ordered = sorted(self._store.index, key=lambda row: (row.segment, row.offset))
         if not self._rows or not self._ordered:

@@ -231,17 +231,18 @@ class RunState:
                 self._evaluation, self._evaluated = found, self._seq + 1
             self._evaluating = running
 
-    def tick(self, now: float, partial: bool = False) -> None:
+    def tick(self, now: float, partial: bool = False, apart_s: float = 0.0) -> None:
         """Advance time: update rates, compute some optima, and remove old beliefs.
 
-        ``partial``: only the learner's messages were received for this time, so the rates of workers are unknown.
+        ``partial``: only the learner's messages were received for this time, so the rates of workers are unknown;
+        ``apart_s``: time between these messages, which were left out in between.
         """
         with self._lock:
             self._seq += 1
             self._workers.tick(now)
             rows = self._workers.rows(now)
             steps_per_s, unstored = sum(row["steps_per_s"] for row in rows), sum(row["unstored"] for row in rows)
-            self._rates.tick(now, self._seq, self._run, steps_per_s, unstored, partial)
+            self._rates.tick(now, self._seq, self._run, steps_per_s, unstored, partial, apart_s)
             self._variations.tick(self._seq)
             self._beliefs = {w: b for w, b in self._beliefs.items() if now - b["heard"] <= _BELIEF_S}
 
@@ -284,6 +285,7 @@ class RunState:
                 "evaluation": self._evaluation if self._evaluated > since else None,
                 "episodes": self._variations.episodes(since),
                 "series": self._rates.series(since),
+                "history": self._rates.history(since),
                 "events": [event for event in self._events if event["seq"] > since],
                 "alerts": list(self._alerts.values()),
                 "believers": list(self._beliefs),

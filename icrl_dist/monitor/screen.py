@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 from textual.app import App
@@ -24,6 +24,8 @@ from icrl_dist.monitor.view_state import ViewState
 
 PERIOD_S = 0.25
 """Time between two updates of the view; longer if an update takes long."""
+_REPLACED_S = 2.0
+"""Time between two questions whether another run is to be shown."""
 _REST = 8
 """Ratio of the time between updates to the time that an update takes."""
 _ROOMY = (110, 36)
@@ -72,9 +74,11 @@ class MonitorApp(App[None]):
         Binding("right_square_bracket", "neighbor(1)"),
     ]
 
-    def __init__(self, feed: Feed) -> None:
+    def __init__(self, feed: Feed, replaced: Callable[[], bool] = lambda: False) -> None:
+        """``replaced``: whether another run is to be shown instead; the view then ends without a result."""
         super().__init__()
-        self._feed = feed
+        self._feed, self._replaced = feed, replaced
+        self.replaced = False
         self._view = ViewState(feed.state)
         self._frozen: float | None = None
         self._active = 0
@@ -106,6 +110,7 @@ class MonitorApp(App[None]):
         self._laid_out = True
         self._arrange()
         self.set_interval(PERIOD_S, self._tick)
+        self.set_interval(_REPLACED_S, self._leave_if_replaced)
         self.update_view()
 
     # Content of the widgets.
@@ -115,6 +120,11 @@ class MonitorApp(App[None]):
         if began >= self._not_before:
             self.update_view()
             self._not_before = began + (time.monotonic() - began) * (1 + _REST)
+
+    def _leave_if_replaced(self) -> None:
+        if self._frozen is None and self._replaced():
+            self.replaced = True
+            self.exit()
 
     def update_view(self) -> None:
         """Show the newest state, unless the view is frozen."""
@@ -307,8 +317,11 @@ class MonitorApp(App[None]):
             self._fill()
 
 
-def watch(feed: Feed) -> int:
-    """Show a run in the terminal until the user quits; returns the exit code."""
-    app: Any = MonitorApp(feed)
+def watch(feed: Feed, replaced: Callable[[], bool] = lambda: False) -> int | None:
+    """Show a run in the terminal until the user quits; returns the exit code.
+
+    ``replaced``: whether another run is to be shown instead, asked every two seconds; None is returned then.
+    """
+    app: Any = MonitorApp(feed, replaced)
     app.run(mouse=False)
-    return int(app.return_code or 0)
+    return None if app.replaced else int(app.return_code or 0)

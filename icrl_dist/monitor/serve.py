@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import resources
-from typing import Any
+from typing import Any, Protocol
 
 import uvicorn
 from starlette.applications import Starlette
@@ -26,7 +26,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.monitor.event_stream import MAX_VIEWERS, EventStream
+from icrl_dist.monitor.event_stream import MAX_VIEWERS
 
 MAX_BODY = 4096
 """Bytes of a command."""
@@ -54,7 +54,19 @@ Command = Callable[[dict[str, Any]], None]
 """Executes a viewer's command, a JSON object, on a thread of the server.  Raises ValueError with a line for the viewer."""
 
 
-def application(page: str, stream: EventStream, command: Command | None = None, routes: Sequence[Route] = ()) -> Starlette:
+class Events(Protocol):
+    """What ``/events`` answers with: an EventStream, or several of them."""
+
+    async def respond(self, request: Request) -> Response:
+        """The endpoint."""
+        ...
+
+    def close(self) -> None:
+        """End every stream and accept no more viewers."""
+        ...
+
+
+def application(page: str, stream: Events, command: Command | None = None, routes: Sequence[Route] = ()) -> Starlette:
     """The application of one page.
 
     ``/`` is the asset ``page``, ``/assets/NAME`` any asset, ``/events`` the stream; ``/command`` takes JSON objects
@@ -152,7 +164,7 @@ def _is_address(name: str) -> bool:
 
 
 @contextlib.contextmanager
-def serving(app: Starlette, stream: EventStream, host: str, port: int) -> Iterator[str]:
+def serving(app: Starlette, stream: Events, host: str, port: int) -> Iterator[str]:
     """Context manager: serves ``app`` in a thread and yields the URL.  Port 0 selects a free port.
 
     Raises ConfigError if the address or the port cannot be used.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from icrl_dist.results import statistics
 from icrl_dist.results.names import AgentKey
 from icrl_dist.results.returns import LAST, Returns, check_pairs, returns
 from icrl_dist.results.statistics import Interval
+from icrl_dist.telemetry.metrics import HeldOut
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,6 +133,24 @@ def episode_of(one: Returns, oracle: Returns, share: float) -> int | None:
     best = oracle.flat.mean()
     good = (one.flat.mean(axis=(0, 1)) >= share * best) & (best > 0)
     return int(good.argmax()) + 1 if good.any() else None
+
+
+def heldout_metrics(rows: Sequence[Mapping[str, Any]]) -> list[HeldOut]:
+    """The rows of ``result_rows`` as metrics.
+
+    The model has one curve over policy versions for each rule that deploys it.
+    """
+    versions = [int(row["key"][1:]) for row in rows if AgentKey(row["key"]).is_model]
+    newest = max(versions, default=0)
+    rules = {row["deployment"] for row in rows if AgentKey(row["key"]).is_model}
+    answer = []
+    for row in rows:
+        is_model, (low, high) = AgentKey(row["key"]).is_model, row["last5_interval"]
+        name = "model" + (f"-{row['deployment']}" if len(rules) > 1 else "") if is_model else row["key"]
+        values = {"return": row["last5"], "low": low, "high": high}
+        kept = {key: value for key, value in values.items() if value is not None}
+        answer.append(HeldOut(row["p"], name, int(row["key"][1:]) if is_model else newest, kept))
+    return answer
 
 
 def surprise(frame: pd.DataFrame) -> dict[str, dict[str, float]]:

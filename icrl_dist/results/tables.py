@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console, ConsoleOptions
 from rich.table import Table
 
 from icrl_dist.config.run import ConfigError
@@ -15,6 +17,24 @@ from icrl_dist.results.statistics import Interval
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+class NarrowTable(Table):
+    """A table that leaves out columns where it would be wider than the console; the others are never cut."""
+
+    spare: tuple[str, ...] = ()
+    """Headers of the columns that may be left out, the first one first."""
+
+    def add_column(self, *arguments: Any, **options: Any) -> None:
+        super().add_column(*arguments, **{"overflow": "fold", **options})
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
+        shown = copy.copy(self)
+        for header in self.spare:
+            if console.measure(shown, options=options.update(max_width=10_000)).maximum <= options.max_width:
+                break
+            shown.columns = [column for column in shown.columns if column.header != header]
+        yield from Table.__rich_console__(shown, console, options)
 
 
 def returns_table(frame: pd.DataFrame, title: str) -> Table:
@@ -29,7 +49,8 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
     shown, last = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes], min(LAST, episodes)
     over = statistics.resampled(trainings, tasks, evaluations, last)
     caption = f"[...]: {over}" if statistics.units((trainings, tasks, evaluations)) > 1 else over
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    table = NarrowTable(title=title, title_justify="left", caption=caption, caption_justify="left")
+    table.spare = tuple(f"ep {e}" for e in (30, 3, 20, 5, 2, 10, 40))
     for name in ("p", "agent", *(f"ep {e}" for e in shown), f"last {last}"):
         table.add_column(name, justify="left" if name == "agent" else "right")
     best, estimates = summaries.ceilings(found, last), summaries.intervals(found, last)
@@ -89,7 +110,7 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
     base = arms[0]
     trainings, tasks, evaluations, episodes = _shape(base)
     over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes))
-    table = Table(
+    table = NarrowTable(
         title=f"Return of the last {min(last, episodes)} episodes, compared with {called[0]}",
         title_justify="left",
         caption=f"{over}; the same resamples for both; for the minimum, tasks are not resampled.  `not shown`: the interval "
@@ -119,7 +140,7 @@ _STATISTICS = {"ratio": "ratio of means, less 1", "improvement": "probability of
 
 def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Return of each expert's first and last recorded episode, one row per variation; ``rows``: ``summaries.experts``."""
-    table = Table(title="SAC experts: return of the first and of the last recorded episode", title_justify="left")
+    table = NarrowTable(title="SAC experts: return of the first and of the last recorded episode", title_justify="left")
     for name in ("task", "adversary", "first", "last"):
         table.add_column(name, justify="left" if name in ("task", "adversary") else "right")
     for row in rows:
@@ -136,7 +157,7 @@ def kl_table(report: Mapping[str, Any], suffix: str, title: str) -> Table:
     contexts = report[f"kl_nats{suffix}_cells"][0]["contexts"]
     over = f"{contexts} contexts of each kind and p"
     caption = f"one training: +- is the standard error over {over}; it says nothing about other training seeds"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    table = NarrowTable(title=title, title_justify="left", caption=caption, caption_justify="left")
     for name in ("goals", "context", "p", "KL", "+-", "goal met", "not met", "met in"):
         table.add_column(name, justify="left" if name in ("goals", "context") else "right")
     for name, goals in ((f"kl_nats{suffix}", "trained on"), (f"kl_heldout{suffix}", "never trained on")):
@@ -159,7 +180,7 @@ def gap_table(report: Mapping[str, Any], title: str) -> Table:
     """
     first = next(iter(report["paper_gap"].values()))
     caption = f"{statistics.resampled(1, first['tasks'], first['seeds'], first['episodes'])}; the same resamples for both"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    table = NarrowTable(title=title, title_justify="left", caption=caption, caption_justify="left")
     for name in ("goals", "p", "model", "exact", "gap", "95%", "difference"):
         table.add_column(name, justify="left" if name in ("goals", "difference") else "right")
     for name, goals in (("paper_gap", "never trained on"), ("paper_gap_train", "trained on")):

@@ -53,6 +53,11 @@ def version_file(folder: Path, version: int) -> Path:
     return folder / "checkpoints" / f"version-{version:04d}.npz"
 
 
+def partial_file(folder: Path) -> Path:
+    """The checkpoint file of a fit that is not finished, in a run folder."""
+    return folder / "checkpoints" / "partial.npz"
+
+
 def newest_version(folder: Path) -> int:
     """The newest version that has a checkpoint in a run folder; -1 if there is none."""
     names = (folder / "checkpoints").glob("version-[0-9][0-9][0-9][0-9].npz")

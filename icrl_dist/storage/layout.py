@@ -17,7 +17,7 @@ NAMES = {
     "report": _REPORTS,
     "results": r"(online|offline|posterior|label_quality|experts)-[0-9a-f]{8}-\d{8}T\d{6}\.\d{6}Z\.parquet",
     "tensorboard": r"events\.out\.tfevents\..+",
-    "": r"(run\.toml|(env|fork|result)\.json|metrics\.jsonl|agent\.npz|learner\.(log|err)|endpoint"
+    "": r"(run\.toml|(env|fork|result)\.json|(metrics\.jsonl|learner\.(log|err))(\.\d)?|agent\.npz|endpoint"
     r"|\.(lock|replacement|beginning))",
 }
 """The folders within a run folder, the deepest first, each with a pattern of the file names that this program writes."""

@@ -17,6 +17,17 @@ _REPEAT_S = 30.0
 """Seconds before an active alert is reported again because its text has changed."""
 _WINDOW_S = 10.0
 """Seconds over which the workers' waiting time is measured."""
+_BURST, _EVERY_S = 50, 10.0
+"""Reports of alerts that begin or change: so many at once, then one in so many seconds."""
+
+KINDS = ("collapse", "zero", "ingest", "labels", "silent", "other")
+"""What the name of an alert begins with."""
+
+
+def alert_kind(name: str) -> str:
+    """The kind of an alert: ``silent`` for ``silent w0``."""
+    kind = name.partition(" ")[0]
+    return kind if kind in KINDS else "other"
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,7 @@ class Alerts:
         self._returns: dict[int, dict[tuple[int, int, int], float]] = {}
         self._agreement: dict[int, float] = {}
         self._waited: deque[tuple[float, dict[str, float]]] = deque()
+        self._allowed, self._allowed_at = float(_BURST), 0.0
 
     def add_return(self, place: tuple[int, int, int], version: int, value: float) -> None:
         """Policy ``version`` (-1 for none) had the return ``value`` in trial ``place``: task, variation, trial."""
@@ -87,21 +99,31 @@ class Alerts:
     def check(self, silent: Mapping[str, float], now: float) -> list[Alert]:
         """The alerts that began, ended, or have another text than in their last report.
 
-        ``silent``: seconds since each worker's last message; ``now``: Unix seconds.
+        A storm of alerts is reported in part (``_BURST``); ``active`` has all of them.  ``silent``: seconds since each
+        worker's last message; ``now``: Unix seconds.
         """
         found = dict(filter(None, (self._collapsed(), self._zero(), self._ingest(), self._labels())))
         for worker, seconds in silent.items():
             if 0 < self._config.silent_s < seconds:
                 found[f"silent {worker}"] = f"worker {worker} has been silent for {self._config.silent_s:g} s"
-        ended = [name for name in self._active if name not in found]
-        changed = [Alert(name, False, f"over: {self._active.pop(name).text}") for name in ended]
+        ended = [self._active.pop(name) for name in list(self._active) if name not in found]
+        changed = [Alert(alert.name, False, f"over: {alert.text}") for alert in ended if alert.reported[0]]
         for name, text in found.items():
             alert = self._active.setdefault(name, ActiveAlert(name, text, now, ("", float("-inf"))))
             alert.text = text
-            if text != alert.reported[0] and not 0 <= now - alert.reported[1] < _REPEAT_S:
+            if text != alert.reported[0] and not 0 <= now - alert.reported[1] < _REPEAT_S and self._allows(now):
                 alert.reported = text, now
                 changed.append(Alert(name, True, text))
         return changed
+
+    def _allows(self, now: float) -> bool:
+        """Whether one more report is allowed; one that is not is made later if its alert is still active."""
+        self._allowed = min(_BURST, self._allowed + max(0.0, now - self._allowed_at) / _EVERY_S)
+        self._allowed_at = now
+        if self._allowed < 1:
+            return False
+        self._allowed -= 1
+        return True
 
     def _collapsed(self) -> tuple[str, str] | None:
         if len(self._returns) < 2 or not self._config.collapse:

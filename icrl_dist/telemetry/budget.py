@@ -6,6 +6,7 @@ import logging
 import time
 
 from icrl_dist.stream.excerpts import plain_lines
+from icrl_dist.telemetry.stamps import stamp
 
 
 class Budget:
@@ -50,15 +51,8 @@ class LogLines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         return plain_lines(super().format(record)) + self._budget(record).note()
 
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802
+        return stamp(record.created)
+
     def _budget(self, record: logging.LogRecord) -> Budget:
         return self._budgets.setdefault((record.pathname, record.lineno), Budget(*self._rates))
-
-
-def log_to(file: str) -> None:
-    """Write the log lines of this process to a file, as ``LogLines``; does nothing if they are written elsewhere."""
-    if logging.getLogger().handlers:
-        return
-    handler, lines = logging.FileHandler(file, encoding="utf-8"), LogLines()
-    handler.setFormatter(lines)
-    handler.addFilter(lines)
-    logging.basicConfig(level=logging.INFO, handlers=[handler])

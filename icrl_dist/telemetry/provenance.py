@@ -100,6 +100,15 @@ def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
 
 def sessions(folder: Path) -> list[dict[str, Any]]:
     """The records of a run's sessions, oldest first; empty if ``env.json`` is missing or damaged."""
+    return _read(folder) or []
+
+
+def readable(folder: Path) -> bool:
+    """Whether ``env.json`` holds records of sessions, or none of them yet."""
+    return _read(folder) is not None
+
+
+def _read(folder: Path) -> list[dict[str, Any]] | None:
     try:
         found = json.loads((folder / FILE).read_text())
         if "versions" in found:  # version 0.1.0 wrote one record, with other names
@@ -107,18 +116,9 @@ def sessions(folder: Path) -> list[dict[str, Any]]:
             package = versions.pop("icrl-dist", "")
             others = {name: found[name] for name in ("platform", "cores") if name in found}
             return [{"package_version": package, "libraries": {"python": found.get("python", ""), **versions}, **others}]
-        return [dict(one) for one in found.get("sessions", [])]
-    except (OSError, ValueError, TypeError, AttributeError):
-        return []
-
-
-def readable(folder: Path) -> bool:
-    """Whether ``env.json`` holds records of sessions, or none of them yet."""
-    try:
-        found = json.loads((folder / FILE).read_text())
-    except (OSError, ValueError):
-        return False
-    return isinstance(found, dict) and ("versions" in found or isinstance(found.get("sessions"), list))
+        return [dict(one) for one in found["sessions"]]
+    except (OSError, ValueError, TypeError, AttributeError, KeyError):
+        return None
 
 
 def create(folder: Path) -> None:

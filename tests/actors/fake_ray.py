@@ -31,6 +31,8 @@ class FakeRay:
         scheduling_strategies=SimpleNamespace(NodeAffinitySchedulingStrategy=lambda node, soft: (node, soft))
     )
 
+    _private = SimpleNamespace(utils=SimpleNamespace(set_sigterm_handler=lambda handler: None))
+
     def __init__(self, *cores):
         self.cores = dict(enumerate(cores))
         """Cores of each node; None: the node has left."""

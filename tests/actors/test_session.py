@@ -30,11 +30,13 @@ class FakeRay:
         self._private = SimpleNamespace(
             services=SimpleNamespace(resolve_ip_for_localhost=lambda host: "192.0.2.2"),
             worker=SimpleNamespace(print_to_stdstream=print),
+            utils=SimpleNamespace(set_sigterm_handler=lambda handler: signal.signal(signal.SIGTERM, handler)),
         )
 
     def init(self, **options):
         assert options["num_cpus"] == 2 and options["address"] == "local"
         assert self._private.services.resolve_ip_for_localhost("127.0.0.1") == options["_node_ip_address"] == "127.0.0.1"
+        self._private.utils.set_sigterm_handler(lambda *_: sys.exit(1))
         self.folders.append(Path(options["_temp_dir"]))
         assert len(f"{self.folders[-1]}/session_2026-11-30_10-33-20_824709_1234567/sockets/plasma_store") <= 107
         (self.folders[-1] / "session_2026-11-30" / "logs").mkdir(parents=True)
@@ -212,12 +214,19 @@ def test_a_running_time_does_not_count_a_stop(monkeypatch):
 
 
 @pytest.mark.integration
-def test_sigterm_while_ray_starts_reaches_the_handler_of_the_program_and_leaves_nothing(fake_ray):
-    ray, received = fake_ray(1, SystemExit(1)), list[int]()
+def test_sigterm_while_ray_starts_reaches_the_handler_of_the_program_and_leaves_nothing(fake_ray, monkeypatch):
+    ray, received, init = fake_ray(0), list[int](), FakeRay.init
+
+    def terminated(self, **options):
+        init(self, **options)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(FakeRay, "init", terminated)
     before = signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
     try:
-        with pytest.raises(SessionFailed):
-            Session(ray, lambda text: None, num_cpus=2)
+        Session(ray, lambda text: None, num_cpus=2).close()
+        ray._private.utils.set_sigterm_handler(signal.SIG_DFL)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL, "Ray's function works again"
     finally:
         signal.signal(signal.SIGTERM, before)
     assert received == [signal.SIGTERM] and not any(ray.alive())

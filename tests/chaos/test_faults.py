@@ -36,7 +36,7 @@ def test_the_schedule_is_a_function_of_the_seed():
     assert all(0 < strike.after <= strike.of / 2 + 1 for strike in drawn.values())
     for fault in schedule.FAULTS:
         phases = {strike.name for key, strike in drawn.items() if key[1] == fault}
-        assert phases == {"adapt/0", "adapt/1"} | ({"pretrain/0"} if fault != "flip-byte" else set())
+        assert phases == {"adapt/0", "adapt/1"} | ({"pretrain/0"} if fault not in ("flip-byte", "flip-checkpoint") else set())
     assert {strike.fit for strike in drawn.values()} == {False, True}
 
 
@@ -91,8 +91,7 @@ def test_metrics_on_a_full_disk_name_the_remedy(tmp_path):
     remedy = r"metrics.jsonl: could not be written \(No space left on device\): free space, then use --resume"
     with pytest.raises(StoreError, match=remedy):
         metrics.write(1, "fit", loss=1.0)
-    with pytest.raises(StoreError, match=remedy):
-        metrics.close()  # its buffer cannot be written either
+    metrics.close()
 
 
 def test_a_full_disk_is_reported_in_one_line_with_the_remedy(capsys, monkeypatch):

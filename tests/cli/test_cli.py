@@ -36,7 +36,7 @@ def refused(capsys, *arguments):
         ("[darkroom]\nsiz = 4", r"unknown key darkroom.siz; did you mean 'size'\?"),
         ("[darkrom]\nsize = 4", r"unknown key darkrom; did you mean 'darkroom'\?"),
         ('[darkroom]\nsize = "7"', r"darkroom.size = '7': expected int, got str"),
-        ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has at least 2 cells"),
+        ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has 2 to 1000 cells"),
         ("[adversary]\np_max = 1.5", r"adversary.p_max = 1.5: a probability lies in \[0, 1\]"),
         ("[evaluate]\np = [0.0, -0.1]", r"evaluate.p = -0.1: a probability lies in \[0, 1\]"),
         ('method = "ppo"', r"method = 'ppo': choose one of dpt, experts, icaa, icag"),
@@ -95,7 +95,7 @@ def test_a_port_in_use(capsys, tmp_path):
         ("a.b.c=1", "SECTION.NAME=VALUE"),
         ("seed.x=1", "seed is not a section"),
         ("adversary.count=two", "adversary.count = 'two': expected int"),
-        ("stream.staleness=-1", "stream.staleness = -1: must not be negative"),
+        ("stream.staleness=-1", "stream.staleness = -1: must be from 0 to 2^31 - 1"),
     ],
 )
 def test_an_invalid_setting(capsys, tmp_path, setting, expected):

@@ -13,6 +13,7 @@ import time
 import pytest
 
 from icrl_dist.config.run import dumps
+from icrl_dist.storage.checkpoint import partial_file
 from learner import checkpoints
 
 pytestmark = pytest.mark.integration
@@ -76,7 +77,7 @@ def test_a_terminal_that_goes_away_ends_the_run_with_a_checkpoint(in_terminal, t
     process, terminal = in_terminal(10**6, signal.SIG_DFL)
     os.close(terminal)  # the kernel sends SIGHUP, and every further output fails with EIO
     assert process.wait(60) == 130
-    assert checkpoints.read_manifest(tmp_path / "run" / "checkpoints" / checkpoints.PARTIAL)["step"] > 0
+    assert checkpoints.read_manifest(partial_file(tmp_path / "run"))["step"] > 0
 
 
 def test_with_sighup_ignored_the_run_goes_on_without_its_terminal(in_terminal, tmp_path):

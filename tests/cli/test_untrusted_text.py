@@ -63,7 +63,7 @@ def test_the_display_shows_any_text_of_an_event(terminal, text):
     written = _OWN_CODES.sub("", output.getvalue()) if terminal else output.getvalue()
     assert is_plain("".join(c for c in written if c not in "\n\r"))
     if not terminal:
-        assert f"it says {plain(text, 1000)}".rstrip() in [line.rstrip() for line in written.splitlines()]
+        assert any(line.rstrip().endswith(f"it says {plain(text, 1000)}".rstrip()) for line in written.splitlines())
 
 
 def test_markup_of_an_event_is_shown_and_not_executed():

@@ -77,7 +77,7 @@ def _outside(one: Range) -> list[Any]:
             case at.Ge(int() | float() as limit):
                 values.append(limit - step)
             case at.Le(int() | float() as limit):
-                values.append(limit + step)
+                values.append(limit + max(step, 0 if one.whole else 0.001 * limit))
             case at.MinLen(length):
                 values.append((0.1,) * (length - 1))
     return [float(value) if not one.whole and not isinstance(value, tuple) else value for value in values]

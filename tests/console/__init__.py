@@ -1,0 +1,1 @@
+"""Tests of icrl_dist.console."""

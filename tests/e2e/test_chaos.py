@@ -7,10 +7,11 @@ import psutil
 import pytest
 
 from icrl_dist.chaos import campaign, schedule
-from icrl_dist.chaos.faults import FAULTS, Struck
+from icrl_dist.chaos.faults import FAULTS
+from icrl_dist.chaos.striking import Struck
 from icrl_dist.cli import main
 
-SMALL = ["--set", "icaa.rounds=0", "--set", "pretrain.steps=20"]
+SMALL = ["--set", "icaa.rounds=1", "--set", "pretrain.steps=20"]
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +26,8 @@ EVIDENCE = {
     "kill-worker": "worker deaths: 1",
     "torn-tail": "segment-",
     "kill-raylet": "is gone; ",
+    "kill-run": "other processes ended within",
+    "flip-checkpoint": "T^0 is fitted again: True",
 }
 
 
@@ -41,7 +44,7 @@ def child_processes():
     return [p.pid for p in psutil.Process().children(recursive=True)]
 
 
-@pytest.mark.parametrize("fault", ["kill-worker", "torn-tail", "kill-raylet"])
+@pytest.mark.parametrize("fault", sorted(EVIDENCE))
 def test_a_fault_lands_and_changes_no_digest(capsys, reference, tmp_path, fault):
     before = child_processes()
     code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", fault)
@@ -53,7 +56,7 @@ def test_a_fault_lands_and_changes_no_digest(capsys, reference, tmp_path, fault)
 
 def test_a_fault_that_does_not_land_fails_the_command(capsys, reference, tmp_path, monkeypatch):
     draw = schedule.draw
-    late = lambda *drawn: dataclasses.replace(draw(*drawn), phase=1, fit=True, after=10**6)  # noqa: E731
+    late = lambda *drawn: dataclasses.replace(draw(*drawn), phase=2, fit=True, after=10**6)  # noqa: E731
     monkeypatch.setattr(schedule, "draw", late)
     monkeypatch.setattr(campaign, "TRIES", 1)
     code, (row,), text = chaos(capsys, reference, tmp_path, "--faults", "kill-worker")

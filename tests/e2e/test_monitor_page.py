@@ -15,11 +15,13 @@ from icrl_dist.monitor import variations
 from icrl_dist.monitor.drawing import optimum
 from icrl_dist.monitor.evaluation import of_rows
 from icrl_dist.monitor.feed import LiveFeed
+from icrl_dist.monitor.folder import serving_folder
 from icrl_dist.monitor.page import serving_run
 from icrl_dist.stream import wire
 from icrl_dist.stream.memory_link import MemoryHub
 from icrl_dist.stream.validation import from_array
 from tests.e2e.training import SMOKE, endpoint_of, finish, kill_the_tree, start, wait_for, workers_of
+from tests.monitor.fake_feed import run_folder
 from tests.monitor.test_evaluation import evaluated
 from tests.monitor.test_page import CountingFeed
 from tests.optional import known
@@ -79,18 +81,18 @@ class MonitorPlane:
         self.progress()
         wait_for(lambda: self.feed.state.snapshot(0.0)["run"]["name"], "the name of the run", SHORT_S)
 
-    def put(self, payload, topic="any", run=None):
+    def put(self, payload, topic, run=None):
         self.link.publish(f"icrl/{run or self.name}/mon/{topic}", payload, droppable=True)
 
     def send(self, kind, **fields):
-        self.put(wire.encode_message(kind, **{"time": time.time(), "worker": "w0", **fields}))
+        self.put(wire.encode_message(kind, **{"time": time.time(), "worker": "w0", **fields}), kind)
 
     def progress(self, **fields):
         counts = {"round": 0, "step": 5, "steps": 10, "version": 0, "trajectories": 5, "workers": 1, "lag": 0}
         self.send("learner", **{"stage": "collect", "phase": "adapt", "drops": {}, "doing": [], **counts, **fields})
 
     def send_return(self, *positional, **fields):
-        self.put(self.trajectories(*positional, **fields))
+        self.put(self.trajectories(*positional, **fields), "trajectories")
 
     def trajectories(self, variation, trial, total, kind="uniform", problem="darkroom", round=0, p=0.25, **fields):
         room = {"size": 3, "horizon": 8, "goal": [1, 1]}
@@ -155,7 +157,7 @@ def test_sorting_filters_and_the_dialog_of_a_variation(page):
         last.focus()
         page.keyboard.press("Enter")
         expect_cells(page, 4, ["6", "5", "5", "4", "4", "3"])
-        expect(page, "th[aria-sort=descending]").to_have_text("Last")
+        expect(page, "#variation-table th[aria-sort=descending]").to_have_text("Last")
         last.click()
         expect_cells(page, 4, ["3", "4", "4", "5", "5", "6"])
         page.get_by_label("Adversary").select_option("uniform")
@@ -201,10 +203,13 @@ def test_hostile_messages_are_shown_as_text_or_ignored(page):
         run.send("event", what="alert", alert=MARKUP, active=True, text=MARKUP)
         run.send("run", **ABOUT | {"method": MARKUP, "problem": MARKUP})
         run.send("run", **ABOUT | {"began": 1e308})
-        run.put(b"\xff" * 100)
-        run.put(msgpack.packb({"v": wire.VERSION, "kind": "event", "text": "x" * (2 << 20)}))
-        run.put(msgpack.packb({"v": wire.VERSION, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}))
-        run.put(wire.encode_message("event", time=1.0, what="x", text="x"), run="another")
+        run.put(b"\xff" * 100, "event")
+        run.put(msgpack.packb({"v": wire.VERSION, "kind": "event", "text": "x" * (2 << 20)}), "event")
+        run.put(
+            msgpack.packb({"v": wire.VERSION, "kind": "trajectories", "variations": [{"returns": [float("nan")]}]}),
+            "trajectories",
+        )
+        run.put(wire.encode_message("event", time=1.0, what="x", text="x"), "event", run="another")
         page.goto(url)
         page.locator("#worker-table").get_by_text(MARKUP).first.wait_for()
         expect(page, "#name").to_have_text(name)
@@ -384,3 +389,55 @@ def test_a_real_run_and_a_killed_worker(page, tmp_path):
             view.send_signal(signal.SIGINT)
             assert finish(view) is not None and view.returncode == 0
         kill_the_tree(training)
+
+
+def test_a_folder_of_runs_is_followed_and_two_are_compared(page, tmp_path):
+    folder, odd = tmp_path / "runs", MARKUP.replace("/", "")
+    page.allowed_errors = r"status of (404|503)"  # a run is asked for before its files are written, or after it is gone
+    with serving_folder(folder, "127.0.0.1", 0) as url:
+        page.goto(url)
+        expect(page, "#headline").to_contain_text(f"Waiting for the first run in {folder}")
+        expect(page, "#runs-note").to_have_text("No run yet: the first one is shown when it begins.")
+        run_folder(folder / "first")
+        expect(page, "#name").to_have_text("first")
+        expect(page, "#headline").to_contain_text("Training finished")
+        run_folder(folder / "second")
+        expect(page, "#name").to_have_text("second")
+        expect(page, "#run-table tbody th").to_have_text(["second", "first"])
+        expect(page, "#run-table tbody tr.shown th").to_have_text("second")
+
+        page.get_by_role("button", name="Compare second with first").click()
+        expect(page, "#compare-names").to_have_text("second and first")
+        expect(page, "#compare-training .key").to_have_text(
+            [re.compile("^episode"), re.compile(r"^second \(adapt/0\)"), re.compile("^first")]
+        )
+        colors = page.eval_on_selector_all("#compare-training .swatch", "all => all.map((one) => one.style.color)")
+        assert len(set(colors)) == 2
+        expect(page, "#compare-training-note").to_contain_text("second: n = 6 of 6 variations; first: n = 6 of 6 variations")
+        expect(page, "#compare-table thead th").to_have_text(["second", "first"])
+        wide = "[...document.querySelectorAll('body, .card, .scroll')].filter((e) => e.scrollWidth > e.clientWidth + 1).length"
+        for width, height in ((1280, 720), (1440, 900), (2560, 1440)):
+            page.set_viewport_size({"width": width, "height": height})
+            until(page, "document.querySelector('#compare-training canvas').clientHeight > 100")
+            until(page, f"{wide} === 0")
+
+        page.locator("#run-table tbody tr").nth(1).click()
+        expect(page, "#name").to_have_text("first")
+        expect(page, "#comparison").to_be_hidden()
+        run_folder(folder / "third")
+        (folder / odd).mkdir()
+        (folder / odd / "run.toml").touch()
+        expect(page, "#run-table tbody tr").to_have_count(4)
+        expect(page, "#run-table").to_contain_text(odd)
+        expect(page, "#name").to_have_text("first")  # chosen, so it is not replaced
+        page.reload()
+        expect(page, "#name").to_have_text("first")
+        shutil.rmtree(folder / odd)
+        page.get_by_role("button", name="Follow the newest").click()
+        expect(page, "#name").to_have_text("third")
+        page.locator("#variation-table tbody tr").first.click()
+        page.get_by_role("button", name=f"Copy: icrl-dist explain {folder}/third adapt/0/").first.wait_for()
+        page.keyboard.press("Escape")
+        page.get_by_label("Position in the recording").press("Home")
+        expect(page, "#at").to_contain_text("0:0")
+        page.goto("about:blank")

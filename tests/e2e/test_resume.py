@@ -7,6 +7,7 @@ import threading
 import psutil
 import pytest
 
+from icrl_dist.storage.checkpoint import partial_file
 from icrl_dist.stream import monitor_messages, wire
 from icrl_dist.stream.zenoh_link import ZenohLink
 from learner import checkpoints
@@ -76,7 +77,7 @@ def test_killing_the_command_or_all_processes_changes_nothing_and_leaves_no_proc
         assert not [p.cmdline() for p in alive], "processes without a parent ended by themselves"
 
     act_when(folder, fitting, kill_the_command)
-    assert len(family) >= 5 and checkpoints.read_manifest(folder / "checkpoints" / checkpoints.PARTIAL)["step"] > 0
+    assert len(family) >= 5 and checkpoints.read_manifest(partial_file(folder))["step"] > 0
     assert not (folder / "result.json").exists()
     process = start(*run, "--actors", "1", "--resume", start_new_session=True)
     kill_when(process, folder, collecting("adapt/0/", 30))

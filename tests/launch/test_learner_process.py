@@ -63,7 +63,7 @@ def test_an_event_that_a_killed_learner_wrote_in_part_is_left_out(start):
 def test_a_learner_ends_in_its_own_time_when_the_run_fails(start, tmp_path):
     """Its checkpoint may take longer than the end of a learner that has finished."""
     event = json.dumps({"event": "note", "text": ""})
-    checkpoint = "sleep 0.3; touch $3/checkpoint; exit 130"
+    checkpoint = "sleep 0.3; touch $4/checkpoint; exit 130"
     process = start(f"trap '{checkpoint}' TERM; echo '{event}' >&$events; while :; do sleep 0.05; done")
     texts(process, 1)
     process.end()

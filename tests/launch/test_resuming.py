@@ -19,8 +19,9 @@ from icrl_dist.config.resuming import FREE
 from icrl_dist.config.run import ConfigError, dumps, load, load_folder, override
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.learner_process import TrainFailed
+from icrl_dist.storage.checkpoint import partial_file
 from icrl_dist.storage.files import StoreError
-from learner import checkpoints, reporter
+from learner import reporter
 from tests.launch.test_run_folder import files
 from tests.learner.test_service import no_tensorboard
 
@@ -55,7 +56,7 @@ def trained(monkeypatch):
     def train_inline(run, folder, report):
         made.append((run, folder))
         (folder / "checkpoints").mkdir(exist_ok=True)
-        (folder / "checkpoints" / checkpoints.PARTIAL).touch()
+        partial_file(folder).touch()
         raise error[0]
 
     error = [launch.TrainInterrupted()]
@@ -146,7 +147,7 @@ def test_a_fit_that_is_resumed_with_every_free_number_changed_gives_the_same_byt
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     with pytest.raises(icrl_dist.TrainInterrupted):
         icrl_dist.train(module_run, "runs/changed", engine="inline", progress=stop)
-    assert (here / "runs" / "changed" / "checkpoints" / checkpoints.PARTIAL).exists()
+    assert partial_file(here / "runs" / "changed").exists()
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     run = override(module_run, [setting.replace("PORT", port) for setting in CHANGED], "--set")

@@ -32,6 +32,7 @@ OURS = (
         "dataset/.segment-000001.frames.9.part",
     ),
     *("checkpoints/version-0000.npz", "checkpoints/partial.npz", "checkpoints/.version-0001.npz.7.part"),
+    *("metrics.jsonl.1", "metrics.jsonl.4", "learner.log.2", "learner.err.1"),
     *("crashes/w0-1.json", "crashes/w0.stacks", "tensorboard/events.out.tfevents.1.host.2.0"),
     *("report/online-T2-0a1b2c3d-paper-unseen-p0_0.2-3episodes-2seeds.json", "report/adaptation.png", "report/online.json"),
 )

@@ -29,6 +29,7 @@ from icrl_dist.console.signals import SIGNALS, interruptible
 from icrl_dist.launch import learner_process, resuming, whole_run
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout, reports
+from icrl_dist.storage.checkpoint import partial_file
 from learner import checkpoints, reporter
 from tests.actors.fake_ray import FakeRay
 from tests.calls import failing
@@ -272,7 +273,7 @@ def test_a_receiver_of_events_that_fails_ends_the_run_with_a_checkpoint_of_the_f
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     with pytest.raises(error, match="the output is closed"):
         icrl_dist.train(module_run, tmp_path / "run", engine="inline", progress=receive)
-    assert checkpoints.read_manifest(tmp_path / "run" / "checkpoints" / checkpoints.PARTIAL)["step"] == 3
+    assert checkpoints.read_manifest(partial_file(tmp_path / "run"))["step"] == 3
 
 
 def test_quarantined_variations_are_in_the_result_and_give_exit_code_1(module_run, tmp_path, monkeypatch, capsys):

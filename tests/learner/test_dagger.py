@@ -7,6 +7,7 @@ import pytest
 from icrl_dist.config.sections import DAggerConfig
 from icrl_dist.diagnostics import explain
 from icrl_dist.launch.train import TrainInterrupted
+from icrl_dist.storage.checkpoint import partial_file
 from icrl_dist.types import Identity
 from learner import checkpoints, reporter, service
 from tests.calls import noting
@@ -43,7 +44,7 @@ def test_an_interrupted_dagger_round_continues_to_the_same_bytes(run, tmp_path, 
     monkeypatch.setattr(reporter, "PERIOD_S", 0.0)
     with pytest.raises(TrainInterrupted):
         run_inline(run, tmp_path / "stopped", stop)
-    partial = checkpoints.read_manifest(tmp_path / "stopped" / "checkpoints" / checkpoints.PARTIAL)
+    partial = checkpoints.read_manifest(partial_file(tmp_path / "stopped"))
     assert partial["next_version"] == 2 and 0 < partial["step"] < 6
     monkeypatch.setattr(service.Service, "run", real)
     assert same(run_inline(run, tmp_path / "stopped", resume=True), whole)

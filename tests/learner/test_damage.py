@@ -14,10 +14,10 @@ import pytest
 from icrl_dist.config.run import ConfigError, Run, dumps, override
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.train import TrainInterrupted
-from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, partial_file, save_checkpoint, version_file
 from icrl_dist.storage.dataset import Dataset, segment_path
 from icrl_dist.storage.files import StoreError
-from learner import checkpoints, reporter, service
+from learner import reporter, service
 from tests.calls import noting
 from tests.learner.test_recovery import flip
 from tests.learner.test_service import no_tensorboard, parent, run_inline, same
@@ -126,7 +126,7 @@ def stopped(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         patch.setattr(reporter, "PERIOD_S", 0.0)
         with pytest.raises(TrainInterrupted):
             run_inline(run, folder, stop)
-    return folder / "checkpoints" / checkpoints.PARTIAL
+    return partial_file(folder)
 
 
 @pytest.mark.parametrize("damage", ["a flipped bit", "no bytes", "other weights", "another seed", "no step"])

@@ -14,7 +14,7 @@ from icrl_dist.config.run import ConfigError, dumps
 from icrl_dist.launch import train
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.problems.darkroom.problem import DarkRoomProblem
-from icrl_dist.storage.checkpoint import version_file
+from icrl_dist.storage.checkpoint import partial_file, version_file
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.telemetry.metrics import Metrics
@@ -98,7 +98,7 @@ def test_a_run_stopped_at_any_step_resumes_to_the_same_bytes(small_run, tmp_path
         run_inline(small_run, folder, stop_at)
     assert stopped
     if what == "fit":
-        partial = checkpoints.read_manifest(folder / "checkpoints" / checkpoints.PARTIAL)
+        partial = checkpoints.read_manifest(partial_file(folder))
         assert partial["next_version"] == next_version and 0 < partial["step"] < small_run.pretrain.steps
     assert same(run_inline(small_run, folder, resume=True), undisturbed)
 

@@ -62,13 +62,46 @@ def test_every_frame_has_a_force():
     assert cart[1] == cart[3]
 
 
-def test_hand_and_object_are_drawn_from_above():
+def test_hand_gripper_and_object_of_an_arm_are_drawn():
     states = np.zeros((3, 39))
-    states[:, :3], states[:, 4:7] = [0.1, 0.6, 0.2], [[0.0, 0.6, 0.02], [0.01, 0.65, 0.02], [0.02, 0.7, 0.02]]
+    states[:, :3], states[:, 3] = [0.1, 0.6, 0.2], [0.0, 0.5, 1.2]
+    states[:, 4:7] = [[0.0, 0.6, 0.02], [0.01, 0.65, 0.02], [0.02, 0.7, 0.1]]
     drawn = drawing.of(message("metaworld-pick-place", {"goal": [0.1, 0.8, 0.2], "object": [0.0, 0.6, 0.02]}, states))
-    assert drawn["goal"] == [0.1, 0.8]
-    assert drawn["paths"][0] == {"name": "hand", "points": [[0.1, 0.6]] * 3}
-    assert drawn["paths"][1] == {"name": "object", "points": [[0.0, 0.6], [0.01, 0.65], [0.02, 0.7]]}
+    assert drawn == {
+        "kind": "arm",
+        "hand": [[0.1, 0.6, 0.2]] * 3,
+        "object": [[0.0, 0.6, 0.02], [0.01, 0.65, 0.02], [0.02, 0.7, 0.1]],
+        "opening": [0.0, 0.5, 1.0],
+        "goal": [0.1, 0.8, 0.2],
+    }
+
+
+@pytest.mark.parametrize("kind", ["dmc-cheetah-run", "dmc-hopper-hop", "dmc-walker-run"])
+def test_the_travel_of_a_body_is_that_of_the_simulation(kind):
+    game = DMC([domains.task(kind)])
+    states = [game.reset([np.random.default_rng(3)])[0]]
+    place, rng = int(game._models[0].joint("rootx").qposadr[0]), np.random.default_rng(4)
+    positions = [game._data[0].qpos[place]]
+    for _ in range(60):
+        action = rng.uniform(-1, 1, (1, game.spec.actions)).astype(np.float32)
+        states.append(game.step(action, np.zeros((1, game.disturbance), np.float32)).observation[0])
+        positions.append(game._data[0].qpos[place])
+    moved = np.array(positions) - positions[0]
+    drawn = drawing.of(message(kind, {}, states) | {"every": 1})
+    assert drawn["ground"] == 0.0 and np.abs(moved).max() > 0.02
+    np.testing.assert_allclose(drawn["travel"], moved, atol=0.01 + 0.05 * np.abs(moved).max())
+    skipped = drawing.of(message(kind, {}, states[::2]) | {"every": 2})
+    np.testing.assert_allclose(skipped["travel"], moved[::2], atol=0.02 + 0.2 * np.abs(moved).max())
+
+
+def test_a_body_that_stays_has_no_travel_and_no_ground_is_seen_from_above():
+    for kind, components in (("dmc-cartpole-balance", 5), ("dmc-reacher-easy", 6)):
+        drawn = drawing.of(message(kind, {}, np.zeros((4, components))))
+        assert drawn["travel"] == [] and drawn["ground"] is None
+    states = np.zeros((3, 78))
+    states[:, 44] = 1.0
+    drawn = drawing.of(message("dmc-quadruped-walk", {}, states) | {"every": 1})
+    assert drawn["ground"] is None and drawn["travel"] == pytest.approx([0.0, 0.02, 0.04])
 
 
 @pytest.mark.parametrize(

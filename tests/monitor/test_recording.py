@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import time
 
 import pytest
@@ -118,7 +119,7 @@ def test_a_crashed_run_with_a_torn_last_line_is_played_to_its_end(finished, tmp_
     crashed = tmp_path / "crashed"
     crashed.mkdir()
     (crashed / "run.toml").write_text((folder / "run.toml").read_text())
-    (crashed / "dataset").symlink_to(folder / "dataset")
+    shutil.copytree(folder / "dataset", crashed / "dataset")
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     (crashed / "metrics.jsonl").write_text("\n".join(lines[:4]) + '\n{"time": 1.5, "sta')
     state, recording = played(crashed)

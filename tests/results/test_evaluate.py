@@ -30,7 +30,7 @@ from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.returns import returns
 from icrl_dist.results.statistics import mean_and_error
 from icrl_dist.results.tables import returns_table
-from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, version_file
 from icrl_dist.storage.files import StoreError
 from icrl_dist.types import Variation
 from learner import checkpoints
@@ -270,8 +270,8 @@ def test_evaluations_add_rows_and_replace_no_report_of_other_settings(folder, ca
     assert set(online.p) == {0.0, 0.2} and set(frame.suite) == {"online", "offline"}
     assert not online.duplicated(["agent", "p", "task_index", "evaluation_seed", "episode"]).any()
     assert "not finished" not in capsys.readouterr().out
-    (folder / "run.toml").touch()
     file = version_file(folder, 0)
+    (folder / "run.toml").write_text(str(load_checkpoint(file).manifest["run"]))
     assert main.main(["evaluate", str(file), "--episodes", "1", "--p", "0"]) == 0
     assert len(list((folder / "results").iterdir())) == 5, "rows of a checkpoint file in a run folder belong to the run"
     shutil.copy(file, folder / "agent.npz")

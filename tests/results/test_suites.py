@@ -15,6 +15,7 @@ from rich.console import Console
 import icrl_dist
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError
+from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from tests.results.test_evaluate import folder
 
 __all__ = ["folder"]
@@ -73,7 +74,7 @@ def test_a_folder_whose_name_is_no_utf_8_is_evaluated_and_named_with_escapes(fol
 
 def test_progress_is_shown_if_it_is_asked_for_and_a_function_gets_the_events(folder, capsys):
     events: list[dict[str, Any]] = []
-    (folder / "run.toml").touch()
+    (folder / "run.toml").write_text(str(load_checkpoint(version_file(folder, 0)).manifest["run"]))
     icrl_dist.evaluate(folder, episodes=1, seeds=1, p=[0.0], progress=events.append)
     assert "this run is not finished" in events[0]["text"] and events[-1]["step"] == events[-1]["steps"]
     assert capsys.readouterr().out == ""

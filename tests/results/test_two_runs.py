@@ -103,11 +103,11 @@ def with_bounds(form, value, interval):
 
 
 @pytest.mark.parametrize(("method", "seeds"), [("icag", [1]), ("icaa", [1]), ("icaa", [0, 1])])
-def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method, seeds):
-    """What ``train`` printed for one training, and the same table of two trainings."""
+def test_every_number_of_the_table_of_returns_follows_from_the_rows(runs, method, seeds):
+    """The table of one training, and the same table of two trainings."""
     found = read_results([runs[method, seed].folder for seed in seeds])
     found = found[found.suite == "online"]
-    printed = runs[method, 1].printed if seeds == [1] else rendered(tables.returns_table(found, "two trainings"))
+    printed = rendered(tables.returns_table(found, "trainings"))
     rows = found.to_dict("records")
     header, body = cells_of(printed)
     assert header == ["p", "agent", "ep 1", "ep 2", "ep 3", "last 3", "of oracle"]
@@ -131,6 +131,22 @@ def test_every_number_of_the_table_of_train_follows_from_the_rows(runs, method, 
         value, share = slow_mean(means(scores)), slow_mean(means(scores)) / slow_mean(means(oracle))
         assert cells[5] == f"{value:.1f}"
         assert cells[6] == with_bounds("{:.0%}", share, bounds(share, resampled))
+
+
+@pytest.mark.parametrize("method", ["icag", "icaa"])
+def test_train_prints_four_rows_of_the_largest_p_and_a_conclusion(runs, method):
+    rows = read_results([runs[method, 1].folder])
+    rows = rows[(rows.suite == "online") & (rows.p == max(LEVELS))].to_dict("records")
+    header, body = cells_of(runs[method, 1].printed)
+    assert header == ["agent", "return", "95%", "of oracle"]
+    versions = sorted({row["agent"] for row in rows if row["policy_version"] >= 0}, reverse=True)
+    assert versions[-1] == "t0" and (len(versions) == 2) == (method == "icaa")
+    keys = [*versions, "random", "oracle"]
+    assert [cells[1] for cells in body] == [f"{slow_mean(means(nested(records(rows, agent=key), LAST))):.2f}" for key in keys]
+    newest, other = (f"T^{versions[0][1]}", "T^0" if method == "icaa" else "random")
+    text = unwrapped(runs[method, 1].printed)
+    assert f"{newest} compared with {other} at p = {max(LEVELS):g}: a " in text
+    assert "in this training; one training seed says nothing about other seeds" in text
 
 
 def test_without_a_ceiling_the_interval_is_that_of_the_return():

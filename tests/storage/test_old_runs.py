@@ -18,7 +18,14 @@ from icrl_dist.config.run import ConfigError, Run, load, parse_written
 from icrl_dist.launch import train
 from icrl_dist.monitor.recording import Recording
 from icrl_dist.storage import checkpoint
-from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, require_format, save_checkpoint, version_file
+from icrl_dist.storage.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    partial_file,
+    require_format,
+    save_checkpoint,
+    version_file,
+)
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream.validation import VERSION
@@ -113,14 +120,14 @@ def test_an_old_run_continues_to_the_same_bytes(finished: tuple[Path, dict[str, 
 
 def test_an_unfinished_old_fit_continues(folder: Path) -> None:
     """The entry ``next_version`` of its checkpoint was called ``produces``."""
-    partial = folder / "checkpoints" / checkpoints.PARTIAL
+    partial = partial_file(folder)
     shutil.copy(version_file(folder, 0), partial)
     rewrite(partial, lambda arrays, manifest: manifest.update(produces=1, step=7))
     assert checkpoints.read_manifest(partial)["next_version"] == 1
     version_file(folder, 1).unlink()
     resumed(folder)
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows if row["stage"] == "version"] == [0, 1, 1]
+    assert [row["step"] for row in rows if row["stage"] == "version"] == [0, 1]
 
 
 def test_an_old_run_is_forked(folder: Path, tmp_path: Path) -> None:

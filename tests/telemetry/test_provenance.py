@@ -214,6 +214,7 @@ def test_a_missing_or_damaged_file_is_begun_again(tmp_path: Path, content: str |
     if content is not None:
         (tmp_path / "env.json").write_text(content)
     assert provenance.sessions(tmp_path) == []
-    assert provenance.add_session(tmp_path, -1, {"threads": 2}) == ""
+    damaged = f"{tmp_path / 'env.json'}: was damaged, so its earlier sessions are lost; it is written anew"
+    assert provenance.add_session(tmp_path, -1, {"threads": 2}) == ("" if content is None else damaged)
     (session,) = provenance.sessions(tmp_path)
     assert session["threads"] == 2 and session["cores"] == len(os.sched_getaffinity(0))

@@ -83,8 +83,8 @@ export function color(name) {
  * Connect to the server's events; `handlers` by name of event.  The element `status` shows the state of the connection:
  * "live" once every event has arrived at least once, so that the page shows the server's whole state.
  */
-export function listen(handlers, status) {
-  const source = new EventSource("/events");
+export function listen(handlers, status, address = "/events") {
+  const source = new EventSource(address);
   const missing = new Set(Object.keys(handlers)); // events that have not arrived on this connection
   const show = (kind, text) => {
     if (status.textContent === text) return;

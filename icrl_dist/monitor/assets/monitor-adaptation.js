@@ -24,6 +24,23 @@ export function scaling(rows) {
 /** A row's phase with this name, if it has returns and a divisor. */
 const drawable = (row, name, scale) => row.phases.find((phase) => phase.name === name && phase.trials.length && scale(phase) !== null);
 
+/**
+ * The mean return by episode of a run's newest phase with returns, or null; `scaled`: whether to divide by the optimum, by
+ * default if one is known.  `variations`: number in the mean, `started`: number with returns.
+ */
+export function newestCurve(store, scaled = null) {
+  const rows = [...store.variations.values()];
+  const found = scaling(rows);
+  const scale = scaled === false ? () => 1 : found.scale;
+  const names = rows.flatMap((row) => row.phases.filter((phase) => drawable(row, phase.name, scale)).map((phase) => phase.name));
+  if (!names.length) return null;
+  const name = names.reduce(later);
+  const { run } = store;
+  const started = rows.filter((row) => row.phases.some((phase) => phase.name === name && phase.trials.length)).length;
+  const { begin, means, rows: used } = common(rows, name, scale, run.stage === "collect" && name === `${run.phase}/${run.round}`);
+  return { name, begin, means, scaled: found.scaled, variations: used.length, started };
+}
+
 /** Draw the training returns of rows; `store`: for what is known of the run beside them. */
 export function drawAdaptation(rows, store) {
   const { scaled, scale } = scaling(rows);

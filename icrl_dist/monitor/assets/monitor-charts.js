@@ -136,13 +136,15 @@ export function line(label, name, more = {}) {
   };
 }
 
+const MINUTES = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 180, 360, 720, 1440, 2880, 10080, 43200, 525600];
+
 /** Series of the run over time, in minutes before now. */
 export class Timeline {
   constructor(place, names, least = 1) {
     this.names = names;
     this.chart = new Chart(place, () => ({
       scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low ?? 0), Math.max(least, (high ?? 1) * 1.08)] } },
-      axes: [axis({ size: 22, values: (_, ticks) => ticks.map(ago), space: 60 }), axis()],
+      axes: [axis({ size: 22, values: (_, ticks) => ticks.map(ago), space: 60, incrs: MINUTES }), axis()],
       series: [
         { label: "", format: (value) => (value === undefined ? "" : ago(value)) },
         ...names.map(({ label, ink: name, dash, points }) => line(label, name, { dash: dash ?? [], points: { show: points ?? false, size: 4 } })),
@@ -150,15 +152,19 @@ export class Timeline {
     }));
   }
 
-  draw(series) {
+  /** `history`: means of what is older than the series. */
+  draw(series, history) {
     const last = series.t.at(-1) ?? 0;
     if (series.t.length < 2) return;
-    this.chart.draw([series.t.map((t) => (t - last) / 60), ...this.names.map(({ name }) => series[name])]);
+    const older = history.t.filter((t) => t < series.t[0]).length;
+    const join = (name) => [...(history[name] ?? []).slice(0, older), ...series[name]];
+    this.chart.draw([join("t").map((t) => (t - last) / 60), ...this.names.map(({ name }) => join(name))]);
   }
 }
 
 function ago(minutes) {
   const seconds = Math.round(-minutes * 60);
   if (!seconds) return "now";
+  if (seconds >= 5400) return `−${brief(seconds / 3600)} h`;
   return seconds % 60 ? `−${Math.floor(seconds / 60)}:${String(seconds % 60).padStart(2, "0")}` : `−${seconds / 60} min`;
 }

@@ -16,8 +16,10 @@ function phaseText(phase) {
 }
 
 export class Detail {
-  constructor(store, episodes) {
+  /** `runs`: names the run in addresses. */
+  constructor(store, episodes, runs) {
     this.store = store;
+    this.runs = runs;
     this.episodes = episodes;
     this.dialog = byId("detail");
     this.name = null;
@@ -55,7 +57,7 @@ export class Detail {
     if (!this.name || this.fetching || newest === this.shown) return;
     this.fetching = true;
     try {
-      const answer = await fetch(`/variation/${this.name}`);
+      const answer = await fetch(`/variation/${this.name}${this.runs.query()}`);
       if (!answer.ok) return setText(byId("detail-note"), "The server has no data of this variation any more.");
       const row = await answer.json();
       if (row.name === this.name) {
@@ -108,7 +110,7 @@ export class Detail {
   #lineage(rows) {
     const head = ["Identity", "Return", "Version", "Weights digest", "Worker", "Sent at", "Explain"];
     const body = rows.toReversed().map((row) => {
-      const command = `icrl-dist explain runs/${this.store.run.name} ${row.identity}`;
+      const command = `icrl-dist explain ${this.runs.folder ?? "runs"}/${this.store.run.name} ${row.identity}`;
       const copy = el("button", { type: "button", class: "small-button", title: command, "aria-label": `Copy: ${command}` }, "Copy command");
       copy.addEventListener("click", () => this.#copy(command));
       return el(

@@ -23,8 +23,8 @@ export function setText(element, text) {
 
 /** Style of the badge of a run's or worker's state; the badge also contains the state as text. */
 const KINDS = {
-  collecting: "ok", fitting: "ok", evaluating: "ok", finished: "ok", working: "ok", done: "ok",
-  waiting: "muted", silent: "warn", interrupted: "warn", failed: "bad", gone: "bad",
+  collecting: "ok", fitting: "ok", training: "ok", evaluating: "ok", finished: "ok", working: "ok", done: "ok",
+  waiting: "muted", starting: "muted", silent: "warn", interrupted: "warn", failed: "bad", gone: "bad",
 };
 
 export function badge(element, state, alerts = 0) {

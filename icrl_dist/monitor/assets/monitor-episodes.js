@@ -11,7 +11,8 @@ const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
 const KEYS = {
   room: "Square: the goal. Orange with a cross: actions overridden by the adversary.",
-  sticks: "Bar: the adversary's force, relative to its maximum.",
+  sticks: "Bar: the adversary's force, relative to its maximum. Marks on the ground: meters.",
+  arm: "From the side. Green square: the goal; orange: the object. Only the hand is observed: the arm's angles are assumed.",
   paths: "From above. Square: the goal; line: hand; dashes: object.",
 };
 
@@ -86,6 +87,7 @@ export class Episodes {
     const waiting = [...this.store.episodes.values()].reverse().find((episode) => !shown.has(episode.identity) && episode.time >= (tile.episode?.time ?? 0));
     if (waiting) {
       if (!tile.element.isConnected) byId("episodes").append(tile.element);
+      byId("episodes").classList.toggle("large", waiting.drawing.kind !== "room");
       tile.show(waiting);
       const kinds = new Set(this.tiles.map((each) => each.episode?.drawing.kind).filter(Boolean));
       setText(byId("episodes-key"), [...kinds].map((kind) => KEYS[kind]).join(" "));

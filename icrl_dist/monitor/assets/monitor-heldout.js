@@ -5,12 +5,12 @@ import { Chart, axis, line } from "./monitor-charts.js";
 import { brief, byId, el, plural, setText } from "./monitor-dom.js";
 
 const INKS = { newest: "--series-1", model: "--series-6", reference: ["--series-3", "--series-2", "--series-4", "--series-5"] };
-const VERDICTS = { higher: "higher than T^0", lower: "lower than T^0", "not shown": "a difference from T^0 is not shown" };
+export const VERDICTS = { higher: "higher than T^0", lower: "lower than T^0", "not shown": "a difference from T^0 is not shown" };
 
-const percent = (value) => (value === null ? "–" : `${number(100 * value)}%`);
+export const percent = (value) => (value === null ? "–" : `${number(100 * value)}%`);
 
 /** A value with its interval, in the form of `format`. */
-function interval(numbers, format) {
+export function interval(numbers, format) {
   if (!numbers) return "–";
   const [value, low, high] = numbers;
   return low === null ? format(value) : `${format(value)} [${format(low)}, ${format(high)}]`;

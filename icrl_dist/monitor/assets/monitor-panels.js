@@ -8,8 +8,8 @@ export function drawHeader({ run, alerts, replay, headline }) {
   setText(byId("name"), run.name || "Waiting for a run");
   const warned = alerts.length ? `(${plural(alerts.length, "alert")}) ` : "";
   document.title = run.name ? `${warned}${run.name}: ${run.state}` : "icrl-dist: live view";
-  badge(byId("state"), run.state ?? "waiting", alerts.length);
-  setText(byId("headline"), headline);
+  badge(byId("state"), replay?.loading ? "loading" : (run.state ?? "waiting"), alerts.length);
+  setText(byId("headline"), replay?.loading ? "Reading the recording: the page does not show the chosen moment yet." : headline);
   setText(byId("what"), [run.method?.toUpperCase().replaceAll("_", "-"), run.problem].filter(Boolean).join(" · "));
   const over = ["finished", "evaluating", "interrupted", "failed"].includes(run.state);
   const fit = run.stage === "fit";
@@ -44,7 +44,9 @@ const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 500];
 
 /** The controls of a recording. */
 export class Replay {
-  constructor() {
+  /** `named()`: the fields of a command that name the run. */
+  constructor(named) {
+    this.named = named;
     this.dragging = false;
     this.speeds = "";
     this.replay = null;
@@ -63,7 +65,7 @@ export class Replay {
   }
 
   async #send(fields) {
-    setText(byId("replay-error"), await command(fields));
+    setText(byId("replay-error"), await command({ ...this.named(), ...fields }));
   }
 
   #ended() {

@@ -18,6 +18,7 @@ export function emptyStore() {
     variationCount: 0,
     leftOut: 0,
     episodes: new Map(),
+    history: { t: [] },
     series: Object.fromEntries(NAMES.map((name) => [name, []])),
     events: [],
     beliefs: {},
@@ -44,6 +45,7 @@ export function apply(store, snapshot) {
   }
   if (snapshot.variations.length || snapshot.evaluation || snapshot.past !== store.past) store.changes += 1;
   store.past = snapshot.past;
+  if (snapshot.history) store.history = snapshot.history;
   if (snapshot.evaluation) store.evaluation = snapshot.evaluation;
   for (const episode of snapshot.episodes) {
     if (store.episodes.get(episode.name)?.identity === episode.identity) continue;

@@ -21,10 +21,29 @@ def sticks(kind: str, states: Float32[np.ndarray, "F S"]) -> list[list[list[floa
     """F observations of a problem as frames, each a list of segments ``[x0, y0, x1, y1]`` in meters.
 
     The view is from the side; for reacher and quadruped from above.  Observations do not contain the
-    position of the body, so the figure does not move forward.
+    position of the body, so the figure does not move forward; ``travel`` says how far it has.
     """
     figure = _figure(kind)
     return [figure.frame(state) for state in states.astype(np.float64)]
+
+
+def travel(kind: str, states: Float32[np.ndarray, "F S"], every: int) -> list[float]:
+    """How far the body has moved forward at each of F observations, ``every`` steps apart, in meters.
+
+    Observations contain the body's velocity, and not its position, so this is the sum of the velocities.  Empty for a
+    body that does not travel.  For quadruped, forward is where its torso points.
+    """
+    figure = _figure(kind)
+    if figure.velocity is None:
+        return []
+    moved = states[:, figure.velocity].astype(np.float64) * every * figure.step_s
+    found: list[float] = np.concatenate([[0.0], np.cumsum((moved[1:] + moved[:-1]) / 2)]).round(3).tolist()
+    return found
+
+
+def ground(kind: str) -> float | None:
+    """The height of the ground in the drawing, in meters; None for a view from above, and for a cart on a rail."""
+    return 0.0 if _figure(kind).walks else None
 
 
 def step_s(kind: str) -> float:
@@ -51,7 +70,22 @@ class Figure:
         capsule = self._model.geom_type[self._geoms] == _CAPSULE
         self._half = np.where(capsule, self._model.geom_size[self._geoms, 1], self._model.geom_size[self._geoms, 0])
         self._along = np.where(capsule, 2, 0)  # a capsule's axis is its own z
+        self.walks = self._domain in ("cheetah", "hopper", "walker")
+        self.velocity: int | None = self._forward()
+        """The component of an observation that is the velocity forward, in meters a second; None for a body that stays."""
         self._view = [0, 1] if self._domain in ("reacher", "quadruped") else [0, 2]
+
+    def _forward(self) -> int | None:
+        if not self.walks and self._domain != "quadruped":
+            return None
+        first = 0
+        for name, value in self._env.observation_spec().items():
+            if name == "torso_velocity":
+                return first
+            if name == "velocity":  # qvel
+                return first + int(self._model.jnt_dofadr[self._model.joint("rootx").id])
+            first += int(np.prod(value.shape, dtype=int))
+        raise AssertionError
 
     def frame(self, state: Float[np.ndarray, " S"]) -> list[list[float]]:
         """The segments of one observation."""

@@ -98,11 +98,16 @@ class DMCProblem(ContinuousProblem):
 
 
 def _sticks(name: str, states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
-    """A ``sticks`` drawing: ``frames`` of segments ``[x0, y0, x1, y1]`` in meters, ``frame_s`` apart, ``force`` in 0..1."""
+    """A ``sticks`` drawing: ``frames`` of segments ``[x0, y0, x1, y1]`` in meters, ``frame_s`` apart, ``force`` in 0..1.
+
+    ``travel``: how far the body has moved forward at each frame, in meters; ``ground``: height of the ground, or None.
+    """
     components = len(domains.problem(name).scale)
     if states.shape[1] != components:
         raise ValueError(f"{states.shape[1]} observation components: {name} has {components}")
     from icrl_dist.problems.dmc import picture
 
     force = [round(float(value), 3) for value in np.minimum(adversary, 1.0)]
-    return {"kind": "sticks", "frames": picture.sticks(name, states), "frame_s": every * picture.step_s(name), "force": force}
+    frame_s, travel, ground = every * picture.step_s(name), picture.travel(name, states, every), picture.ground(name)
+    drawn = {"frames": picture.sticks(name, states), "frame_s": frame_s, "travel": travel, "ground": ground, "force": force}
+    return {"kind": "sticks", **drawn}

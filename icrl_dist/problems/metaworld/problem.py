@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _TASKS = 50
 """Number of ML1's training tasks."""
-_HAND, _OBJECT = slice(0, 2), slice(4, 6)
+_HAND, _OPENING, _OBJECT = slice(0, 3), 3, slice(4, 7)
 """Components of the observation with x and y of hand and object."""
 
 
@@ -118,7 +118,7 @@ class MetaWorldProblem(ContinuousProblem):
 
     @property
     def drawing(self) -> MakeDrawing:
-        return _paths
+        return _arm
 
     @property
     def benchmarks(self) -> Benchmarks:
@@ -127,16 +127,16 @@ class MetaWorldProblem(ContinuousProblem):
         return bench.benchmarks()
 
 
-def _paths(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
-    """A ``paths`` drawing: named lists of points seen from above, in meters, and ``goal``."""
+def _arm(states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:
+    """An ``arm`` drawing: ``hand``, ``object`` and ``goal`` as ``[x, y, z]`` in meters, ``opening`` (0 to 1) of the gripper."""
     goal = task.get("goal")
     if not isinstance(goal, (list, tuple)) or len(goal) != 3 or not all(type(c) in (int, float) for c in goal):
         raise ValueError("not an episode of pick-place")
     if states.shape[1] < 7 or not np.isfinite(goal).all():
         raise ValueError("not an episode of pick-place")
     drawn = {"hand": _HAND, "object": _OBJECT}
-    paths = [{"name": name, "points": [_rounded(p) for p in states[:, place]]} for name, place in drawn.items()]
-    return {"kind": "paths", "paths": paths, "goal": _rounded(np.array(goal[:2]))}
+    points = {name: [_rounded(point) for point in states[:, place]] for name, place in drawn.items()}
+    return {"kind": "arm", **points, "opening": _rounded(states[:, _OPENING].clip(0, 1)), "goal": _rounded(np.array(goal))}
 
 
 def _rounded(values: np.ndarray) -> list[float]:

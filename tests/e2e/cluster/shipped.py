@@ -87,6 +87,10 @@ class ShippedCluster:
                 with contextlib.suppress(psutil.NoSuchProcess):
                     process.resume()
 
+    def stored(self, name):
+        """Bytes of the dataset of a run."""
+        return sum(path.stat().st_size for path in (self.folder(name) / "dataset").glob("segment-*.frames"))
+
     @contextlib.contextmanager
     def cut_off(self):
         """Disconnect the network of all worker nodes."""

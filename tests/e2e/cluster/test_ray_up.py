@@ -80,7 +80,7 @@ class TestJobs:
         with underway(tmp_path, jobs.job("submit", "--", *jobs.train("smoke").split())) as (process, printed):
             wait_for(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "a worker on each node")
             assert process.poll() is None and not jobs.head.processes("WorkerActor.work"), printed()
-            wait_for(lambda: "round 0" in printed() or process.poll() is not None, "the output of round 0")
+            wait_for(lambda: "adapt/0" in printed() or process.poll() is not None, "the output of round 0")
             assert process.poll() is None, "the output came only at the end"
             assert process.wait(timeout=400) == 0, printed()
         assert re.search(r"learner on head \(cpu, 1 threads\) listens at tls/", printed())
@@ -122,15 +122,16 @@ class TestJobs:
         """Both workers are disconnected in the middle of a round, so that the run cannot continue without them."""
         words = jobs.job("submit", "--submission-id", "stopped", "--", *jobs.train("stopped").split())
         with underway(tmp_path, words) as (process, printed):
-            wait_for(lambda: jobs.running("WorkerActor.work") == [1, 1] or process.poll() is not None, "workers")
+            wait_for(lambda: jobs.stored("stopped") or process.poll() is not None, "trajectories")
             with jobs.suspended():
                 subprocess.run(jobs.job("stop", "stopped"), check=True, capture_output=True, timeout=250)
                 process.wait(timeout=200)
             assert re.search(r"interrupted; `icrl-dist train smoke --resume .*` continues", printed()), printed()
             assert "was stopped" in printed(), printed()
         assert not jobs.head.processes("learner") and not jobs.head.processes("icrl-dist train")
+        before = jobs.stored("stopped")
         with underway(tmp_path, jobs.exec(jobs.train("stopped", "--resume"))) as (process, printed):
-            wait_for(lambda: "round 0" in printed() or process.poll() is not None, "a round")
+            wait_for(lambda: jobs.stored("stopped") > before or process.poll() is not None, "more trajectories")
             with contextlib.ExitStack() as cut:
                 with jobs.suspended():
                     cut.enter_context(jobs.cut_off())
@@ -143,7 +144,7 @@ class TestJobs:
 def test_killed_raylets_a_killed_learner_and_a_node_that_joins_during_a_round(cluster, inline, tmp_path):
     """All workers and the learner die in the middle of a round; a node outside the cluster file does the rest."""
     with underway(tmp_path, cluster.exec(cluster.train("killed"))) as (process, printed):
-        wait_for(lambda: "round 0" in printed() or process.poll() is not None, "the first round")
+        wait_for(lambda: "adapt/0" in printed() or process.poll() is not None, "the first round")
         assert process.poll() is None, printed()
         for word, nodes in (("raylet/raylet", cluster.workers), ("-m learner", (cluster.head,))):
             for node in nodes:
