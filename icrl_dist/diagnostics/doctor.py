@@ -165,9 +165,8 @@ def _open_files() -> Check:
 def _decoder() -> Check:
     if kinds():
         return Check("decoder", True, f"compiled, for {' and '.join(kinds())}")
-    return Check(
-        "decoder", None, "not compiled: torch decides, several times as slowly", "install a C compiler, then `make env`"
-    )
+    remedy = "install a C compiler, then `make env`"
+    return Check("decoder", None, "not compiled: torch computes decisions, which takes several times as long", remedy)
 
 
 def _gpu() -> Check:
