@@ -29,7 +29,7 @@ from icrl_dist.diagnostics.modules import check_modules
 from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.diagnostics.surroundings import existing, writable
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import kinds
 from icrl_dist.stream import endpoints
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")

@@ -16,6 +16,14 @@
 #ifndef KIND
 #include <stdint.h>
 
+#ifdef __FAST_MATH__
+#error "fast math changes the order of sums: compile without it"
+#endif
+#ifdef __ELF__
+/* This file, in the library after what is loaded: models/compiled.py finds a library of other sources by it. */
+__asm__(".pushsection .icrl_source\n.incbin \"" __FILE__ "\"\n.popsection");
+#endif
+
 #define LANES 16
 #define BLOCKS 8               /* per chunk */
 #define CHUNK (LANES * BLOCKS) /* tokens per chunk */
@@ -309,7 +317,7 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
     long most = 0, offset = b * CHUNK * width;
     V highest[QUERIES], total[QUERIES];
     for (int g = 0; g < count; g++) {
-        highest[g] = all(-1e30f), total[g] = all(0.0f);
+        highest[g] = all(-__FLT_MAX__), total[g] = all(0.0f);
         if (visible[g] > most) most = visible[g];
     }
     for (int i = 0; i < count * width; i++) store(mixed + i * LANES, all(0.0f));

@@ -1,0 +1,56 @@
+"""The library that is compiled from C files of this folder when the package is installed, if there is a C compiler."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.util
+import platform
+import sys
+from pathlib import Path
+
+BUILD = "install a C compiler and run `make kernel`, or install a wheel that was built with one"
+_KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",), "arm64": ("neon",)}
+"""The instruction sets that the C files name, by machine, each including the ones before it."""
+
+
+@functools.cache
+def library(name: str = "_decoder_kernel", sources: tuple[str, ...] = ("decoder_kernel.c",)) -> ctypes.CDLL | str:
+    """The library of this name, or, if it cannot be used here, the reason with its remedy.
+
+    ``sources``: the C files that it is built from.
+    """
+    found = importlib.util.find_spec(f"{__package__}.{name}")
+    if found is None or found.origin is None:
+        return f"not compiled: {BUILD}"
+    return _load(Path(found.origin), [Path(__file__).with_name(source) for source in sources])
+
+
+def _load(file: Path, sources: list[Path]) -> ctypes.CDLL | str:
+    try:
+        if not _is_whole(file, sources):
+            return f"{file} is incomplete, or was built from other C files than those beside it: {BUILD}"
+        loaded = ctypes.CDLL(str(file))
+        count = loaded.icrl_kinds()
+    except (OSError, AttributeError) as error:
+        return f"{file} cannot be loaded ({error}): {BUILD}"
+    if not _KINDS.get(platform.machine(), ())[:count]:
+        return f"this processor ({platform.machine()}) has neither AVX2 with FMA nor NEON: let torch decide"
+    return loaded
+
+
+def _is_whole(file: Path, sources: list[Path]) -> bool:
+    """Whether a library holds its own sources, as they are now.
+
+    A compiler for Linux puts them after everything that is loaded.  So a file that was cut is found too: the end of
+    the process, by a bus error, would be the result of loading it.
+    """
+    content = file.read_bytes()
+    return sys.platform != "linux" or all(source.read_bytes() in content for source in sources)
+
+
+@functools.cache
+def kinds() -> tuple[str, ...]:
+    """The instruction sets that the library can use on this processor, the widest last; none if it cannot be used."""
+    found = library()
+    return () if isinstance(found, str) else _KINDS.get(platform.machine(), ())[: found.icrl_kinds()]
