@@ -73,7 +73,8 @@ class KernelTransformer(CopiedWhole):
         if self._spec.discrete:
             return sample(self.probabilities(outputs), u[:, 0])
         mean, raw = np.split(outputs, 2, axis=-1)
-        deviation = FLOOR + np.logaddexp(np.float32(0), raw)
+        with np.errstate(invalid="ignore"):  # as torch: nan without a warning
+            deviation = FLOOR + np.logaddexp(np.float32(0), raw)
         return np.clip(mean + deviation * ndtri(np.clip(u, 1e-6, 1 - 1e-6)), -1.0, 1.0).astype(np.float32)
 
     def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
@@ -98,8 +99,13 @@ class KernelTransformer(CopiedWhole):
         if not self._config.fourier:
             return x
         half = np.float32(0.5 * np.pi)
-        waves = [f(half * k * x) for k in range(1, self._config.fourier + 1) for f in (np.sin, np.cos)]
+        with np.errstate(invalid="ignore"):  # as torch: the sine of infinity is nan without a warning
+            waves = [f(half * k * x) for k in range(1, self._config.fourier + 1) for f in (np.sin, np.cos)]
         return np.concatenate([x, *waves], axis=-1, dtype=np.float32)
 
     def _actions(self, actions: np.ndarray) -> Float32[np.ndarray, "*B A"]:
-        return np.eye(self._spec.actions, dtype=np.float32)[actions] if self._spec.discrete else np.asarray(actions, np.float32)
+        if not self._spec.discrete:
+            return np.asarray(actions, np.float32)
+        if (outside := (actions < 0) | (actions >= self._spec.actions)).any():
+            raise ValueError(f"action {actions[outside][0]}: expected one of 0..{self._spec.actions - 1}")
+        return np.eye(self._spec.actions, dtype=np.float32)[actions]
