@@ -1,4 +1,4 @@
-"""The library that is compiled from C files of this folder when the package is installed, if there is a C compiler."""
+"""The libraries that are compiled from C files of this folder when the package is installed, if there is a C compiler."""
 
 from __future__ import annotations
 
@@ -15,15 +15,12 @@ _KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",), "arm64": ("neon",)
 
 
 @functools.cache
-def library(name: str = "_decoder_kernel", sources: tuple[str, ...] = ("decoder_kernel.c",)) -> ctypes.CDLL | str:
-    """The library of this name, or, if it cannot be used here, the reason with its remedy.
-
-    ``sources``: the C files that it is built from.
-    """
-    found = importlib.util.find_spec(f"{__package__}.{name}")
+def library(name: str) -> ctypes.CDLL | str:
+    """A compiled kernel, ``decoder`` or ``training``, or, if it cannot be used here, the reason with its remedy."""
+    found = importlib.util.find_spec(f"{__package__}._{name}_kernel")
     if found is None or found.origin is None:
         return f"not compiled: {BUILD}"
-    return _load(Path(found.origin), [Path(__file__).with_name(source) for source in sources])
+    return _load(Path(found.origin), [Path(__file__).with_name(source) for source in (f"{name}_kernel.c", "lanes.h")])
 
 
 def _load(file: Path, sources: list[Path]) -> ctypes.CDLL | str:
@@ -50,7 +47,7 @@ def _is_whole(file: Path, sources: list[Path]) -> bool:
 
 
 @functools.cache
-def kinds() -> tuple[str, ...]:
-    """The instruction sets that the library can use on this processor, the widest last; none if it cannot be used."""
-    found = library()
+def kinds(name: str = "decoder") -> tuple[str, ...]:
+    """The instruction sets that a kernel can use on this processor, the widest last; none if it cannot be used."""
+    found = library(name)
     return () if isinstance(found, str) else _KINDS.get(platform.machine(), ())[: found.icrl_kinds()]

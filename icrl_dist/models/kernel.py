@@ -18,7 +18,8 @@ from jaxtyping import Float32
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import CopiedWhole
-from icrl_dist.models.compiled import kinds, library
+from icrl_dist.models.compiled import kinds as kinds
+from icrl_dist.models.compiled import library as library
 from icrl_dist.models.trunk_shapes import layers_of
 
 _LANES, _BLOCKS = 16, 8
@@ -57,7 +58,7 @@ def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
 
 def require_kernel() -> None:
     """Raises ConfigError unless the kernel was built and this processor can run it."""
-    if isinstance(why := library(), str):
+    if isinstance(why := library("decoder"), str):
         raise ConfigError(
             f"context.decoder = 'kernel': on {platform.node()} the compiled decoder cannot be used: {why}; "
             "or begin a run with context.decoder = 'torch', which has other digests"
@@ -71,7 +72,7 @@ class Kernel(CopiedWhole):
     """
 
     def __init__(self, kind: str | None = None) -> None:
-        loaded = library()
+        loaded = library("decoder")
         if isinstance(loaded, str):
             raise RuntimeError(f"kernel: {loaded}")
         if kind is not None and kind not in kinds():
@@ -88,7 +89,7 @@ class Kernel(CopiedWhole):
         return _kernel, (self.kind,)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
-        found = getattr(library(), f"icrl_{name}_{self.kind}")
+        found = getattr(library("decoder"), f"icrl_{name}_{self.kind}")
         found.argtypes, found.restype = arguments, None
         return found
 
