@@ -28,7 +28,7 @@ from icrl_dist.launch import learner_process, run_folder, watching
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.models.kernel import best_decoder
+from icrl_dist.models.kernel import best_decoder, require_kernel
 from icrl_dist.storage import layout
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.fork import fork
@@ -55,11 +55,18 @@ class TrainInterrupted(Exception):  # noqa: N818
 
 
 def with_decoder(run: Run, folder: Path, resume: bool) -> Run:
-    """The run with its decoder named, where this was ``auto``: the best one here, or, to resume, that of the run there."""
-    if run.context.decoder != "auto":
-        return run
-    there = load_folder(folder).context.decoder if resume and (folder / "run.toml").is_file() else "auto"
-    return replace(run, context=replace(run.context, decoder=best_decoder(run.model) if there == "auto" else there))
+    """The run with its decoder named, where this was ``auto``: the best one here, or, to resume, that of the run there.
+
+    Raises ConfigError for the kernel where this installation has none.
+    """
+    decoder = run.context.decoder
+    if decoder == "auto" and resume and (folder / "run.toml").is_file():
+        decoder = load_folder(folder).context.decoder
+    if decoder == "auto":
+        decoder = best_decoder(run.model)
+    if decoder == "kernel":
+        require_kernel()
+    return replace(run, context=replace(run.context, decoder=decoder))
 
 
 def prepare(

@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.config.sections import ModelConfig
+from icrl_dist.config.sections import Decoder, ModelConfig
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.models.compiled import kinds as kinds
 from icrl_dist.models.compiled import library as library
-from icrl_dist.models.trunk_shapes import layers_of
 
 _LANES, _BLOCKS = 16, 8
 _CHUNK = _LANES * _BLOCKS
@@ -54,6 +53,14 @@ class _Decoder(ctypes.Structure):
 def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
     """What ``context.decoder = "auto"`` means here: the kernel if there is one and the model is not too wide."""
     return "kernel" if kinds() and model.width <= WIDEST else "torch"
+
+
+def decoder_here(decoder: Decoder, model: ModelConfig) -> Literal["torch", "kernel"]:
+    """What computes decisions here for ``context.decoder``: torch, where the kernel is named and there is none.
+
+    That changes outputs by 1e-5.  Decisions that enter a run's digests need ``require_kernel``.
+    """
+    return best_decoder(model) if decoder == "auto" else decoder if kinds() else "torch"
 
 
 def require_kernel() -> None:
@@ -138,7 +145,7 @@ class KernelDecoder(CopiedWhole):
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel) -> None:
-        """Raises ValueError for weights that are none of a trunk with these heads, or for ``batch`` below 1."""
+        """``weights`` must have the shapes of ``models.stored``.  Raises ValueError for ``batch`` below 1."""
         if batch < 1:
             raise ValueError(f"batch {batch}: expected at least 1")
         self._made_of = weights, heads, batch, kernel
@@ -147,7 +154,7 @@ class KernelDecoder(CopiedWhole):
         self._one_call = threading.Lock()
         self._kept: list[np.ndarray] = []
         """What the kernel has pointers to."""
-        self._layers = layers_of(weights, heads)
+        self._layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
         layers = (_Layer * self._layers)()
         for number, layer in enumerate(layers):
             self._fill(layer, {n.split(".", 2)[2]: w for n, w in weights.items() if n.startswith(f"blocks.{number}.")}, heads)

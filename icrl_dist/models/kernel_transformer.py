@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.special import ndtri
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.deployed import Columns, WindowColumns
 from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
-from icrl_dist.models.sampling import sample
+from icrl_dist.models.sampling import sample, sample_gaussian
+from icrl_dist.models.stored import check_shapes, shapes
 from icrl_dist.types import Spec
 
 FLOOR = 0.05
@@ -30,7 +30,11 @@ class KernelTransformer(CopiedWhole):
     def __init__(
         self, spec: Spec, config: ModelConfig, weights: Mapping[str, np.ndarray], batch: int, kernel: Kernel | None = None
     ) -> None:
-        """``weights``: by their names in a checkpoint, without ``model/``."""
+        """``weights``: by their names in a checkpoint, without ``model/``.
+
+        Raises ValueError for weights of another model, or for ``batch`` below 1.
+        """
+        check_shapes(shapes(spec, config), weights)
         self._spec, self._config, self._kernel = spec, config, kernel or Kernel()
         trunk = {name.removeprefix("trunk."): np.array(value) for name, value in weights.items() if name.startswith("trunk.")}
         self._decoder = KernelDecoder(trunk, config.heads, batch, self._kernel)
@@ -75,7 +79,7 @@ class KernelTransformer(CopiedWhole):
         mean, raw = np.split(outputs, 2, axis=-1)
         with np.errstate(invalid="ignore"):  # as torch: nan without a warning
             deviation = FLOOR + np.logaddexp(np.float32(0), raw)
-        return np.clip(mean + deviation * ndtri(np.clip(u, 1e-6, 1 - 1e-6)), -1.0, 1.0).astype(np.float32)
+        return sample_gaussian(mean, deviation, u)
 
     def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
         return self._kernel.softmax(padded(outputs), outputs.shape[1])

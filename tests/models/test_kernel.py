@@ -19,7 +19,7 @@ from icrl_dist.config.sections import ModelConfig
 from icrl_dist.models.compiled import kinds
 from icrl_dist.models.deployed import Columns, Deployed
 from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer
-from icrl_dist.models.kernel import Kernel, KernelDecoder
+from icrl_dist.models.kernel_transformer import KernelTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.types import Spec
 from tests.models.deployments import deployment
@@ -212,19 +212,19 @@ def test_arrays_of_wrong_shapes_are_refused_and_change_nothing(call: Callable[[D
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("blocks.1.feed.0.weight", (79, 20)), ("norm.bias", (19,)), ("blocks.0.qkv.bias", None)]
+    ("name", "shape"), [("trunk.blocks.1.feed.0.weight", (79, 20)), ("head.bias", (4,)), ("trunk.norm.bias", None)]
 )
 def test_weights_of_wrong_shapes_are_refused(name: str, shape: tuple[int, ...] | None) -> None:
-    weights = {n.removeprefix("trunk."): w for n, w in weights_of(small().model).items() if n.startswith("trunk.")}
-    KernelDecoder(weights, 2, 3, Kernel())
+    of = small()
+    weights = weights_of(of.model)
+    KernelTransformer(SPEC, of.model.config, weights, 3)
     del weights[name]
     if shape is not None:
         weights[name] = np.zeros(shape, np.float32)
     with pytest.raises(ValueError, match=name.replace(".", r"\.")):
-        KernelDecoder(weights, 2, 3, Kernel())
-    for heads, batch in ((3, 1), (0, 1), (2, 0)):
-        with pytest.raises(ValueError, match="expected"):
-            KernelDecoder(weights, heads, batch, Kernel())
+        KernelTransformer(SPEC, of.model.config, weights, 3)
+    with pytest.raises(ValueError, match="expected at least 1"):
+        KernelTransformer(SPEC, of.model.config, weights_of(of.model), 0)
 
 
 def test_one_deployment_in_several_threads_neither_ends_the_process_nor_mixes_up_decisions() -> None:
