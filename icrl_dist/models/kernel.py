@@ -18,6 +18,7 @@ from jaxtyping import Float32
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import Decoder, ModelConfig
 from icrl_dist.copies import CopiedWhole
+from icrl_dist.models.compiled import Unusable
 from icrl_dist.models.compiled import kinds as kinds
 from icrl_dist.models.compiled import library as library
 
@@ -65,7 +66,7 @@ def decoder_here(decoder: Decoder, model: ModelConfig) -> Literal["torch", "kern
 
 def require_kernel() -> None:
     """Raises ConfigError unless the kernel was built and this processor can run it."""
-    if isinstance(why := library("decoder"), str):
+    if isinstance(why := library("decoder"), Unusable):
         raise ConfigError(
             f"context.decoder = 'kernel': on {platform.node()} the compiled decoder cannot be used: {why}; "
             "or begin a run with context.decoder = 'torch', which has other digests"
@@ -80,7 +81,7 @@ class Kernel(CopiedWhole):
 
     def __init__(self, kind: str | None = None) -> None:
         loaded = library("decoder")
-        if isinstance(loaded, str):
+        if isinstance(loaded, Unusable):
             raise RuntimeError(f"kernel: {loaded}")
         if kind is not None and kind not in kinds():
             raise RuntimeError(f"kernel {kind}: this processor has {', '.join(kinds())}")

@@ -16,7 +16,8 @@ from jaxtyping import Float32, Int32, Int64
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import NotCopied
-from icrl_dist.models.kernel import address, kinds, library
+from icrl_dist.models.compiled import Unusable, kinds, library
+from icrl_dist.models.kernel import address
 from icrl_dist.types import Spec
 
 _LANES = 16
@@ -118,7 +119,7 @@ class TrainingKernel(NotCopied):
     def __init__(self, spec: Spec, config: ModelConfig, shapes: Mapping[str, tuple[int, ...]], kind: str | None = None) -> None:
         """``shapes``: of the parameters, in the order of the array that ``load`` takes."""
         known, built = kinds("training"), library("training")
-        if isinstance(built, str):
+        if isinstance(built, Unusable):
             raise RuntimeError(f"training kernel: {built}")
         if kind is not None and kind not in known:
             raise RuntimeError(f"training kernel {kind}: this processor has {', '.join(known)}")
