@@ -270,7 +270,8 @@ def train_ray(
         stack.callback(fleet.close)
         handle_again()  # Ray replaces the handlers
         needed = plugins.of_run(run.problem, run.method)
-        fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed)
+        kernel = run.context.decoder == "kernel"
+        fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed, kernel)
         if address is not None:
             if interrupted.is_set():
                 raise TrainInterrupted
