@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import hashlib
 import multiprocessing
 import pickle
 import threading
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import torch
 
 from icrl_dist.agent.loading import SHIPPED, open_checkpoint, shipped, trained
 from icrl_dist.config.sections import ModelConfig
@@ -304,3 +306,27 @@ def test_deployments_give_their_memory_back() -> None:
     before = make(50)
     grown = make(200) - before
     assert grown < 20e6, "200 contexts of 2 layers x 20 x 128 x 32 numbers take 131 MB"
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_outputs_are_those_of_every_other_processor(kind: str) -> None:
+    """The digest was recorded with AVX2; a change of the order of sums changes it, and so digests of runs."""
+    rng, batch = np.random.default_rng(0), 5
+    model = network(SPEC, ModelConfig(3, 2, 40, window=4), 0, 0.3)
+    with torch.no_grad():
+        for parameter in model.parameters():  # numpy's integers are equal everywhere
+            parameter.copy_(torch.from_numpy(rng.integers(-1000, 1000, tuple(parameter.shape)) / np.float32(2000)))
+    one, found = deployed(Case(SPEC, model, batch), kind), hashlib.sha256()
+    for length in (1, 130, 20):
+        cells = rng.integers(0, 5, (2, batch, length, 2)).astype(np.float32)
+        one.append(
+            Columns(
+                cells[0], rng.integers(0, 5, (batch, length)), cells[1], rng.integers(0, 2, (batch, length)) / np.float32(1)
+            )
+        )
+        outputs = one.decide(cells[0, :, 0])
+        found.update(outputs.tobytes() + one.probabilities(outputs).tobytes())
+    cells = rng.integers(0, 5, (2, batch, 4, 2)).astype(np.float32)
+    seen = Columns(cells[0], rng.integers(0, 5, (batch, 4)), cells[1], np.ones((batch, 4), np.float32))
+    found.update(one.decide_window(window(seen), Columns(*(column[:, :1] for column in seen))).tobytes())
+    assert found.hexdigest()[:16] == "dc147407f14c8ed0"
