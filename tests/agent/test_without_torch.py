@@ -101,6 +101,14 @@ def test_copies_act_alike(decoder, copied):
 
 
 @compiled
+def test_a_pickled_agent_says_what_it_needs_where_there_is_no_kernel(monkeypatch):
+    pickled = pickle.dumps(load_agent("darkroom", seed=0))
+    monkeypatch.setattr(kernel, "kinds", lambda: ())
+    with pytest.raises(RuntimeError, match=r"pickled agent of the compiled decoder.*decoder='torch'"):
+        pickle.loads(pickled)
+
+
+@compiled
 def test_an_agents_model_is_built_when_it_is_asked_for_and_later_contexts_use_its_weights(monkeypatch):
     agent, same = load_agent("darkroom", seed=0), load_agent("darkroom", seed=0)
     before = agent.distribution([[1, 2]])
