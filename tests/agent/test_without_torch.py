@@ -90,8 +90,7 @@ def test_an_agent_acts_through_the_kernel_as_through_torch(deploy):
             np.testing.assert_allclose(one, other, atol=1e-5, rtol=1e-4)
 
 
-@compiled
-@pytest.mark.parametrize("decoder", ["kernel", "torch"])
+@pytest.mark.parametrize("decoder", [pytest.param("kernel", marks=compiled), "torch"])
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda agent: pickle.loads(pickle.dumps(agent))])
 def test_copies_act_alike(decoder, copied):
     agent = load_agent("darkroom", seed=0, decoder=decoder)
