@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
+from icrl_dist.config.run import Run
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.dpt import DPT
@@ -65,7 +66,7 @@ def test_other_numbers_and_a_model_without_end_are_refused() -> None:
         StoredTransformer.of(Spec((0.0, 0.0), (4.0,), 5, 8), model.config, arrays)
 
 
-def test_a_method_that_changes_model_or_policy_keeps_the_model_in_torch(small_run) -> None:
+def test_a_method_that_changes_model_or_policy_keeps_the_model_in_torch(small_run: Run) -> None:
     class OtherModel(DPT):
         def build(self, spec, run):
             return super().build(spec, run)
