@@ -46,7 +46,10 @@ class _Fit(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int32) for name in ("width", "heads", "layers", "actions", "gaussian", "window")),
         *((name, ctypes.c_int32) for name in ("token_inputs", "query_inputs", "tokens", "queries")),
-        *((name, ctypes.c_void_p) for name in ("place", "weight", "back", "token", "query", "label", "length", "prefix", "own")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("place", "weight", "back", "token", "query", "label", "length", "prefix", "own")
+        ),
         ("share", ctypes.c_float),
     ]
 
@@ -116,7 +119,9 @@ class TrainingKernel(NotCopied):
         """``shapes``: of the parameters, in the order of the array that ``load`` takes."""
         known, built = kinds("training"), library("training")
         if built is None or not known or (kind or known[-1]) not in known:
-            raise RuntimeError(f"training kernel {kind or ''}: this installation has {', '.join(known) or 'none'} for this processor")
+            raise RuntimeError(
+                f"training kernel {kind or ''}: this installation has {', '.join(known) or 'none'} for this processor"
+            )
         self._spec, self._config, self._places = spec, config, _Places(spec, config, shapes)
         self._weight, self._back = (np.zeros(self._places.size, np.float32) for _ in range(2))
         self.gradient_size = self._places.size
@@ -180,7 +185,7 @@ class Problem:
         """Labels: the loss of a batch is a mean over them."""
         sizes = config.width, config.heads, config.layers, spec.actions
         shapes = inputs.tokens.shape[2], inputs.queries.shape[2], inputs.tokens.shape[1], queries
-        pointers = map(address, self._kept)
+        pointers = [address(array) for array in self._kept]
         self._fit = _Fit(*sizes, not spec.discrete, config.window, *shapes, *pointers, 1 / self.count)
         self._at, self._run = ctypes.addressof(self._fit), kernel._fit
         longest = int(inputs.length.max())
