@@ -12,6 +12,17 @@
 #ifndef LANES
 #define LANES 16
 
+#ifdef __FAST_MATH__
+#error "fast math changes the order of sums: compile without it"
+#endif
+#ifdef __ELF__
+/* Put the file into the library, after what is loaded: models/compiled.py finds libraries of other sources by it. */
+#define KEEP_SOURCE __asm__(".pushsection .icrl_source\n.incbin \"" __FILE__ "\"\n.popsection");
+#else
+#define KEEP_SOURCE
+#endif
+KEEP_SOURCE
+
 typedef const float *Linear[2]; /* weight, bias */
 
 static inline int padded(int n) { return (n + LANES - 1) / LANES * LANES; }

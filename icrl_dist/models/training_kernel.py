@@ -16,7 +16,8 @@ from jaxtyping import Float32, Int32, Int64
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import NotCopied
-from icrl_dist.models.kernel import address, kinds, library
+from icrl_dist.models.compiled import Unusable, kinds, library
+from icrl_dist.models.kernel import address
 from icrl_dist.types import Spec
 
 _LANES = 16
@@ -118,10 +119,10 @@ class TrainingKernel(NotCopied):
     def __init__(self, spec: Spec, config: ModelConfig, shapes: Mapping[str, tuple[int, ...]], kind: str | None = None) -> None:
         """``shapes``: of the parameters, in the order of the array that ``load`` takes."""
         known, built = kinds("training"), library("training")
-        if built is None or not known or (kind or known[-1]) not in known:
-            raise RuntimeError(
-                f"training kernel {kind or ''}: this installation has {', '.join(known) or 'none'} for this processor"
-            )
+        if isinstance(built, Unusable):
+            raise RuntimeError(f"training kernel: {built}")
+        if kind is not None and kind not in known:
+            raise RuntimeError(f"training kernel {kind}: this processor has {', '.join(known)}")
         self._spec, self._config, self._places = spec, config, _Places(spec, config, shapes)
         self._weight, self._back = (np.zeros(self._places.size, np.float32) for _ in range(2))
         self.gradient_size = self._places.size

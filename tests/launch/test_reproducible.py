@@ -12,7 +12,7 @@ import torch
 from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, parse_written
 from icrl_dist.launch import train
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import Unusable, kinds
 from icrl_dist.storage import held
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from icrl_dist.telemetry import provenance
@@ -73,8 +73,8 @@ def test_a_gpu_a_missing_kernel_and_another_loss_are_refused(
         on_cpu = asked(run, "any-machine", learner={"device": "cpu"})
         assert train.without_auto(on_cpu, tmp_path, resume=False).learner.reproducible == "any-machine"
     with monkeypatch.context() as patch:
-        patch.setattr(reproducible, "kinds", lambda name: ())
-        refused(run, tmp_path, ["was not built", "make env"])
+        patch.setattr(reproducible, "library", lambda name: Unusable("not compiled", "install a C compiler"))
+        refused(run, tmp_path, ["cannot be used: not compiled: install a C compiler"])
     install(methods={"return-to-go": ReturnToGo})
     refused(replace(run, method="return-to-go"), tmp_path, ["method = 'return-to-go'", "use dpt, icag or icaa"])
 

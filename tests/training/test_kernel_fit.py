@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from icrl_dist.config.sections import OptimConfig
+from icrl_dist.models.compiled import kinds
 from icrl_dist.models.features import sine_and_cosine
-from icrl_dist.models.kernel import kinds
 from icrl_dist.models.weights import weights_of
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.training.kernel_fit import KernelFit, _power, cosine
