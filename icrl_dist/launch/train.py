@@ -35,6 +35,7 @@ from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry import provenance
+from icrl_dist.training.reproducible import best_fit, require_kernel_fit
 
 FINISH_S = 10.0
 """Seconds within which the learner's last event arrives after its workers have ended."""
@@ -54,19 +55,23 @@ class TrainInterrupted(Exception):  # noqa: N818
         return type(self), (str(self), self.resumable)
 
 
-def with_decoder(run: Run, folder: Path, resume: bool) -> Run:
-    """The run with its decoder named, where this was ``auto``: the best one here, or, to resume, that of the run there.
+def without_auto(run: Run, folder: Path, resume: bool) -> Run:
+    """The run with its decoder and its way to fit named, where they were ``auto``: the best here, or those of the run there.
 
-    Raises ConfigError for the kernel where this installation has none.
+    Raises ConfigError for a kernel where this installation has none, and for a fit that is impossible here.
     """
-    decoder = run.context.decoder
-    if decoder == "auto" and resume and (folder / "run.toml").is_file():
-        decoder = load_folder(folder).context.decoder
-    if decoder == "auto":
-        decoder = best_decoder(run.model)
+    there = load_folder(folder) if resume and (folder / "run.toml").is_file() else run
+    decoder, fits = run.context.decoder, run.learner.reproducible
+    decoder = there.context.decoder if decoder == "auto" else decoder
+    decoder = best_decoder(run.model) if decoder == "auto" else decoder
     if decoder == "kernel":
         require_kernel()
-    return replace(run, context=replace(run.context, decoder=decoder))
+    run = replace(run, context=replace(run.context, decoder=decoder))
+    fits = there.learner.reproducible if fits == "auto" else fits
+    fits = best_fit(run) if fits == "auto" else fits
+    run = replace(run, learner=replace(run.learner, reproducible=fits))
+    require_kernel_fit(run)
+    return run
 
 
 def prepare(

@@ -95,7 +95,7 @@ INLINE void store(float *p, V v) { EACH(i) *(R *)(p + i * REGISTER_LANES) = v.r[
 INLINE V all(float x) {
     const R zero = {0};
     V o;
-    EACH(i) o.r[i] = x + zero;
+    EACH(i) o.r[i] = x - zero; /* which leaves -0 as it is, so the compiler makes it a broadcast */
     return o;
 }
 #define add NAMED(add, KIND)

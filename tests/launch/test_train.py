@@ -76,7 +76,7 @@ def test_a_run_resumes_with_another_endpoint_but_not_with_another_seed(small_run
 def test_a_run_keeps_its_decoder_and_is_refused_where_the_kernel_that_it_needs_is_missing(small_run, tmp_path, monkeypatch):
     def decoder(there, asked, resume=True):
         (tmp_path / "run.toml").write_text(dumps(by(there)))
-        return train.with_decoder(by(asked), tmp_path, resume).context.decoder
+        return train.without_auto(by(asked), tmp_path, resume).context.decoder
 
     by = lambda decoder: replace(small_run, context=replace(small_run.context, decoder=decoder))  # noqa: E731
     monkeypatch.setattr(kernel, "library", lambda name: Unusable("not compiled", "run `make kernel`"))
