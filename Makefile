@@ -35,10 +35,10 @@ $(READY): pyproject.toml constraints.txt $(wildcard icrl_dist/models/*.[ch])
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $(READY)
 
-kernel: env ## the compiled decoder again, for example after a compiler was installed
+kernel: env ## the compiled kernels again, for example after a compiler was installed
 	rm -rf build icrl_dist/models/_*.so
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
-	$(BIN)/icrl-dist doctor | grep decoder
+	$(BIN)/icrl-dist doctor | grep kernel
 
 clean:
 	rm -rf $(VENV) build *.egg-info icrl_dist/models/_*.so

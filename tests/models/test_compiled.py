@@ -86,7 +86,7 @@ def refused(why: str, remedy: str) -> None:
     assert kinds() == ()
     assert isinstance(deployed(build(), B, "auto"), DeployedTransformer)
     assert isinstance(deployed(build(), B, "kernel"), DeployedTransformer)
-    check = doctor._decoder()
+    check = doctor._compiled("decoder", "torch decides")
     assert check.ok is None and re.search(why, check.value) and remedy in check.remedy
     for function, error in ((kernel.require_kernel, ConfigError), (kernel.Kernel, RuntimeError)):
         with pytest.raises(error, match=f"kernel.*{why}.*{re.escape(remedy)}") as raised:
@@ -96,4 +96,4 @@ def refused(why: str, remedy: str) -> None:
 
 def test_the_library_in_its_place_is_used(place: Path) -> None:
     assert kinds() and not isinstance(deployed(build(), B, "auto"), DeployedTransformer)
-    assert doctor._decoder().ok is True
+    assert doctor._compiled("decoder", "torch decides").ok is True
