@@ -32,11 +32,12 @@ env: $(READY) ## the virtual environment
 $(READY): pyproject.toml constraints.txt $(wildcard icrl_dist/models/*.[ch])
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"icrl-dist needs Python 3.11, this is {v[0]}.{v[1]}: run make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
+	rm -f icrl_dist/models/_*.so
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $(READY)
 
 kernel: env ## the compiled kernels again, for example after a compiler was installed
-	rm -rf build icrl_dist/models/_*.so
+	rm -f icrl_dist/models/_*.so
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	$(BIN)/icrl-dist doctor | grep kernel
 
