@@ -180,8 +180,14 @@ class Problem:
         spec, config = kernel._spec, kernel._config
         labels = np.zeros((*inputs.labels.shape[:2], spec.actions + -spec.actions % _LANES), np.float32)
         labels[..., : spec.actions] = inputs.labels
-        self._kept = kernel._places.place, kernel._weight, kernel._back, inputs.tokens, inputs.queries, labels, *inputs[3:]
+        tokens, states = (np.ascontiguousarray(array, np.float32) for array in (inputs.tokens, inputs.queries))
+        numbers = [np.ascontiguousarray(array, np.int32) for array in (inputs.length, inputs.prefix, inputs.own)]
+        self._kept = kernel._places.place, kernel._weight, kernel._back, tokens, states, labels, *numbers
         contexts, queries = inputs.prefix.shape
+        if (inputs.prefix < 0).any() or (inputs.prefix > inputs.length[:, None]).any() or inputs.length.max() > tokens.shape[1]:
+            raise ValueError(
+                f"prefixes of {inputs.prefix.min()} to {inputs.prefix.max()}: a context has {tokens.shape[1]} tokens"
+            )
         self.count = contexts * queries
         """Labels: the loss of a batch is a mean over them."""
         sizes = config.width, config.heads, config.layers, spec.actions

@@ -11,6 +11,7 @@ import torch
 
 from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, parse_written
+from icrl_dist.config.sections import Reproducible
 from icrl_dist.launch import train
 from icrl_dist.models.compiled import Unusable, kinds
 from icrl_dist.storage import held
@@ -26,7 +27,7 @@ pytestmark = [
 ]
 
 
-def asked(run: Run, value: str, **sections: dict[str, Any]) -> Run:
+def asked(run: Run, value: Reproducible, **sections: dict[str, Any]) -> Run:
     """The run with ``learner.reproducible = value`` and other settings, by section."""
     changed = {name: replace(getattr(run, name), **settings) for name, settings in sections.items()}
     run = replace(run, **changed)
@@ -96,7 +97,8 @@ def test_runs_of_versions_without_the_key_were_fitted_by_torch(small_run: Run) -
 
 
 def test_threads_are_free_only_where_digests_do_not_depend_on_them(small_run: Run) -> None:
-    for value, fixed in (("any-machine", []), ("this-machine", ["learner.threads"])):
+    cases: list[tuple[Reproducible, list[str]]] = [("any-machine", []), ("this-machine", ["learner.threads"])]
+    for value, fixed in cases:
         run = asked(small_run, value)
         other = asked(run, value, learner={"threads": 2})
         assert [d.name for d in differences(run, other)] == fixed
