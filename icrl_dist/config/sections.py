@@ -10,8 +10,10 @@ from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
 from icrl_dist.config.ranges import NotNegative, Positive, PositiveFloat, Probability, Rate, Rounds, Share
 from icrl_dist.stream.schema import Remedy
 
-Deployment = Literal["paper", "committed"]
 Decoder = Literal["auto", "torch", "kernel"]
+"""What computes decisions on a CPU: see ``ContextConfig``."""
+
+Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online.
 
 ``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition enters
