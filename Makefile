@@ -29,7 +29,7 @@ format: env
 
 env: $(READY) ## the virtual environment
 
-$(READY): pyproject.toml constraints.txt icrl_dist/models/decoder_kernel.c
+$(READY): pyproject.toml constraints.txt $(wildcard icrl_dist/models/*.[ch])
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"icrl-dist needs Python 3.11, this is {v[0]}.{v[1]}: run make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 PACKAGES = ("icrl_dist", "actors", "learner")
-_SUFFIXES = (".c", ".py", ".toml")
+_SUFFIXES = (".c", ".h", ".py", ".toml")
 
 
 @functools.cache

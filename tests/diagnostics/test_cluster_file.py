@@ -36,7 +36,7 @@ def checkout(tmp_path, monkeypatch):
     with zipfile.ZipFile(root / "dist" / f"icrl_dist-{__version__}-py3-none-any.whl", "w") as wheel:
         for package in version.PACKAGES:
             for file in (ROOT / package).rglob("*"):
-                if file.suffix in (".c", ".py", ".toml", ".npz"):
+                if file.suffix in (".c", ".h", ".py", ".toml", ".npz"):
                     wheel.write(file, file.relative_to(ROOT))
     monkeypatch.setenv("HOME", str(home))
     return root
