@@ -174,11 +174,11 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
                 }
     }
     for (int g = 0; g < count; g++) {
-        float lanes[LANES], top;
+        float lanes[LANES];
         store(lanes, highest[g]);
-        top = lanes[0];
-        for (int i = 1; i < LANES; i++) top = lanes[i] > top ? lanes[i] : top;
-        V scale = exponential(sub(highest[g], all(top)));
+        UNROLL for (int n = LANES / 2; n > 0; n /= 2)
+            UNROLL for (int i = 0; i < n; i++) lanes[i] = lanes[i] > lanes[i + n] ? lanes[i] : lanes[i + n];
+        V scale = exponential(sub(highest[g], all(lanes[0])));
         scale = mul(scale, all(1.0f / sum(mul(total[g], scale))));
         for (int d = 0; d < width; d += 8) {
             V part[8];
