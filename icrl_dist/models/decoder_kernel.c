@@ -161,14 +161,20 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
         }
         const float *chunk = m->chunks[c * m->layers + l] + offset;
         if (ahead && !ahead->once) chunk_after(ahead, l, b, c);
-        if (count == QUERIES)
-            attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS);
-        else
+        if (count == QUERIES) {
+            int blocks = (limit[QUERIES - 1] + LANES - 1) / LANES; /* the last one sees the most */
+            if (blocks <= BLOCKS / 4)
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 4);
+            else if (blocks <= BLOCKS / 2)
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 2);
+            else
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS);
+        } else
             for (int g = 0; g < count; g++)
                 switch ((limit[g] + LANES - 1) / LANES) {
-#define LIVE(n)                                                                                                               \
-    case n:                                                                                                                   \
-        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n);          \
+#define LIVE(n)                                                                                                                \
+    case n:                                                                                                                    \
+        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n);  \
         break;
                     LIVE(1) LIVE(2) LIVE(3) LIVE(4) LIVE(5) LIVE(6) LIVE(7) LIVE(8)
                 }
@@ -208,7 +214,7 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
     float *h = m->work, *normed = h + ROWS * wide, *q = normed + ROWS * wide, *attended = q + ROWS * q_wide;
     float *up = attended + ROWS * q_wide, *mixed = up + ROWS * up_wide;
     long tokens = m->batch * length;
-    Ahead far = {.m = m, .tokens = past + length, .once = length == 1 && heads < QUERIES}, *ahead = m->far_away ? &far : 0;
+    Ahead far = {.m = m, .tokens = past + length, .once = length == 1 && heads < QUERIES}, *ahead = m->far_away && length <= ROWS ? &far : 0;
     if (ahead) this_chunk(ahead);
     for (int i = 0; ahead && far.once && i < LEAD; i += 8) bring(ahead, 8);
     for (long start = 0; start < tokens; start += ROWS) {
