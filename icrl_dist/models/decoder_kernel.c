@@ -214,7 +214,8 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
     float *h = m->work, *normed = h + ROWS * wide, *q = normed + ROWS * wide, *attended = q + ROWS * q_wide;
     float *up = attended + ROWS * q_wide, *mixed = up + ROWS * up_wide;
     long tokens = m->batch * length;
-    Ahead far = {.m = m, .tokens = past + length, .once = length == 1 && heads < QUERIES}, *ahead = m->far_away && length <= ROWS ? &far : 0;
+    Ahead far = {.m = m, .tokens = past + length, .once = length == 1 && heads < QUERIES};
+    Ahead *ahead = m->far_away && length <= ROWS ? &far : 0;
     if (ahead) this_chunk(ahead);
     for (int i = 0; ahead && far.once && i < LEAD; i += 8) bring(ahead, 8);
     for (long start = 0; start < tokens; start += ROWS) {
