@@ -29,6 +29,7 @@ class BenchArguments:
             "soak",
             "fuzz",
             "incontext",
+            "first-action",
             "experts",
             "disturbance",
             "monitor",
@@ -41,8 +42,9 @@ class BenchArguments:
     and ``ray.get``.  ``recovery``: time until a run continues after a worker or the learner is killed.
     ``soak``: memory growth of every process in a long run.  ``fuzz``: 100,000 hostile inputs to every
     function that decodes bytes.  ``incontext``: deployment and training of the model, beside DPT's
-    official layout, and the compiled decoder beside torch's.  ``experts``: batched updates of many
-    experts, beside stable-baselines3.
+    official layout, and the compiled decoder beside torch's.  ``first-action``: time from the start of
+    Python to the first action of an agent, by the compiled decoder and by torch.  ``experts``: batched
+    updates of many experts, beside stable-baselines3.
     ``disturbance``: the return that an undisturbed expert loses under each default adversary.
     ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
     problem: str | None = None
@@ -79,6 +81,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         env,
         experts,
         experts_gpu,
+        first_action,
         fuzz,
         incontext,
         ingest,
@@ -93,6 +96,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         "broadcast",
         "disturbance",
         "experts",
+        "first-action",
         "fuzz",
         "incontext",
         "monitor",
@@ -139,6 +143,10 @@ def bench(arguments: BenchArguments, console: Console) -> int:
                 show_part = lambda part: status.update(f"incontext: {part}")  # noqa: E731
                 result = incontext.run(arguments.folder, arguments.quick, show_part, arguments.decisions)
             text = incontext.describe(result)
+        case "first-action":
+            with console.status("first-action"):
+                result = first_action.run()
+            text = first_action.describe(result)
         case "experts":
             with console.status("experts"):
                 on_gpu = arguments.device == "cuda" or (arguments.device == "auto" and experts_gpu.present())
