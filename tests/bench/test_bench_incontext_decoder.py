@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def test_without_a_kernel_nothing_is_compared(monkeypatch: pytest.MonkeyPatch, t
 def test_sides_alternate_and_the_first_calls_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
     clock = [0.0]
-    monkeypatch.setattr(decoder.time, "process_time", lambda: clock[0])
+    monkeypatch.setattr(time, "process_time", lambda: clock[0])
 
     def call(side: str, cost: float) -> Any:
         def work() -> None:
