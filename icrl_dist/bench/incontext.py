@@ -1,4 +1,4 @@
-"""In-context learning against the official DPT layout: deployment, time to quality, labels, long contexts.
+"""In-context learning against the official DPT layout: deployment, time to quality, labels, long contexts; and both decoders.
 
 Both run in this process on one core and are measured in CPU-seconds.  The peer is a new implementation
 (``peer.py``); if it is slower than the official code was, the benchmark fails.
@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from icrl_dist.bench import incontext_cost as cost
+from icrl_dist.bench import incontext_decoder as decoder
 from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.bench import peer
 from icrl_dist.storage.files import write_json
@@ -28,16 +29,22 @@ REFERENCE_GFLOPS = 90.0
 Report = Callable[[str], None]
 
 
-def run(folder: Path = Path("runs"), quick: bool = False, report: Report = lambda text: None) -> dict[str, Any]:
-    """Measure everything; ``quick`` takes one seed and fewer repeats.
+def run(
+    folder: Path = Path("runs"), quick: bool = False, report: Report = lambda text: None, decisions: bool = False
+) -> dict[str, Any]:
+    """Measure everything; ``quick`` takes one seed and fewer repeats, ``decisions`` compares only the decoders.
 
     Writes ``incontext.png`` and ``incontext.json`` to ``folder``.  The JSON file stores each finished
     training, so an interrupted benchmark continues with the next one.  ``ok`` is false if the peer is
-    below its floors or a training of ours did not reach the target loss; ``reasons`` lists why.
+    below its floors, if a training of ours did not reach the target loss, or if the compiled decoder
+    misses a bound of ``incontext_decoder``; ``reasons`` lists why.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
+        if decisions:
+            compared = decoder.run(quick, report)
+            return compared | {"quick": quick, "ok": not compared["decoder_missed"], "reasons": compared["decoder_missed"]}
         return _run(folder, quick, report)
     finally:
         torch.set_num_threads(threads)
@@ -53,6 +60,7 @@ def _run(folder: Path, quick: bool, report: Report) -> dict[str, Any]:
         rates = {side: statistics.median(found) for side, found in cost.deployment(batch, pairs).items()}
         result[f"steps_per_s_{batch}"], result[f"peer_steps_per_s_{batch}"] = round(rates["ours"]), round(rates["peer"])
         result[f"deploy_ratio_{batch}"] = round(rates["ours"] / rates["peer"], 1)
+    result |= decoder.run(quick, report)
     report("training steps")
     result |= {name: round(rate) for name, rate in cost.training(3 if quick else 9).items()}
     result["labels_ratio"] = round(result["labels_per_s"] / result["peer_labels_per_s"], 1)
@@ -68,12 +76,15 @@ def _run(folder: Path, quick: bool, report: Report) -> dict[str, Any]:
     ]
     if not all(training["reached"] for name, training in trainings.items() if name.startswith("ours")):
         reasons.append(f"a model of ours did not reach a loss within {quality.CLOSE} nats of the floor")
+    reasons += result["decoder_missed"]
     figure = _plot(result, trainings, folder / "incontext.png")
     return result | {"figure": str(figure), "ok": not reasons, "reasons": reasons}
 
 
 def describe(result: dict[str, Any]) -> str:
     """The result as a small table."""
+    if "length" not in result:
+        return "\n".join([*decoder.describe(result), *result["reasons"]])
     rows = [f"{'per CPU-second, one core':<44}{'ours':>10}{'peer':>10}{'ratio':>8}"]
     for batch in (20, 512):
         ours, theirs = result[f"steps_per_s_{batch}"], result[f"peer_steps_per_s_{batch}"]
@@ -95,7 +106,7 @@ def describe(result: dict[str, Any]) -> str:
             f"{gpu['device']}: {gpu['labels_per_s']:,.0f} labels/s ({gpu['labels_share']:.0%} of its limit), "
             f"{gpu['decisions_per_s']:,.0f} decisions/s ({gpu['decisions_share']:.0%})"
         )
-    return "\n".join([*rows, *result["reasons"]])
+    return "\n".join([*rows, *decoder.describe(result), *result["reasons"]])
 
 
 def _trainings(path: Path, seeds: range, report: Report) -> dict[str, Any]:

@@ -42,8 +42,9 @@ class BenchArguments:
     and ``ray.get``.  ``recovery``: time until a run continues after a worker or the learner is killed.
     ``soak``: memory growth of every process in a long run.  ``fuzz``: 100,000 hostile inputs to every
     function that decodes bytes.  ``incontext``: deployment and training of the model, beside DPT's
-    official layout.  ``first-action``: time from the start of Python to the first action of an agent, by the
-    compiled decoder and by torch.  ``experts``: batched updates of many experts, beside stable-baselines3.
+    official layout, and the compiled decoder beside torch's.  ``first-action``: time from the start of
+    Python to the first action of an agent, by the compiled decoder and by torch.  ``experts``: batched
+    updates of many experts, beside stable-baselines3.
     ``disturbance``: the return that an undisturbed expert loses under each default adversary.
     ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
     problem: str | None = None
@@ -54,6 +55,8 @@ class BenchArguments:
     quick: bool = False
     """Measure less: one seed instead of three (incontext), 3 repetitions instead of 15 (experts), briefly
     trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of 8 (monitor)."""
+    decisions: bool = False
+    """incontext: compare only the compiled decoder with torch's, in about a minute, and train nothing."""
     drop: float | None = None
     """disturbance: instead, find the strength at which this fraction of the return is lost, such as 0.25.  The
     strength of each problem is kept for later runs with ``control.strength = "drop:0.25"``."""
@@ -102,6 +105,8 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         raise ConfigError(f"bench {arguments.name}: --seconds: this benchmark has a fixed size; leave the option out")
     if (arguments.name != "disturbance" or arguments.quick) and arguments.drop is not None:
         raise ConfigError(f"--drop {arguments.drop:g}: it belongs to `bench disturbance`, without --quick")
+    if arguments.name != "incontext" and arguments.decisions:
+        raise ConfigError("--decisions: it belongs to `bench incontext`")
     if arguments.name != "experts" and arguments.device != "cpu":
         raise ConfigError(f"--device {arguments.device}: it belongs to `bench experts`")
     if arguments.drop is None and arguments.device == "cpu" and arguments.steps is not None:
@@ -135,7 +140,8 @@ def bench(arguments: BenchArguments, console: Console) -> int:
             result, text = (r := fuzz.run(folder=arguments.folder)), fuzz.describe(r)
         case "incontext":
             with console.status("incontext") as status:
-                result = incontext.run(arguments.folder, arguments.quick, lambda part: status.update(f"incontext: {part}"))
+                show_part = lambda part: status.update(f"incontext: {part}")  # noqa: E731
+                result = incontext.run(arguments.folder, arguments.quick, show_part, arguments.decisions)
             text = incontext.describe(result)
         case "first-action":
             with console.status("first-action"):

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrl_dist.collect.trajectories import trajectory, unlabelled
 from icrl_dist.config.ranges import Positive
-from icrl_dist.config.sections import ContextConfig, Deployment
+from icrl_dist.config.sections import ContextConfig, Decoder, Deployment
 from icrl_dist.interfaces import Method, Policy, Problem, WeightSource
 from icrl_dist.rollout.episode import deploy_online
 from icrl_dist.types import Identity, Job, LabelCounts, Payload, Trajectory, Variation
@@ -28,6 +28,8 @@ class Rollouts(Payload):
     """Most transitions in a context, as ``context.max``."""
     deploy: Deployment
     """The deployment rule."""
+    decoder: Decoder
+    """What computes decisions on a CPU, as ``context.decoder``: the run's own, because digests depend on it."""
 
     @property
     def labels(self) -> LabelCounts | None:
@@ -61,7 +63,7 @@ def rollouts(
         if look is not None:
             look(policy, shown, rows[trial][shown], job.variations[shown])
 
-    context = ContextConfig(max=payload.context_max, keep="all")
+    context = ContextConfig(max=payload.context_max, keep="all", decoder=payload.decoder)
     policy = method.policy(model, env.batch, context, payload.deploy, watch if look else None)
     labeller = None
     if isinstance(payload, LabelledRollouts):

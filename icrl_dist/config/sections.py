@@ -11,7 +11,11 @@ from icrl_dist.config.ranges import NotNegative, Positive, PositiveFloat, Probab
 from icrl_dist.stream.schema import Remedy
 
 Decoder = Literal["auto", "torch", "kernel"]
+"""What computes decisions on a CPU: see ``ContextConfig``."""
+
 Reproducible = Literal["auto", "any-machine", "this-machine"]
+"""Where a fit gives the same weights digest: see ``LearnerConfig``."""
+
 Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online.
 

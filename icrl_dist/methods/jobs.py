@@ -55,7 +55,7 @@ def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], tri
 
 def rollouts(run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployment) -> tuple[Job, ...]:
     """Jobs that deploy T^j in every variation, without labels; episodes start as test episodes do."""
-    return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule))
+    return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule, run.context.decoder))
 
 
 def dagger_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment]) -> tuple[Job, ...]:
@@ -64,7 +64,7 @@ def dagger_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Depl
     Episodes start as test episodes do.  Jobs take the deployment rules in turn, because each rule gives
     another kind of history.
     """
-    payload = LabelledRollouts(run.context.max, rules[0], registry.of(run).labelling(run))
+    payload = LabelledRollouts(run.context.max, rules[0], run.context.decoder, registry.of(run).labelling(run))
     jobs = grouped(run, phase, _at_test_start(run, choose), run.dagger.trials, payload)
     return tuple(
         dataclasses.replace(job, payload=dataclasses.replace(payload, deploy=rules[(phase.round + number) % len(rules)]))

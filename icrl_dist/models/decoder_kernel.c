@@ -17,6 +17,7 @@ KEEP_SOURCE
 #define BLOCKS 8               /* per chunk */
 #define CHUNK (LANES * BLOCKS) /* tokens per chunk */
 #define ROWS 16                /* tokens that pass through the layers together */
+#define LEAD 1024             /* rows of 16 numbers that are brought nearer ahead of their use: 64 KiB */
 #define QUERIES 4              /* queries of one context that read a chunk together */
 
 typedef struct {
@@ -38,46 +39,93 @@ long icrl_work(int width, int heads) {
     return (long)ROWS * rows + (long)QUERIES * width * LANES;
 }
 
+/* Chunks in the order in which they will be read.  With hundreds of environments they lie in memory.  While others are
+   read and computed with, they are brought into the second-level cache at the same rate, LEAD rows of 16 numbers
+   before their use: so a decision takes little longer than reading them alone. */
+typedef struct {
+    const Decoder *m;
+    const float *at, *end; /* the rest of chunk c of context b in layer l */
+    long tokens;           /* of each context */
+    long first, b, c;      /* ROWS contexts, from `first` on, pass through the layers together */
+    int l;
+    int once; /* whether each chunk is read once; else only the next one is brought, in no exact order */
+} Ahead;
+
+static void this_chunk(Ahead *a) {
+    long left = a->tokens - a->c * CHUNK;
+    a->at = a->m->chunks[a->c * a->m->layers + a->l] + a->b * CHUNK * a->m->width;
+    a->end = a->at + (left > CHUNK ? CHUNK : padded((int)left)) * a->m->width;
+}
+
+static __attribute__((noinline)) void next_chunk(Ahead *a) {
+    const Decoder *m = a->m;
+    long last = a->first + ROWS < m->batch ? a->first + ROWS : m->batch;
+    if (++a->c * CHUNK >= a->tokens) a->c = 0, a->b++;
+    if (a->b == last) a->b = a->first, a->l++;
+    if (a->l == m->layers) a->l = 0, a->b = a->first = last < m->batch ? last : 0;
+    this_chunk(a);
+}
+
+static void chunk_after(Ahead *a, int l, long b, long c) {
+    a->l = l, a->first = a->b = b, a->c = c;
+    next_chunk(a);
+}
+
 #define SOURCE "decoder_kernel.c"
 #include "lanes.h"
 
 #else /* compiled once for each KIND */
 
+/* Bring some lines of 16 numbers that will be read later into the second-level cache. */
+#define bring NAMED(bring, KIND)
+INLINE void bring(Ahead *ahead, int lines) {
+    UNROLL for (int i = 0; i < lines; i++) __builtin_prefetch(ahead->at + i * LANES, 0, 2);
+    ahead->at += lines * LANES;
+    if (ahead->at >= ahead->end) next_chunk(ahead);
+}
+
 /* The scores of `count` queries for n blocks of tokens, from block k0 of a chunk on: weight[g][k] for query g
-   and block k.  `next`, unless 0, is brought nearer: as many numbers as are read here. */
+   and block k. */
 #define scores NAMED(scores, KIND)
-INLINE void scores(V weight[][BLOCKS], const float *const *q, const float *chunk, const float *next, int width, int count, int k0,
+INLINE void scores(V weight[][BLOCKS], const float *const *q, const float *chunk, Ahead *ahead, int width, int count, int k0,
                    int n) {
     UNROLL for (int g = 0; g < count; g++) UNROLL for (int k = 0; k < n; k++) weight[g][k0 + k] = all(0.0f);
-    for (int d = 0; d < width; d++) UNROLL for (int k = 0; k < n; k++) {
-        if (next) __builtin_prefetch(next + ((k0 * width + d * n) + k) * LANES, 0, 2);
-        V token = load(chunk + ((k0 + k) * width + d) * LANES);
-        UNROLL for (int g = 0; g < count; g++) weight[g][k0 + k] = fma(token, all(q[g][d]), weight[g][k0 + k]);
+    for (int d = 0; d < width; d++) {
+        if (ahead) bring(ahead, n - n / 2);
+        UNROLL for (int k = 0; k < n; k++) {
+            V token = load(chunk + ((k0 + k) * width + d) * LANES);
+            UNROLL for (int g = 0; g < count; g++) weight[g][k0 + k] = fma(token, all(q[g][d]), weight[g][k0 + k]);
+        }
     }
 }
 
 /* Add the tokens of these blocks, times their weights, to `mixed` (count, width, LANES), which is multiplied
    by correction[g] first if this is given. */
 #define mix NAMED(mix, KIND)
-INLINE void mix(float *mixed, V weight[][BLOCKS], const V *correction, const float *chunk, int width, int count, int k0, int n) {
-    for (int d = 0; d < width; d++) UNROLL for (int g = 0; g < count; g++) {
-        float *place = mixed + (g * width + d) * LANES;
-        V part = load(place);
-        if (correction) part = mul(part, correction[g]);
-        UNROLL for (int k = 0; k < n; k++) part = fma(load(chunk + ((k0 + k) * width + d) * LANES), weight[g][k0 + k], part);
-        store(place, part);
+INLINE void mix(float *mixed, V weight[][BLOCKS], const V *correction, const float *chunk, Ahead *ahead, int width, int count,
+                int k0, int n) {
+    for (int d = 0; d < width; d++) {
+        if (ahead) bring(ahead, n / 2);
+        UNROLL for (int g = 0; g < count; g++) {
+            float *place = mixed + (g * width + d) * LANES;
+            V part = load(place);
+            if (correction) part = mul(part, correction[g]);
+            UNROLL for (int k = 0; k < n; k++)
+                part = fma(load(chunk + ((k0 + k) * width + d) * LANES), weight[g][k0 + k], part);
+            store(place, part);
+        }
     }
 }
 
 /* `count` queries of one context read the first `live` blocks of a chunk; query g sees its first limit[g]
    tokens.  mixed, highest and total: the sums so far, by lane. */
 #define attend_chunk NAMED(attend_chunk, KIND)
-INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const *q, const float *chunk, const float *next,
+INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const *q, const float *chunk, Ahead *ahead,
                          const int *limit, int width, int count, int live) {
     V weight[QUERIES][BLOCKS], correction[QUERIES];
     int head = live < TOGETHER ? live : TOGETHER;
-    scores(weight, q, chunk, next, width, count, 0, head);
-    if (live > head) scores(weight, q, chunk, next, width, count, head, live - head);
+    scores(weight, q, chunk, ahead, width, count, 0, head);
+    if (live > head) scores(weight, q, chunk, ahead, width, count, head, live - head);
     UNROLL for (int g = 0; g < count; g++) {
         V before = highest[g];
         UNROLL for (int k = 0; k < live; k++)
@@ -90,15 +138,15 @@ INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const 
             total[g] = add(total[g], weight[g][k]);
         }
     }
-    mix(mixed, weight, correction, chunk, width, count, 0, head);
-    if (live > head) mix(mixed, weight, 0, chunk, width, count, head, live - head);
+    mix(mixed, weight, correction, chunk, ahead, width, count, 0, head);
+    if (live > head) mix(mixed, weight, 0, chunk, ahead, width, count, head, live - head);
 }
 
 /* Attention of up to QUERIES queries of context b in layer l, query g over its first visible[g] tokens.
    What the tokens are weighted to goes to to[g], (width). */
 #define attend NAMED(attend, KIND)
 INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float *const *to, const long *visible, int count,
-                   float *mixed) {
+                   float *mixed, Ahead *ahead) {
     int width = m->width;
     long most = 0, offset = b * CHUNK * width;
     V highest[QUERIES], total[QUERIES];
@@ -114,28 +162,31 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
             limit[g] = left < 0 ? 0 : left > CHUNK ? CHUNK : (int)left;
         }
         const float *chunk = m->chunks[c * m->layers + l] + offset;
-        /* What is read next: this context's next chunk, or the next context's first one. */
-        const float *next = !m->far_away                ? 0
-                            : (c + 1) * CHUNK < most ? m->chunks[(c + 1) * m->layers + l] + offset
-                                                     : m->chunks[l] + (b + 1 < m->batch ? offset + CHUNK * width : 0);
-        if (count == QUERIES)
-            attend_chunk(mixed, highest, total, q, chunk, next, limit, width, QUERIES, BLOCKS);
-        else
+        if (ahead && !ahead->once) chunk_after(ahead, l, b, c);
+        if (count == QUERIES) {
+            int blocks = (limit[QUERIES - 1] + LANES - 1) / LANES; /* the last one sees the most */
+            if (blocks <= BLOCKS / 4)
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 4);
+            else if (blocks <= BLOCKS / 2)
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 2);
+            else
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS);
+        } else
             for (int g = 0; g < count; g++)
                 switch ((limit[g] + LANES - 1) / LANES) {
-#define LIVE(n)                                                                                                               \
-    case n:                                                                                                                   \
-        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, next, limit + g, width, 1, n);          \
+#define LIVE(n)                                                                                                                \
+    case n:                                                                                                                    \
+        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n);  \
         break;
                     LIVE(1) LIVE(2) LIVE(3) LIVE(4) LIVE(5) LIVE(6) LIVE(7) LIVE(8)
                 }
     }
     for (int g = 0; g < count; g++) {
-        float lanes[LANES], top;
+        float lanes[LANES];
         store(lanes, highest[g]);
-        top = lanes[0];
-        for (int i = 1; i < LANES; i++) top = lanes[i] > top ? lanes[i] : top;
-        V scale = exponential(sub(highest[g], all(top)));
+        UNROLL for (int n = LANES / 2; n > 0; n /= 2)
+            UNROLL for (int i = 0; i < n; i++) lanes[i] = lanes[i] > lanes[i + n] ? lanes[i] : lanes[i + n];
+        V scale = exponential(sub(highest[g], all(lanes[0])));
         scale = mul(scale, all(1.0f / sum(mul(total[g], scale))));
         for (int d = 0; d < width; d += 8) {
             V part[8];
@@ -165,6 +216,10 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
     float *h = m->work, *normed = h + ROWS * wide, *q = normed + ROWS * wide, *attended = q + ROWS * q_wide;
     float *up = attended + ROWS * q_wide, *mixed = up + ROWS * up_wide;
     long tokens = m->batch * length;
+    Ahead far = {.m = m, .tokens = past + length, .once = length == 1 && heads < QUERIES};
+    Ahead *ahead = m->far_away && length <= ROWS ? &far : 0;
+    if (ahead) this_chunk(ahead);
+    for (int i = 0; ahead && far.once && i < LEAD; i += 8) bring(ahead, 8);
     for (long start = 0; start < tokens; start += ROWS) {
         int rows = tokens - start < ROWS ? (int)(tokens - start) : ROWS;
         for (int r = 0; r < rows; r++)
@@ -181,7 +236,7 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
                 const float *query[QUERIES];
                 float *to[QUERIES];
                 long visible[QUERIES], b = (start + i / heads) / length;
-                int count = 0;
+                int count = 0, again = i % heads; /* whether the context has just been read for other heads */
                 if (alone && i % heads == 0) put(m, l, b, past, normed + i / heads * wide);
                 for (; count < QUERIES && i < rows * heads; i++) {
                     long row = start + i / heads;
@@ -191,7 +246,7 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
                     to[count] = attended + i / heads * q_wide + i % heads * width;
                     visible[count++] = past + (alone ? 0 : row % length) + 1;
                 }
-                attend(m, l, b, query, to, visible, count, mixed);
+                attend(m, l, b, query, to, visible, count, mixed, again ? 0 : ahead);
             }
             linear(h, wide, attended, q_wide, layer->out, heads * width, rows, 1);
             for (int r = 0; r < rows; r++) layer_norm(normed + r * wide, h + r * wide, layer->norm_mlp, width);

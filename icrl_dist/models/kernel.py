@@ -139,8 +139,10 @@ def address(array: np.ndarray) -> int:
 
 def padded(array: np.ndarray) -> Float32[np.ndarray, "*N C"]:
     """The array with its last axis filled up with zeros to a multiple of 16."""
-    fill = -array.shape[-1] % _LANES
-    return np.ascontiguousarray(np.pad(np.asarray(array, np.float32), [(0, 0)] * (array.ndim - 1) + [(0, fill)]))
+    used = array.shape[-1]
+    wide = np.zeros((*array.shape[:-1], used + -used % _LANES), np.float32)
+    wide[..., :used] = array
+    return wide
 
 
 class KernelDecoder(CopiedWhole):

@@ -13,6 +13,7 @@ import torch
 
 from icrl_dist.bench import incontext, peer
 from icrl_dist.bench import incontext_cost as cost
+from icrl_dist.bench import incontext_decoder as decoder
 from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.cli import main
 from icrl_dist.config.sections import OptimConfig
@@ -163,6 +164,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "ours": [(True, 10.0), (True, 40.0), (True, 20.0)],
         "peer": [(True, 100.0), (True, 300.0), (True, 120.0)],
         "trained": [],
+        "missed": [],
     }
 
     def train(side: str) -> Any:
@@ -172,6 +174,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(cost, "deployment", lambda batch, pairs: values["deployment"])
     monkeypatch.setattr(cost, "training", lambda rounds: values["training"])
     monkeypatch.setattr(cost, "by_length", lambda: {"length": [0, 4000], "decision_us": [300, 9000], "length_exponent": 0.9})
+    monkeypatch.setattr(decoder, "run", lambda quick, report: {"kernel": None, "decoder_missed": values["missed"]})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(quality, "ours", train("ours"))
     monkeypatch.setattr(quality, "theirs", train("peer"))
@@ -198,6 +201,9 @@ def test_a_peer_below_its_floors_fails_and_a_slow_machine_lowers_the_floors(meas
     assert result["reasons"][0] in incontext.describe(result)
     measured["gflops"] = 0.9 * incontext.REFERENCE_GFLOPS
     assert incontext.run(tmp_path, quick=True)["ok"]
+    measured["missed"] = ["the kernel is slow"]
+    assert incontext.run(tmp_path, quick=True)["reasons"] == ["the kernel is slow"]
+    measured["missed"] = []
     measured["gflops"] = 9 * incontext.REFERENCE_GFLOPS
     assert incontext.run(tmp_path, quick=True)["floor_scale"] == 1.0
 

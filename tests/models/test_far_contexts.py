@@ -1,0 +1,41 @@
+"""The compiled decoder where contexts are so large that it brings them into the cache ahead of their use."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist.models import decoder, kernel
+from icrl_dist.models.gpt import GPT
+
+pytestmark = pytest.mark.skipif(not kernel.kinds(), reason="the kernel was not built here")
+
+
+@pytest.mark.parametrize("kind", kernel.kinds())
+@pytest.mark.parametrize(
+    ("width", "heads", "batch", "length"), [(32, 1, 33, 130), (20, 5, 21, 128), (16, 4, 40, 127), (32, 2, 1, 1700)]
+)
+def test_decisions_do_not_depend_on_other_contexts_and_equal_torchs(
+    kind: str, width: int, heads: int, batch: int, length: int
+) -> None:
+    torch.manual_seed(0)
+    trunk = GPT(3, heads, width, 0.0).eval()
+    weights = {name: value.numpy() for name, value in trunk.state_dict().items()}
+    context, query, window = torch.randn(batch, length, width), torch.randn(batch, width), torch.randn(batch, 5, width)
+    far = kernel.KernelDecoder(weights, heads, batch, kernel.Kernel(kind))
+    alone = kernel.KernelDecoder(weights, heads, 1, kernel.Kernel(kind))
+    with torch.inference_mode():
+        of_torch = decoder.Decoder(trunk, batch)
+        of_torch.append(context)
+        far.append(context.numpy())
+        assert far._decoder.far_away == 1
+        found = far.query(query.numpy()), far.window(window.numpy())
+        expected = of_torch.query(query), of_torch.window(window)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other.numpy(), atol=1e-5)
+    for row in {0, batch - 1}:
+        alone.clear()
+        alone.append(context[row : row + 1].numpy())
+        assert (alone.query(query[row : row + 1].numpy())[0] == found[0][row]).all()
+        assert (alone.window(window[row : row + 1].numpy())[0] == found[1][row]).all()
