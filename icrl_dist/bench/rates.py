@@ -24,7 +24,7 @@ import torch
 
 from icrl_dist.agent import ood_score
 from icrl_dist.agent.trained_model import TrainedModel
-from icrl_dist.bench.samples import Sample, all_trials, random_trajectories
+from icrl_dist.bench.samples import RandomWeights, Sample, all_trials, random_trajectories
 from icrl_dist.collect import kinds
 from icrl_dist.collect.adapt import Rollouts
 from icrl_dist.config.run import Run
@@ -124,16 +124,6 @@ def _env_steps(job: Job, horizon: int) -> int:
     return steps * len(job.variations)
 
 
-class _RandomWeights:
-    """A policy source with an untrained model: the cost of a decision does not depend on the weights."""
-
-    def __init__(self, model: torch.nn.Module) -> None:
-        self._model = model
-
-    def at(self, version: int) -> tuple[torch.nn.Module, str]:
-        return self._model, "0" * 64
-
-
 def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[Trajectory]]:
     """Seconds of the job, and trajectories like its own: all trials of some of its variations."""
     if isinstance(job.payload, ExpertHistories):
@@ -141,7 +131,7 @@ def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[
         return _training(job, problem, job.payload.sac, budget_s), random_trajectories(job, problem)
     run, by_model = trained.run, isinstance(job.payload, Rollouts)
     rows, trajectories, times = len(job.variations), [], [time.perf_counter()]
-    work = kinds.do(job, registry.of(run), trained.method, _RandomWeights(trained.model), "plan")
+    work = kinds.do(job, registry.of(run), trained.method, RandomWeights(trained.model), "plan")
     while group := list(itertools.islice(work, rows)):
         trajectories += group
         times.append(time.perf_counter())

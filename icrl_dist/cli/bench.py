@@ -29,6 +29,7 @@ class BenchArguments:
             "soak",
             "fuzz",
             "incontext",
+            "fit",
             "experts",
             "disturbance",
             "monitor",
@@ -41,7 +42,8 @@ class BenchArguments:
     and ``ray.get``.  ``recovery``: time until a run continues after a worker or the learner is killed.
     ``soak``: memory growth of every process in a long run.  ``fuzz``: 100,000 hostile inputs to every
     function that decodes bytes.  ``incontext``: deployment and training of the model, beside DPT's
-    official layout.  ``experts``: batched updates of many experts, beside stable-baselines3.
+    official layout.  ``fit``: training steps, beside torch's and beside the time of their matrix products alone.
+    ``experts``: batched updates of many experts, beside stable-baselines3.
     ``disturbance``: the return that an undisturbed expert loses under each default adversary.
     ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
     problem: str | None = None
@@ -50,8 +52,9 @@ class BenchArguments:
     seconds: float | None = None
     """Duration of the measurement (env, stream, ingest, scale and soak)."""
     quick: bool = False
-    """Measure less: one seed instead of three (incontext), 3 repetitions instead of 15 (experts), briefly
-    trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of 8 (monitor)."""
+    """Measure less: one seed instead of three (incontext), 3 rounds instead of 11 (fit), 3 repetitions instead of 15
+    (experts), briefly trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of
+    8 (monitor)."""
     drop: float | None = None
     """disturbance: instead, find the strength at which this fraction of the return is lost, such as 0.25.  The
     strength of each problem is kept for later runs with ``control.strength = "drop:0.25"``."""
@@ -76,6 +79,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         env,
         experts,
         experts_gpu,
+        fit,
         fuzz,
         incontext,
         ingest,
@@ -90,6 +94,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         "broadcast",
         "disturbance",
         "experts",
+        "fit",
         "fuzz",
         "incontext",
         "monitor",
@@ -133,6 +138,10 @@ def bench(arguments: BenchArguments, console: Console) -> int:
             with console.status("incontext") as status:
                 result = incontext.run(arguments.folder, arguments.quick, lambda part: status.update(f"incontext: {part}"))
             text = incontext.describe(result)
+        case "fit":
+            with console.status("fit") as status:
+                result = fit.run(arguments.quick, lambda part: status.update(f"fit: {part}"))
+            text = fit.describe(result)
         case "experts":
             with console.status("experts"):
                 on_gpu = arguments.device == "cuda" or (arguments.device == "auto" and experts_gpu.present())
