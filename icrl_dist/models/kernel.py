@@ -52,16 +52,17 @@ class _Decoder(ctypes.Structure):
 
 
 @functools.cache
-def _library() -> ctypes.CDLL | None:
-    found = importlib.util.find_spec("icrl_dist.models._decoder_kernel")
+def library(name: str) -> ctypes.CDLL | None:
+    """A compiled kernel of this package, ``decoder`` or ``training``; None if it was not built."""
+    found = importlib.util.find_spec(f"icrl_dist.models._{name}_kernel")
     return None if found is None or found.origin is None else ctypes.CDLL(found.origin)
 
 
 @functools.cache
-def kinds() -> tuple[str, ...]:
-    """The instruction sets that the kernel can use on this processor, the widest last; none if it was not built."""
-    library = _library()
-    return () if library is None else _KINDS.get(platform.machine(), ())[: library.icrl_kinds()]
+def kinds(name: str = "decoder") -> tuple[str, ...]:
+    """The instruction sets that a kernel can use on this processor, the widest last; none if it was not built."""
+    built = library(name)
+    return () if built is None else _KINDS.get(platform.machine(), ())[: built.icrl_kinds()]
 
 
 def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
@@ -72,7 +73,7 @@ def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
 def require_kernel() -> None:
     """Raises ConfigError unless the kernel was built and this processor can run it."""
     if not kinds():
-        why = "was not built" if _library() is None else "does not support this processor"
+        why = "was not built" if library("decoder") is None else "does not support this processor"
         raise ConfigError(
             f"context.decoder = 'kernel': the compiled decoder {why} on {platform.node()}: install a C compiler and run "
             "`make env` there, or begin a run with context.decoder = 'torch', which has other digests"
@@ -86,22 +87,22 @@ class Kernel(CopiedWhole):
     """
 
     def __init__(self, kind: str | None = None) -> None:
-        library = _library()
-        if library is None or not kinds() or (kind or kinds()[-1]) not in kinds():
+        built = library("decoder")
+        if built is None or not kinds() or (kind or kinds()[-1]) not in kinds():
             raise RuntimeError(f"kernel {kind or ''}: this installation has {', '.join(kinds()) or 'none'} for this processor")
         self.kind = kind or kinds()[-1]
         pointer, number = ctypes.c_void_p, ctypes.c_int
         self.run = self._function("run", pointer, pointer, pointer, *[ctypes.c_long] * 3, number)
         self._linear = self._function("linear", *[pointer] * 4, *[number] * 3)
         self._softmax = self._function("softmax", pointer, *[number] * 3)
-        library.icrl_work.restype = ctypes.c_long
-        self.work_size = library.icrl_work
+        built.icrl_work.restype = ctypes.c_long
+        self.work_size = built.icrl_work
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _kernel, (self.kind,)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
-        found = getattr(_library(), f"icrl_{name}_{self.kind}")
+        found = getattr(library("decoder"), f"icrl_{name}_{self.kind}")
         found.argtypes, found.restype = arguments, None
         return found
 
