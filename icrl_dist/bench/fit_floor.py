@@ -9,13 +9,13 @@ from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.training.batches import TrainingBatch
 
 
-def step_flops(model: PretrainedTransformer, batch: TrainingBatch, hidden: bool = True) -> int:
+def step_flops(model: PretrainedTransformer, batch: TrainingBatch, hidden: bool = False) -> int:
     """Floating-point operations of the products of one step, two for each multiplication, forward and backward.
 
     Every product of the forward pass has two in the backward pass: the gradients of its two factors.  Embeddings have
     one, because inputs need no gradient.  The attention of the last layer needs no queries of the context.
-    ``hidden``: with the pairs of tokens that a mask hides (later tokens of a context, transitions beyond a query's
-    prefix), which dense products compute too; without them it is the least that the loss needs, padding included.
+    ``hidden``: also for the pairs of tokens that a mask hides (later tokens of a context, transitions beyond a query's
+    prefix): dense products compute them, the loss does not need them.  Padding counts as transitions do.
     """
     config, rows = model.config, len(batch.prefix)
     tokens, queries = batch.rewards.size, batch.prefix.size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -13,9 +13,12 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions, Windows
+from icrl_dist.models.kernel import kinds
+from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.training import fit
 from icrl_dist.training.batches import TrainingBatch
+from icrl_dist.training.kernel_fit import KernelFit
 
 RATE = 1e-4
 """Learning rate of all steps: the cost of a step does not depend on it."""
@@ -57,8 +60,21 @@ def _by_torch(run: Run, draw: Draw, threads: int) -> Steps:
     return steps
 
 
-WAYS: Mapping[str, Callable[[Run, Draw, int], Steps]] = {"torch": _by_torch}
-"""By name ``make(run, draw, threads)``; torch first, and last the way that a run takes by default."""
+def _by_kernel(run: Run, draw: Draw, threads: int) -> Steps:
+    """``training.kernel_fit``: everything but the batches in a compiled kernel."""
+    weights = weights_of(new_model(run))
+    fitted = KernelFit(registry.of(run).spec, run.model, run.optim, weights, threads)
+
+    def steps(first: int, count: int) -> None:
+        for step in range(first, first + count):
+            fitted.step(batch_of(run, draw, step), RATE)
+
+    return steps
+
+
+def ways() -> dict[str, Callable[[Run, Draw, int], Steps]]:
+    """By name ``make(run, draw, threads)``: torch first, and last the way that a run takes by default on a CPU."""
+    return {"torch": _by_torch, **({"kernel": _by_kernel} if kinds("training") else {})}
 
 
 class Part(NamedTuple):

@@ -52,7 +52,7 @@ class BenchArguments:
     seconds: float | None = None
     """Duration of the measurement (env, stream, ingest, scale and soak)."""
     quick: bool = False
-    """Measure less: one seed instead of three (incontext), 3 rounds instead of 11 (fit), 3 repetitions instead of 15
+    """Measure less: one seed instead of three (incontext), 10 rounds instead of 40 (fit), 3 repetitions instead of 15
     (experts), briefly trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of
     8 (monitor)."""
     drop: float | None = None

@@ -46,7 +46,10 @@ class _Fit(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int32) for name in ("width", "heads", "layers", "actions", "gaussian", "window")),
         *((name, ctypes.c_int32) for name in ("token_inputs", "query_inputs", "tokens", "queries")),
-        *((name, ctypes.c_void_p) for name in ("place", "weight", "back", "token", "query", "label", "length", "prefix", "own")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("place", "weight", "back", "token", "query", "label", "length", "prefix", "own")
+        ),
         ("share", ctypes.c_float),
     ]
 
@@ -116,7 +119,9 @@ class TrainingKernel(NotCopied):
         """``shapes``: of the parameters, in the order of the array that ``load`` takes."""
         known, built = kinds("training"), library("training")
         if built is None or not known or (kind or known[-1]) not in known:
-            raise RuntimeError(f"training kernel {kind or ''}: this installation has {', '.join(known) or 'none'} for this processor")
+            raise RuntimeError(
+                f"training kernel {kind or ''}: this installation has {', '.join(known) or 'none'} for this processor"
+            )
         self._spec, self._config, self._places = spec, config, _Places(spec, config, shapes)
         self._weight, self._back = (np.zeros(self._places.size, np.float32) for _ in range(2))
         self.gradient_size = self._places.size

@@ -132,14 +132,18 @@ class KernelFit(NotCopied):
             )
             states = features(states)
             # Each state, and the previous state of the window with its action and reward; the first has no previous one.
-            before = _with_one(np.concatenate([states, actions(taken), rewards[..., None]], axis=-1, dtype=np.float32))[..., :-1, :]
+            before = _with_one(np.concatenate([states, actions(taken), rewards[..., None]], axis=-1, dtype=np.float32))[
+                ..., :-1, :
+            ]
             before = np.pad(before, ((0, 0), (0, 0), (1, 0), (0, 0)))
             rows, length = len(order), states.shape[2]
             windows = np.concatenate([_with_one(states), before], axis=-1).reshape(rows, -1, queries.shape[2] + before.shape[3])
             queries = np.pad(queries, ((0, 0), (0, 0), (0, before.shape[3])))
             queries = np.concatenate([queries, windows], axis=1)
             labels = np.concatenate([labels, window_labels.reshape(rows, -1, labels.shape[2])], axis=1)
-            prefix = np.concatenate([prefix, np.repeat(np.take_along_axis(batch.window_prefix, order, 1), length, axis=1)], axis=1)
+            prefix = np.concatenate(
+                [prefix, np.repeat(np.take_along_axis(batch.window_prefix, order, 1), length, axis=1)], axis=1
+            )
             own = np.concatenate([own, np.tile(np.arange(1, length + 1, dtype=np.int32), states.shape[1])])
         return Inputs(tokens, queries, labels, prefix.max(axis=1).astype(np.int32), prefix.astype(np.int32), own)
 
@@ -181,7 +185,9 @@ class KernelFit(NotCopied):
         """The inverse of ``state``.  Raises ValueError for the state of another optimizer."""
         steps = {int(value) for key, value in stored.items() if key.endswith("/step")}
         places = {tuple(key.split("/")[:2]) for key in stored}
-        own = {(str(part), str(index)) for part, names in enumerate((self._others, self._matrices)) for index in range(len(names))}
+        own = {
+            (str(part), str(index)) for part, names in enumerate((self._others, self._matrices)) for index in range(len(names))
+        }
         if stored and (places != own or len(steps) != 1):
             raise ValueError(f"it holds the state of {len(places)} parameters, not of these {len(own)}")
         self._steps = steps.pop() if steps else 0

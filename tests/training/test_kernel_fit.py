@@ -43,7 +43,9 @@ def test_loss_and_gradients_are_those_of_torch(case: Case) -> None:
     assert own_loss == pytest.approx(loss, rel=1e-5)
     assert set(own) == set(gradients)
     for name, gradient in gradients.items():
-        np.testing.assert_allclose(own[name], gradient.numpy(), rtol=0, atol=1e-4 * float(gradient.abs().max()) + 1e-8, err_msg=name)
+        np.testing.assert_allclose(
+            own[name], gradient.numpy(), rtol=0, atol=1e-4 * float(gradient.abs().max()) + 1e-8, err_msg=name
+        )
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case)))
