@@ -10,8 +10,9 @@ from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen
 from icrl_dist.config.ranges import NotNegative, Positive, PositiveFloat, Probability, Rate, Rounds, Share
 from icrl_dist.stream.schema import Remedy
 
-Deployment = Literal["paper", "committed"]
 Decoder = Literal["auto", "torch", "kernel"]
+Reproducible = Literal["auto", "any-machine", "this-machine"]
+Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online.
 
 ``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition enters
@@ -212,8 +213,13 @@ class LearnerConfig:
     """The learner process."""
 
     threads: NotNegative = 0
-    """CPU threads of a fit; 0 uses every core, because workers are idle during a fit.  The weights
-    digest depends on it, so the run folder records it."""
+    """CPU threads of a fit; 0 uses every core, because workers are idle during a fit.  With
+    ``reproducible = "this-machine"`` the weights digest depends on it, so the run folder records it."""
+    reproducible: Reproducible = "auto"
+    """Where a fit gives the same weights digest.  ``any-machine``: on every processor and with any number of threads,
+    through the compiled kernel, which is also faster than torch for models up to 128 wide; on the CPU, without dropout,
+    for methods with DPT's model and loss, and with ``context.decoder = "kernel"``.  ``this-machine``: on machines of one
+    kind with the same threads, by torch.  ``auto``: any-machine where it is possible.  A run keeps what it began with."""
     restarts: NotNegative = 3
     """Maximum number of restarts of the learner, and of successive restarts of a worker without progress;
     then the run fails."""

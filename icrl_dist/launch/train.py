@@ -35,6 +35,7 @@ from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry import provenance
+from icrl_dist.training.reproducible import best_fit, require_kernel_fit
 
 FINISH_S = 10.0
 """Seconds within which the learner's last event arrives after its workers have ended."""
@@ -54,12 +55,20 @@ class TrainInterrupted(Exception):  # noqa: N818
         return type(self), (str(self), self.resumable)
 
 
-def with_decoder(run: Run, folder: Path, resume: bool) -> Run:
-    """The run with its decoder named, where this was ``auto``: the best one here, or, to resume, that of the run there."""
-    if run.context.decoder != "auto":
-        return run
-    there = load_folder(folder).context.decoder if resume and (folder / "run.toml").is_file() else "auto"
-    return replace(run, context=replace(run.context, decoder=best_decoder(run.model) if there == "auto" else there))
+def without_auto(run: Run, folder: Path, resume: bool) -> Run:
+    """The run with its decoder and its way to fit named, where they were ``auto``: the best here, or those of the run there.
+
+    Raises ConfigError if it cannot be fitted here as it says.
+    """
+    there = load_folder(folder) if resume and (folder / "run.toml").is_file() else None
+    if run.context.decoder == "auto":
+        decoder = "auto" if there is None else there.context.decoder
+        run = replace(run, context=replace(run.context, decoder=best_decoder(run.model) if decoder == "auto" else decoder))
+    if run.learner.reproducible == "auto":
+        fits = "auto" if there is None else there.learner.reproducible
+        run = replace(run, learner=replace(run.learner, reproducible=best_fit(run) if fits == "auto" else fits))
+    require_kernel_fit(run)
+    return run
 
 
 def prepare(

@@ -185,7 +185,7 @@ class Problem:
         """Labels: the loss of a batch is a mean over them."""
         sizes = config.width, config.heads, config.layers, spec.actions
         shapes = inputs.tokens.shape[2], inputs.queries.shape[2], inputs.tokens.shape[1], queries
-        pointers = map(address, self._kept)
+        pointers = [address(array) for array in self._kept]
         self._fit = _Fit(*sizes, not spec.discrete, config.window, *shapes, *pointers, 1 / self.count)
         self._at, self._run = ctypes.addressof(self._fit), kernel._fit
         longest = int(inputs.length.max())

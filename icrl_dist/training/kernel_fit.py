@@ -204,6 +204,14 @@ def _with_one(x: Float32[np.ndarray, "*N I"]) -> Float32[np.ndarray, "*N J"]:
     return np.concatenate([x, np.ones((*x.shape[:-1], 1), np.float32)], axis=-1)
 
 
+def cosine(x: float) -> float:
+    """The cosine for 0 <= x <= pi, by additions and multiplications alone, to 1e-14: see ``_power``."""
+    total = 0.0
+    for power in range(30, 0, -2):
+        total = (1 + total) * (x * x) * (-1 / (power * (power - 1)))
+    return 1 + total
+
+
 def _power(base: float, exponent: int) -> float:
     """``base ** exponent`` by multiplications alone: the power of a mathematical library depends on the library."""
     result = 1.0

@@ -78,15 +78,16 @@ class Case(NamedTuple):
             found[:, -1] = lengths
             return found
 
-        found = [states(b, t), actions(b, t), states(b, t), rng.uniform(0, 1, size=(b, t)).astype(np.float32)]
-        for column in found:
+        before, taken, after, rewards = states(b, t), actions(b, t), states(b, t), rng.uniform(0, 1, (b, t)).astype(np.float32)
+        for column in (before, taken, after, rewards):
             for row, end in enumerate(lengths):
                 column[row, end:] = 0
         made = None
         if r:
-            rewards = rng.uniform(0, 1, size=(b, r, length)).astype(np.float32)
-            made = LabelledWindows(states(b, r, length), actions(b, r, length), rewards, labels(b, r, length))
-        return TrainingBatch(*found, states(b, n), labels(b, n), prefix(n), made, prefix(r) if r else None)
+            earned = rng.uniform(0, 1, size=(b, r, length)).astype(np.float32)
+            made = LabelledWindows(states(b, r, length), actions(b, r, length), earned, labels(b, r, length))
+        queries = states(b, n), labels(b, n), prefix(n)
+        return TrainingBatch(before, taken, after, rewards, *queries, made, prefix(r) if r else None)
 
 
 def by_torch(model: PretrainedTransformer, batch: TrainingBatch) -> tuple[float, dict[str, Tensor]]:
