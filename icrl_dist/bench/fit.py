@@ -19,7 +19,7 @@ from icrl_dist.bench import fit_ways
 from icrl_dist.bench.fit_floor import step_flops
 from icrl_dist.bench.fit_ways import Part, PartsOfTorch, Steps
 from icrl_dist.bench.samples import Sample, collected
-from icrl_dist.config.run import Run, load
+from icrl_dist.config.run import Run, load_run
 from icrl_dist.interfaces import Draw
 from icrl_dist.methods import registry as methods
 
@@ -68,7 +68,7 @@ def _missed(row: dict[str, Any]) -> list[str]:
 
 def _run(name: str, rounds: int, report: Report) -> list[dict[str, Any]]:
     """One row for each number of threads."""
-    chosen = load(name)
+    chosen = load_run(name, "learner.device=cpu")
     report(f"{name}: its data")
     method = methods.of(chosen)
     phase = method.phases(chosen)[0]
@@ -84,7 +84,7 @@ def _run(name: str, rounds: int, report: Report) -> list[dict[str, Any]]:
 
 def _ways(chosen: Run, draw: Draw, threads: int, rounds: int) -> dict[str, Any]:
     """Rates of all ways; how many steps the last one takes for one of torch; and the floor of a step."""
-    ways = {name: make(chosen, draw, threads) for name, make in fit_ways.ways().items()}
+    ways = {name: make(chosen, draw, threads) for name, make in fit_ways.ways(chosen).items()}
     model = fit_ways.new_model(chosen)
     timed: dict[str, list[Part]] = {name: [] for name in ways}
     flops, dense, product_ms = list[float](), list[float](), list[float]()
@@ -163,11 +163,11 @@ def describe(result: dict[str, Any]) -> str:
         f"ratio: fit_over_torch, at least {FIT_OVER_TORCH:g}; over floor: step_over_floor, at most {STEP_OVER_FLOOR:g}; floor: "
         "CPU-ms of the products of a step at the rate of a large one; dense: also of the pairs of tokens that a mask hides"
     )
-    lines += ["", f"{'part of a step by torch, ms':<28}" + "".join(f"{_name(row):>22}" for row in result["fits"])]
+    lines += ["", f"{'part of a step by torch, CPU-ms':<32}" + "".join(f"{_name(row):>22}" for row in result["fits"])]
     for name in dict.fromkeys(name for row in result["fits"] for name in row["parts"]):
         times = [row["parts"].get(name) for row in result["fits"]]
         lines.append(
-            f"{name:<28}" + "".join(f"{'' if found is None else format(found['wall_ms'], '.2f'):>22}" for found in times)
+            f"{name:<32}" + "".join(f"{'' if found is None else format(found['cpu_ms'], '.2f'):>22}" for found in times)
         )
     return "\n".join([*lines, *result["reasons"]])
 

@@ -13,10 +13,9 @@ from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions, Windows
-from icrl_dist.models.kernel import kinds
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
-from icrl_dist.training import fit
+from icrl_dist.training import fit, kernel_fit, reproducible
 from icrl_dist.training.batches import TrainingBatch
 from icrl_dist.training.kernel_fit import KernelFit
 
@@ -62,19 +61,19 @@ def _by_torch(run: Run, draw: Draw, threads: int) -> Steps:
 
 def _by_kernel(run: Run, draw: Draw, threads: int) -> Steps:
     """``training.kernel_fit``: everything but the batches in a compiled kernel."""
-    weights = weights_of(new_model(run))
-    fitted = KernelFit(registry.of(run).spec, run.model, run.optim, weights, threads)
+    kernel = KernelFit(registry.of(run).spec, run.model, run.optim, weights_of(new_model(run)), threads)
 
     def steps(first: int, count: int) -> None:
-        for step in range(first, first + count):
-            fitted.step(batch_of(run, draw, step), RATE)
+        take = lambda step, rate: kernel.step(batch_of(run, draw, step), rate)  # noqa: E731
+        fit.take_steps(take, run.optim, RATE, first + count, first=first, cosine=kernel_fit.cosine)
 
     return steps
 
 
-def ways() -> dict[str, Callable[[Run, Draw, int], Steps]]:
-    """By name ``make(run, draw, threads)``: torch first, and last the way that a run takes by default on a CPU."""
-    return {"torch": _by_torch, **({"kernel": _by_kernel} if kinds("training") else {})}
+def ways(run: Run) -> dict[str, Callable[[Run, Draw, int], Steps]]:
+    """By name ``make(run, draw, threads)``: torch first, and last the way that the run takes on this CPU."""
+    by_kernel = reproducible.best_fit(run) == "any-machine"
+    return {"torch": _by_torch, **({"kernel": _by_kernel} if by_kernel else {})}
 
 
 class Part(NamedTuple):

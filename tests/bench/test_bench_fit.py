@@ -59,7 +59,7 @@ def test_the_timed_parts_are_the_step_of_a_fit(monkeypatch: pytest.MonkeyPatch, 
     parts = fit_ways.PartsOfTorch(run, lambda rng: batches)
     model = fit_ways.new_model(run)
     optimizer = fit.Optimizer(model, run.optim)
-    monkeypatch.setattr(fit, "rate", lambda step, steps, warmup: 1.0)
+    monkeypatch.setattr(fit, "rate", lambda step, steps, warmup, cosine: 1.0)
     found = [parts.step(number) for number in range(3)]
     fit.fit(model, optimizer, run.optim, fit_ways.RATE, 3, lambda step: batch_loss(model, batches))
     for (key, one), other in zip(model.named_parameters(), parts.model.parameters(), strict=True):
@@ -106,7 +106,7 @@ def test_it_measures_every_way_with_the_same_batches(monkeypatch: pytest.MonkeyP
 
         return make
 
-    monkeypatch.setattr(fit_ways, "ways", lambda: {"torch": way("torch", 0.02), "fast": way("fast", 0.005)})
+    monkeypatch.setattr(fit_ways, "ways", lambda run: {"torch": way("torch", 0.02), "fast": way("fast", 0.005)})
     result = bench.run(quick=True, runs=("smoke",))
     assert json.loads(json.dumps(result)) == result
     assert len(drawn) == 2 * len(result["fits"]) and len(set(map(tuple, drawn.values()))) == 1
