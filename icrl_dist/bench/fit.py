@@ -150,25 +150,28 @@ def _parts(chosen: Run, draw: Draw, count: int) -> dict[str, dict[str, float]]:
 
 def describe(result: dict[str, Any]) -> str:
     """The result as tables."""
-    names = list(result["fits"][0]["ways"])
-    heads = [f"{name + ' steps/s':>17}{'CPU-ms':>8}" for name in names]
-    lines = [f"{'fit':<22}{''.join(heads)}{'ratio':>8}{'floor ms':>10}{'over floor':>12}{'dense ms':>10}"]
-    for row in result["fits"]:
-        rates = "".join(f"{row['ways'][name]['steps_per_s']:>17.1f}{row['ways'][name]['cpu_ms']:>8.1f}" for name in names)
-        lines.append(
-            f"{_name(row):<22}{rates}{row['fit_over_torch']:>8.2f}{row['floor_ms']:>10.1f}{row['step_over_floor']:>12.2f}"
-            f"{row['dense_floor_ms']:>10.1f}"
-        )
-    lines.append(
-        f"ratio: fit_over_torch, at least {FIT_OVER_TORCH:g}; over floor: step_over_floor, at most {STEP_OVER_FLOOR:g}; floor: "
-        "CPU-ms of the products of a step at the rate of a large one; dense: also of the pairs of tokens that a mask hides"
-    )
-    lines += ["", f"{'part of a step by torch, CPU-ms':<32}" + "".join(f"{_name(row):>22}" for row in result["fits"])]
-    for name in dict.fromkeys(name for row in result["fits"] for name in row["parts"]):
-        times = [row["parts"].get(name) for row in result["fits"]]
-        lines.append(
-            f"{name:<32}" + "".join(f"{'' if found is None else format(found['cpu_ms'], '.2f'):>22}" for found in times)
-        )
+    rows = result["fits"]
+    names = list(dict.fromkeys(name for row in rows for name in row["ways"]))
+    heads = "".join(f"{name + '/s':>10}{'CPU-ms':>7}" for name in names)
+    lines = [f"{'steps':<20}{heads}{'ratio':>6}{'floor':>6}{'over':>6}{'dense':>6}"]
+    for row in rows:
+        found = [row["ways"].get(name) for name in names]
+        rates = "".join(" " * 17 if way is None else f"{way['steps_per_s']:>10.1f}{way['cpu_ms']:>7.1f}" for way in found)
+        floors = f"{row['floor_ms']:>6.1f}{row['step_over_floor']:>6.2f}{row['dense_floor_ms']:>6.1f}"
+        lines.append(f"{_name(row):<20}{rates}{row['fit_over_torch']:>6.2f}{floors}")
+    lines += [
+        f"ratio: fit_over_torch, steps per second, at least {FIT_OVER_TORCH:g}",
+        "floor: CPU-ms of the products of a step at the rate of a large one",
+        f"over: step_over_floor, CPU time of a step over it, at most {STEP_OVER_FLOOR:g}",
+        "dense: the floor with the pairs of tokens that a mask hides",
+        "",
+    ]
+    parts = list(dict.fromkeys(name for row in rows for name in row["parts"]))
+    lines.append(f"{'CPU-ms by torch':<19}" + "".join(f"{name:>{len(name) + 1}}" for name in parts))
+    for row in rows:
+        times = [(name, row["parts"].get(name)) for name in parts]
+        cells = (f"{'' if part is None else format(part['cpu_ms'], '.1f'):>{len(name) + 1}}" for name, part in times)
+        lines.append(f"{_name(row):<19}" + "".join(cells))
     return "\n".join([*lines, *result["reasons"]])
 
 

@@ -107,9 +107,9 @@ class PartsOfTorch:
         put = torch.as_tensor
         context = Transitions(*map(put, (batch.observations, batch.actions, batch.next_observations, batch.rewards)))
         queries, prefix, labels = map(put, (batch.queries, batch.prefix, batch.labels))
-        ended("to tensors")
+        ended("tensors")
         cache = model.encode(context)
-        ended("encode contexts")
+        ended("contexts")
         outputs = model.decide(queries, cache, prefix)
         ended("queries")
         loss = model.action_head.loss(outputs, labels)

@@ -114,6 +114,7 @@ def test_it_measures_every_way_with_the_same_batches(monkeypatch: pytest.MonkeyP
         assert 1.5 < ratio < 8 and row["ways"]["fast"]["cpu_ms"] < row["ways"]["torch"]["cpu_ms"]
         assert 0 < row["floor_ms"] < row["dense_floor_ms"] and row["step_over_floor"] < row["torch_over_floor"]
     text = bench.describe(result)
+    assert max(map(len, text.splitlines())) <= 80
     assert "smoke, 1 thread" in text and "optimizer" in text and f"{result['fit_over_torch'][0]:.2f}" in text
 
 
