@@ -88,8 +88,8 @@ _MODULES = {
     "Variation": "icrl_dist.types",
 }
 
-_COMPUTE = ("InContextAgent", "evaluate", "load_agent")
-"""Names whose modules import torch, and that compute in this process; ``train`` imports torch when it needs it."""
+_COMPUTE = ("evaluate",)
+"""Names whose modules import torch, and that compute in this process; others import torch when they need it."""
 
 
 def __getattr__(name: str) -> object:

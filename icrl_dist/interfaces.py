@@ -559,6 +559,14 @@ class Method(abc.ABC):
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
         """The variations of training task ``task``, whose number is ``index``, in a round."""
 
+    def stored_model(self, spec: Spec, run: Run, weights: Mapping[str, np.ndarray]) -> Any | None:
+        """The trained model of a checkpoint as ``policy`` takes it where the compiled decoder decides, without torch.
+
+        ``weights``: by their names in ``state_dict``.  None: the method has none, and ``policy`` is given the model that
+        ``build`` makes.  Raises ValueError if the weights do not fit it.
+        """
+        return None
+
     def deployment(self, run: Run) -> Deployment:
         """The deployment rule that a model of this run was trained for."""
         return "paper"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -15,9 +15,15 @@ from icrl_dist.agent.ood_score import Surprise
 from icrl_dist.agent.threads import torch_threads, whole_or_none
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.run import ConfigError, Deployment
+from icrl_dist.config.sections import Decoder
+from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
+from icrl_dist.models import kernel
 from icrl_dist.models.outcome_readout import OutcomeModel
+
+if TYPE_CHECKING:
+    import torch
 
 
 class InContextAgent(CopiedWhole):
@@ -40,9 +46,13 @@ class InContextAgent(CopiedWhole):
         deploy: Deployment | None = None,
         outcomes: OutcomeModel | None = None,
         threads: int | None = None,
+        decoder: Decoder = "auto",
     ) -> None:
-        """Raises ConfigError for a rule that the model was not trained for, ``threads`` below 1, ``seed`` below 0."""
+        """Raises ConfigError for a rule that the model was not trained for, ``threads`` below 1, ``seed`` below 0, and for a
+        ``decoder`` that is unknown or missing here.
+        """
         seed = whole_or_none("seed", seed, 0)
+        _check_decoder(decoder)
         self._trained, self.spec = trained, trained.spec
         self.outcomes = outcomes
         """The model's prediction of outcomes, for ``surprise``; None for a checkpoint that was not calibrated."""
@@ -53,6 +63,7 @@ class InContextAgent(CopiedWhole):
         """The deployment rule."""
         self.threads = whole_or_none("threads", threads, 1)
         """CPU threads of torch in the agent's methods; the process's own number is set again after each.  None: that number."""
+        self._context = dataclasses.replace(trained.run.context, decoder=decoder)
         self._rng = np.random.default_rng(seed)
         self._one_call = threading.RLock()
         self.reset_context()
@@ -63,12 +74,13 @@ class InContextAgent(CopiedWhole):
         Raises ValueError for a ``batch`` below 1.
         """
         batch = arrays.whole("batch", batch, 1)
-        with self._one_call, torch_threads(self.threads):
-            self._surprise = Surprise(self.outcomes, self.spec, batch) if self.outcomes else None
-            watch = self._surprise.observe if self._surprise else None
-            trained = self._trained
-            self._policy: Any = trained.method.policy(trained.model, batch, trained.run.context, self.deploy, watch)
-            self._batch = batch
+        with self._one_call:
+            model = self._trained.to_deploy(self._context)  # imports torch if it is needed, so before torch_threads
+            with torch_threads(self.threads):
+                self._surprise = Surprise(self.outcomes, self.spec, batch) if self.outcomes else None
+                watch = self._surprise.observe if self._surprise else None
+                self._policy: Any = self._trained.method.policy(model, batch, self._context, self.deploy, watch)
+                self._batch = batch
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_one_call"}
@@ -78,8 +90,9 @@ class InContextAgent(CopiedWhole):
 
     @property
     def model(self) -> torch.nn.Module:
-        """The trained model."""
-        return self._trained.model
+        """The trained model, in torch.  The first use imports torch and builds it; later contexts use its weights."""
+        with self._one_call:
+            return self._trained.model
 
     @property
     def surprise(self) -> Float[np.ndarray, " B"]:
@@ -161,4 +174,15 @@ class InContextAgent(CopiedWhole):
         return (
             f"; reset_context(batch=B) sets B; this agent was trained with {self.spec.observation} observation components "
             f"and {self.spec.actions} action {kind}"
+        )
+
+
+def _check_decoder(decoder: object) -> None:
+    if decoder not in get_args(Decoder):
+        choices = get_args(Decoder)
+        raise ConfigError(f"decoder = {decoder!r}{nearest(str(decoder), choices)}: choose one of {', '.join(choices)}")
+    if decoder == "kernel" and not kernel.kinds():
+        raise ConfigError(
+            "decoder = 'kernel': there is no compiled decoder for this processor here: "
+            "install a C compiler and run `make env`, or leave decoder at 'auto'"
         )

@@ -7,17 +7,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.agent.ood_score import calibrate
-from icrl_dist.agent.threads import torch_threads, whole_or_none
+from icrl_dist.agent.threads import whole_or_none
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, load_folder, parse_written
+from icrl_dist.config.sections import Decoder
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.outcome_readout import OutcomeModel
-from icrl_dist.models.weights import load_weights
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, newest_version, version_file
 from icrl_dist.storage.files import StoreError
 from icrl_dist.storage.fork import Lineage
@@ -30,7 +28,11 @@ SHIPPED = tuple(sorted(file.stem for file in _AGENTS.glob("*.npz")))
 
 
 def load_agent(
-    what: str | Path, seed: int | None = None, deploy: Deployment | None = None, threads: int | None = 1
+    what: str | Path,
+    seed: int | None = None,
+    deploy: Deployment | None = None,
+    threads: int | None = 1,
+    decoder: Decoder = "auto",
 ) -> InContextAgent:
     """A trained agent, which acts without weight updates.
 
@@ -42,16 +44,19 @@ def load_agent(
     than one helps large batches on idle cores.  On busy cores threads that wait for each other can take a hundred
     times as long (docs/decisions/073-openmp-wait-policy.md).  Outside these calls the process's own number holds.
     With one thread an agent also acts in a forked process; torch's threads do not survive a fork.
+    ``decoder``: what computes its decisions, ``torch`` or ``kernel``, the compiled decoder, which always uses one thread
+    and imports no torch.  ``auto``: the kernel if it was built, for models up to 128 wide, whatever the run used: their
+    outputs agree to 1e-5.
 
-    Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy`` or if ``threads`` is
-    below 1 or ``seed`` below 0, StoreError if the file was not written by this system or its weights are no finite numbers.
+    Raises ConfigError if there is no such agent, if it was not trained for the rule ``deploy``, if ``threads`` is
+    below 1 or ``seed`` below 0, or if ``decoder`` is unknown or not built; StoreError if the file was not written by this
+    system or its weights are no finite numbers.
     Loading executes no code from the file.
     """
     threads = whole_or_none("threads", threads, 1)
     checkpoint = agent_checkpoint(shipped(what)) if what in SHIPPED else open_checkpoint(path_of("what", what))
     manifest = {k: v for k, v in checkpoint.manifest.items() if k != "spec"}
-    with torch_threads(threads):  # a forked process cannot use the threads that this one started
-        return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads)
+    return InContextAgent(trained(checkpoint), manifest, seed, deploy, outcomes_of(checkpoint), threads, decoder)
 
 
 def shipped(name: str | Path) -> Path:
@@ -138,12 +143,9 @@ def trained(checkpoint: Checkpoint) -> TrainedModel:
     try:
         run = parse_written(checkpoint.manifest["run"], "checkpoint")
         spec, method = spec_from(checkpoint.manifest["spec"]), methods.of(run)
-        with torch.random.fork_rng(()):  # an untrained model takes random numbers of the process
-            model = method.build(spec, run)
-        load_weights(model, checkpoint.part("model"))
+        return TrainedModel.stored(run, method, spec, checkpoint.part("model"))
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StoreError(f"checkpoint: not an agent of this version of icrl-dist ({' '.join(str(error).split())})") from None
-    return TrainedModel(run, method, spec, model.eval())
 
 
 def outcomes_of(checkpoint: Checkpoint) -> OutcomeModel | None:

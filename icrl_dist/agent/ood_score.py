@@ -76,7 +76,8 @@ def _decisions(trained: TrainedModel, rows: Sequence[tuple[int, Variation]]) -> 
     steps: list[Decisions] = []
     env = problems.of(trained.run).batch([variation for _, variation in rows])
     watch = lambda *decision: steps.append(decision)  # noqa: E731
-    policy = trained.method.policy(trained.model, len(rows), trained.run.context, None, watch)
+    context = trained.run.context
+    policy = trained.method.policy(trained.to_deploy(context), len(rows), context, None, watch)
     for number in range(EPISODES):
         keys = [(index, row, number) for row, (index, _) in enumerate(rows)]
         episode(env, policy, [generator(trained.run.seed, RandomKey.OOD_CALIBRATION, *key) for key in keys])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
-
-import torch
 
 from icrl_dist.arrays import whole
 from icrl_dist.config.run import ConfigError
@@ -40,12 +39,15 @@ os.register_at_fork(after_in_child=_forget)
 def torch_threads(count: int | None) -> Iterator[None]:
     """Let torch use this many threads; afterwards the process's own number again.  None: that number.
 
-    A thread that enters while another is inside would read the other's number as the process's: the first reads it for all.
+    Nothing happens in a process that has not imported torch.  A thread that enters while another is inside would read the
+    other's number as the process's: the first reads it for all.
     """
     global _inside, _before
-    if count is None:
+    if count is None or "torch" not in sys.modules:
         yield
         return
+    import torch
+
     with _entering:
         _before = _before if _inside else torch.get_num_threads()
         _inside, before = _inside + 1, _before

@@ -30,6 +30,7 @@ class BenchArguments:
             "fuzz",
             "incontext",
             "fit",
+            "first-action",
             "experts",
             "disturbance",
             "monitor",
@@ -43,7 +44,8 @@ class BenchArguments:
     ``soak``: memory growth of every process in a long run.  ``fuzz``: 100,000 hostile inputs to every
     function that decodes bytes.  ``incontext``: deployment and training of the model, beside DPT's
     official layout.  ``fit``: training steps, beside torch's and beside the time of their matrix products alone.
-    ``experts``: batched updates of many experts, beside stable-baselines3.
+    ``first-action``: time from the start of Python to the first action of an agent, by the compiled decoder and
+    by torch.  ``experts``: batched updates of many experts, beside stable-baselines3.
     ``disturbance``: the return that an undisturbed expert loses under each default adversary.
     ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
     problem: str | None = None
@@ -80,6 +82,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         experts,
         experts_gpu,
         fit,
+        first_action,
         fuzz,
         incontext,
         ingest,
@@ -95,6 +98,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         "disturbance",
         "experts",
         "fit",
+        "first-action",
         "fuzz",
         "incontext",
         "monitor",
@@ -142,6 +146,10 @@ def bench(arguments: BenchArguments, console: Console) -> int:
             with console.status("fit") as status:
                 result = fit.run(arguments.quick, lambda part: status.update(f"fit: {part}"))
             text = fit.describe(result)
+        case "first-action":
+            with console.status("first-action"):
+                result = first_action.run()
+            text = first_action.describe(result)
         case "experts":
             with console.status("experts"):
                 on_gpu = arguments.device == "cuda" or (arguments.device == "auto" and experts_gpu.present())

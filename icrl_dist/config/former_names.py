@@ -58,5 +58,6 @@ def translated(tables: dict[str, Any], sections: Set[str], owner: Any) -> dict[s
         if isinstance(holder, dict) and (key or section) in holder:
             holder[new.rpartition(".")[2]] = holder.pop(key or section)
     found = owner.translated(found)
-    foreign = set(plugins.sections(None)) - sections
+    unknown = found.keys() - sections
+    foreign = unknown & plugins.sections(None).keys() if unknown else set()  # they take the import of every problem
     return {name: table for name, table in found.items() if name not in foreign}

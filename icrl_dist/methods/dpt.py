@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import torch
 
     from icrl_dist.models.dpt import PretrainedTransformer
+    from icrl_dist.models.stored import StoredTransformer
     from icrl_dist.rollout.deployment import InContextPolicy
     from icrl_dist.training.batches import TrainingBatch
 
@@ -84,6 +85,13 @@ class DPT(Method):
 
         return PretrainedTransformer(spec, run.model)
 
+    def stored_model(self, spec: Spec, run: Run, weights: Mapping[str, np.ndarray]) -> StoredTransformer | None:
+        """None for a method of another package that changes the model or the policy: its code expects the torch model."""
+        from icrl_dist.models.stored import StoredTransformer
+
+        same = type(self).build is DPT.build and type(self).policy is DPT.policy
+        return StoredTransformer.of(spec, run.model, weights) if same else None
+
     def loss(self, model: PretrainedTransformer, batch: TrainingBatch) -> torch.Tensor:
         """The loss of eq. (1); with action windows also that of eq. (6)."""
         from icrl_dist.methods.dpt_loss import batch_loss
@@ -95,7 +103,7 @@ class DPT(Method):
 
     def policy(
         self,
-        model: PretrainedTransformer,
+        model: PretrainedTransformer | StoredTransformer,
         batch: int,
         context: ContextConfig,
         deploy: Deployment | None = None,

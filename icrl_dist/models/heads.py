@@ -10,11 +10,10 @@ from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.special import ndtri
 from torch import Tensor
 from torch.nn import functional as F
 
-from icrl_dist.models.sampling import sample
+from icrl_dist.models.sampling import sample, sample_gaussian
 from icrl_dist.types import Spec
 
 FLOOR = 0.05
@@ -86,8 +85,7 @@ class Gaussian:
 
     def act(self, outputs: Float[Tensor, "B O"], u: Float[np.ndarray, "B U"]) -> Float[np.ndarray, "B A"]:
         mean, deviation = (part.cpu().numpy() for part in self._mean_and_deviation(outputs))
-        normal = ndtri(np.clip(u, 1e-6, 1 - 1e-6))
-        return np.clip(mean + deviation * normal, -1.0, 1.0).astype(np.float32)
+        return sample_gaussian(mean, deviation, u)
 
     def _mean_and_deviation(self, outputs: Float[Tensor, "*B O"]) -> tuple[Float[Tensor, "*B A"], Float[Tensor, "*B A"]]:
         """Mean and standard deviation; the deviation is at least ``FLOOR``."""

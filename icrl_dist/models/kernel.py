@@ -123,6 +123,11 @@ class Kernel(CopiedWhole):
 
 def _kernel(kind: str) -> Kernel:
     """The kernel for this instruction set, or for one that this processor has: results are equal."""
+    if not kinds():
+        raise RuntimeError(
+            "a pickled agent of the compiled decoder cannot be read here: install a C compiler and run `make env`, "
+            "or pickle one of load_agent(..., decoder='torch')"
+        )
     return Kernel(kind if kind in kinds() else None)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.special import ndtri
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import CopiedWhole
@@ -14,7 +13,7 @@ from icrl_dist.interfaces import Actions
 from icrl_dist.models.deployed import Columns, WindowColumns
 from icrl_dist.models.features import Features
 from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
-from icrl_dist.models.sampling import sample
+from icrl_dist.models.sampling import sample, sample_gaussian
 from icrl_dist.types import Spec
 
 FLOOR = 0.05
@@ -73,8 +72,7 @@ class KernelTransformer(CopiedWhole):
         if self._spec.discrete:
             return sample(self.probabilities(outputs), u[:, 0])
         mean, raw = np.split(outputs, 2, axis=-1)
-        deviation = FLOOR + np.logaddexp(np.float32(0), raw)
-        return np.clip(mean + deviation * ndtri(np.clip(u, 1e-6, 1 - 1e-6)), -1.0, 1.0).astype(np.float32)
+        return sample_gaussian(mean, FLOOR + np.logaddexp(np.float32(0), raw), u)
 
     def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
         return self._kernel.softmax(padded(outputs), outputs.shape[1])

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from icrl_dist.models.stored import check_shapes
+
 
 def weights_of(model: nn.Module) -> dict[str, np.ndarray]:
     """The parameters as numpy arrays by name: copies, little-endian."""
@@ -15,5 +17,6 @@ def weights_of(model: nn.Module) -> dict[str, np.ndarray]:
 
 
 def load_weights(model: nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises RuntimeError naming the parameters unless names and shapes are the model's own."""
+    """Raises ValueError naming the parameters unless names and shapes are the model's own."""
+    check_shapes(((name, tuple(value.shape)) for name, value in model.state_dict().items()), arrays)
     model.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in arrays.items()})

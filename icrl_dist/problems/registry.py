@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from icrl_dist import arrays
 from icrl_dist.config import plugins
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.interfaces import Batch, Problem
-from icrl_dist.problems.gym_adapter import VariationEnv
 from icrl_dist.types import NULL, Adversary, Spec, Task, Variation
+
+if TYPE_CHECKING:
+    from icrl_dist.problems.gym_adapter import VariationEnv
 
 
 def names() -> tuple[str, ...]:
@@ -75,6 +77,8 @@ def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
     """
     if not isinstance(variation, Variation) or not isinstance(variation.task, Task):
         raise TypeError(f"make: {arrays.short(variation)}: expected Variation(task, adversary)")
+    from icrl_dist.problems.gym_adapter import VariationEnv
+
     return VariationEnv(variation, batch([variation]), render_mode)
 
 

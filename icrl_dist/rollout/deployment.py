@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
@@ -11,10 +13,12 @@ from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.deployed import Columns, Deployed, WindowColumns
-from icrl_dist.models.dpt import DeployedTransformer, PretrainedTransformer
 from icrl_dist.models.kernel import best_decoder, require_kernel
 from icrl_dist.models.kernel_transformer import KernelTransformer
-from icrl_dist.models.weights import weights_of
+from icrl_dist.models.stored import StoredTransformer
+
+if TYPE_CHECKING:
+    from icrl_dist.models.dpt import PretrainedTransformer
 
 
 def default_deployment(model: ModelConfig) -> Deployment:
@@ -29,7 +33,13 @@ class InContextPolicy(CopiedWhole):
     is encoded again, because the cached keys of later transitions depend on the dropped ones.
     """
 
-    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
+    def __init__(
+        self,
+        model: PretrainedTransformer | StoredTransformer,
+        batch: int,
+        context: ContextConfig,
+        watch: Watch | None = None,
+    ) -> None:
         self.model, self.batch, self._config, self._watch = model, batch, context, watch
         self._episodes: list[Columns] = []
         self._pending: list[tuple[np.ndarray, ...]] = []
@@ -141,7 +151,13 @@ class CommittedPolicy(InContextPolicy):
     because some training windows hold actions of another task's policy (``pretrain.decoy_fraction``).
     """
 
-    def __init__(self, model: PretrainedTransformer, batch: int, context: ContextConfig, watch: Watch | None = None) -> None:
+    def __init__(
+        self,
+        model: PretrainedTransformer | StoredTransformer,
+        batch: int,
+        context: ContextConfig,
+        watch: Watch | None = None,
+    ) -> None:
         super().__init__(model, batch, context, watch)
         self._encoded = 0  # number of the transitions in self._pending that the decoder has encoded
 
@@ -175,24 +191,32 @@ class CommittedPolicy(InContextPolicy):
             self._deployed.append(Columns(*(column[:, encoded:] for column in episode)))
 
 
-def deployed(model: PretrainedTransformer, batch: int, decoder: Decoder = "auto") -> Deployed:
-    """The transformer deployed in B environments by this decoder (``config.ContextConfig``); on a GPU by torch.
+def deployed(model: PretrainedTransformer | StoredTransformer, batch: int, decoder: Decoder = "auto") -> Deployed:
+    """The transformer deployed in B environments by this decoder (``config.ContextConfig``).
 
-    Raises ConfigError for ``kernel`` where this installation has none.
+    A model on a GPU is always deployed by torch, a stored one always by the kernel.  Raises ConfigError for the kernel
+    where this installation has none.
     """
-    if decoder == "auto":
-        decoder = best_decoder(model.config)
-    if decoder == "torch" or model.low.device.type != "cpu":
-        return DeployedTransformer(model, batch)
+    if isinstance(model, StoredTransformer):
+        weights = model.weights
+    else:
+        from icrl_dist.models.dpt import DeployedTransformer
+        from icrl_dist.models.weights import weights_of
+
+        if decoder == "auto":
+            decoder = best_decoder(model.config)
+        if decoder == "torch" or model.low.device.type != "cpu":
+            return DeployedTransformer(model, batch)
+        weights = weights_of(model)
     require_kernel()
-    return KernelTransformer(model.spec, model.config, weights_of(model), batch)
+    return KernelTransformer(model.spec, model.config, weights, batch)
 
 
 _RULES: dict[Deployment, type[InContextPolicy]] = {"paper": InContextPolicy, "committed": CommittedPolicy}
 
 
 def in_context(
-    model: PretrainedTransformer,
+    model: PretrainedTransformer | StoredTransformer,
     batch: int,
     context: ContextConfig,
     deploy: Deployment | None = None,

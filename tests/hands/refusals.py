@@ -193,6 +193,7 @@ AGENTS: list[Case] = [
     (lambda: icrl_dist.load_agent("darkroom", threads=1.5), "threads = 1.5"),  # type: ignore[arg-type]
     (lambda: icrl_dist.load_agent("darkroom", deploy="commited"), "'commited'.*committed"),  # type: ignore[arg-type]
     (lambda: icrl_dist.load_agent("darkroom", deploy=""), "deploy"),  # type: ignore[arg-type]
+    (lambda: icrl_dist.load_agent("darkroom", decoder="kernl"), "'kernl'.*kernel"),  # type: ignore[arg-type]
 ]
 
 

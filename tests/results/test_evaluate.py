@@ -164,7 +164,7 @@ def test_exact_agents_find_the_goal_and_know_the_adversary_of_their_row(small_ru
 def test_the_agent_repeats_its_actions_after_a_reset_of_context_and_draws(untrained):
     run = dataclasses.replace(untrained.run, context=ContextConfig(max=100))
     env = make(evaluate.variations(run, 0.0)[0])
-    agent = InContextAgent(dataclasses.replace(untrained, run=run), {}, seed=3)
+    agent = InContextAgent(TrainedModel(run, untrained.method, untrained.spec, untrained.model), {}, seed=3)
 
     def play(episodes):
         actions = []
