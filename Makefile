@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # What Python compiles and pytest rewrites is kept for every process after the first.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-fast check format env clean
+.PHONY: demo test test-fast check format env kernel clean
 
 demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
 	$(BIN)/icrl-dist train demo --overwrite
@@ -35,5 +35,10 @@ $(READY): pyproject.toml constraints.txt $(wildcard icrl_dist/models/*.[ch])
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $(READY)
 
+kernel: env ## the compiled decoder again, for example after a compiler was installed
+	rm -rf build icrl_dist/models/_*.so
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	$(BIN)/icrl-dist doctor | grep decoder
+
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build *.egg-info icrl_dist/models/_*.so

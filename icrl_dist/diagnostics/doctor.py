@@ -29,7 +29,7 @@ from icrl_dist.diagnostics.modules import check_modules
 from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.diagnostics.surroundings import existing, writable
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import Unusable, kinds, library
 from icrl_dist.stream import endpoints
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
@@ -163,10 +163,10 @@ def _open_files() -> Check:
 
 
 def _decoder() -> Check:
-    if kinds():
-        return Check("decoder", True, f"compiled, for {' and '.join(kinds())}")
-    remedy = "install a C compiler, then `make env`"
-    return Check("decoder", None, "not compiled: torch computes decisions, which takes several times as long", remedy)
+    if isinstance(why := library("decoder"), Unusable):
+        value = f"{why.why}: torch computes decisions, which takes several times as long"
+        return Check("decoder", None, value, why.remedy)
+    return Check("decoder", True, f"compiled, for {' and '.join(kinds())}")
 
 
 def _gpu() -> Check:

@@ -27,12 +27,17 @@ class Features:
         if not self._fourier:
             return x
         half = np.float32(0.5 * np.pi)
-        waves = [wave for k in range(1, self._fourier + 1) for wave in sine_and_cosine(half * k * x)]
+        with np.errstate(invalid="ignore"):  # as torch: the sine of infinity is nan without a warning
+            waves = [wave for k in range(1, self._fourier + 1) for wave in sine_and_cosine(half * k * x)]
         return np.concatenate([x, *waves], axis=-1, dtype=np.float32)
 
     def actions(self, actions: np.ndarray) -> Float32[np.ndarray, "*B A"]:
-        """Discrete actions one-hot, vectors as they are."""
-        return np.eye(self._spec.actions, dtype=np.float32)[actions] if self._spec.discrete else np.asarray(actions, np.float32)
+        """Discrete actions one-hot, vectors as they are.  Raises ValueError for a discrete action that there is not."""
+        if not self._spec.discrete:
+            return np.asarray(actions, np.float32)
+        if (outside := (actions < 0) | (actions >= self._spec.actions)).any():
+            raise ValueError(f"action {actions[outside][0]}: expected one of 0..{self._spec.actions - 1}")
+        return np.eye(self._spec.actions, dtype=np.float32)[actions]
 
 
 def sine_and_cosine(x: Float32[np.ndarray, "*N"]) -> tuple[Float32[np.ndarray, "*N"], Float32[np.ndarray, "*N"]]:

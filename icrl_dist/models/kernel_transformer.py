@@ -14,6 +14,7 @@ from icrl_dist.models.deployed import Columns, WindowColumns
 from icrl_dist.models.features import Features
 from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
 from icrl_dist.models.sampling import sample, sample_gaussian
+from icrl_dist.models.stored import check_shapes, shapes
 from icrl_dist.types import Spec
 
 FLOOR = 0.05
@@ -30,7 +31,11 @@ class KernelTransformer(CopiedWhole):
     def __init__(
         self, spec: Spec, config: ModelConfig, weights: Mapping[str, np.ndarray], batch: int, kernel: Kernel | None = None
     ) -> None:
-        """``weights``: by their names in a checkpoint, without ``model/``."""
+        """``weights``: by their names in a checkpoint, without ``model/``.
+
+        Raises ValueError for weights of another model, or for ``batch`` below 1.
+        """
+        check_shapes(shapes(spec, config), weights)
         self._spec, self._kernel = spec, kernel or Kernel()
         trunk = {name.removeprefix("trunk."): np.array(value) for name, value in weights.items() if name.startswith("trunk.")}
         self._decoder = KernelDecoder(trunk, config.heads, batch, self._kernel)
@@ -72,7 +77,9 @@ class KernelTransformer(CopiedWhole):
         if self._spec.discrete:
             return sample(self.probabilities(outputs), u[:, 0])
         mean, raw = np.split(outputs, 2, axis=-1)
-        return sample_gaussian(mean, FLOOR + np.logaddexp(np.float32(0), raw), u)
+        with np.errstate(invalid="ignore"):  # as torch: nan without a warning
+            deviation = FLOOR + np.logaddexp(np.float32(0), raw)
+        return sample_gaussian(mean, deviation, u)
 
     def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
         return self._kernel.softmax(padded(outputs), outputs.shape[1])

@@ -16,6 +16,8 @@
 #include <stdint.h>
 #include <string.h>
 
+KEEP_SOURCE
+
 #define BLOCK 16 /* rows whose attention weights are in memory at once */
 
 /* Places of the parameters in `weight`, `back` and a gradient, as indices of `place`. */

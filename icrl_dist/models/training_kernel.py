@@ -16,7 +16,8 @@ from jaxtyping import Float32, Int32, Int64
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import NotCopied
-from icrl_dist.models.kernel import address, kinds, library
+from icrl_dist.models.compiled import Unusable, kinds, library
+from icrl_dist.models.kernel import address
 from icrl_dist.types import Spec
 
 _LANES = 16
@@ -118,10 +119,10 @@ class TrainingKernel(NotCopied):
     def __init__(self, spec: Spec, config: ModelConfig, shapes: Mapping[str, tuple[int, ...]], kind: str | None = None) -> None:
         """``shapes``: of the parameters, in the order of the array that ``load`` takes."""
         known, built = kinds("training"), library("training")
-        if built is None or not known or (kind or known[-1]) not in known:
-            raise RuntimeError(
-                f"training kernel {kind or ''}: this installation has {', '.join(known) or 'none'} for this processor"
-            )
+        if isinstance(built, Unusable):
+            raise RuntimeError(f"training kernel: {built}")
+        if kind is not None and kind not in known:
+            raise RuntimeError(f"training kernel {kind}: this processor has {', '.join(known)}")
         self._spec, self._config, self._places = spec, config, _Places(spec, config, shapes)
         self._weight, self._back = (np.zeros(self._places.size, np.float32) for _ in range(2))
         self.gradient_size = self._places.size
@@ -179,8 +180,14 @@ class Problem:
         spec, config = kernel._spec, kernel._config
         labels = np.zeros((*inputs.labels.shape[:2], spec.actions + -spec.actions % _LANES), np.float32)
         labels[..., : spec.actions] = inputs.labels
-        self._kept = kernel._places.place, kernel._weight, kernel._back, inputs.tokens, inputs.queries, labels, *inputs[3:]
+        tokens, states = (np.ascontiguousarray(array, np.float32) for array in (inputs.tokens, inputs.queries))
+        numbers = [np.ascontiguousarray(array, np.int32) for array in (inputs.length, inputs.prefix, inputs.own)]
+        self._kept = kernel._places.place, kernel._weight, kernel._back, tokens, states, labels, *numbers
         contexts, queries = inputs.prefix.shape
+        if (inputs.prefix < 0).any() or (inputs.prefix > inputs.length[:, None]).any() or inputs.length.max() > tokens.shape[1]:
+            raise ValueError(
+                f"prefixes of {inputs.prefix.min()} to {inputs.prefix.max()}: a context has {tokens.shape[1]} tokens"
+            )
         self.count = contexts * queries
         """Labels: the loss of a batch is a mean over them."""
         sizes = config.width, config.heads, config.layers, spec.actions

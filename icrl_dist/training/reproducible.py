@@ -8,7 +8,7 @@ from pathlib import Path
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.config.sections import Reproducible
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import Unusable, library
 
 WIDEST = 128
 """The widest model that is fitted through the kernel: up to there it is faster than torch (docs/results/engine.md)."""
@@ -36,8 +36,8 @@ def _objection(run: Run) -> str:
         return f"model.width = {run.model.width}: the kernel is for models up to {WIDEST} wide: use at most {WIDEST}"
     if run.model.dropout:
         return f"model.dropout = {run.model.dropout}: the kernel has none: use 0"
-    if not kinds("training"):
-        return f"the training kernel was not built on {platform.node()}: install a C compiler and run `make env`"
+    if isinstance(why := library("training"), Unusable):
+        return f"on {platform.node()} the training kernel cannot be used: {why}"
     if run.context.decoder == "torch":
         return "context.decoder = 'torch': its decisions depend on the processor: use kernel"
     if run.learner.device == "cuda" or (run.learner.device == "auto" and _gpu()):

@@ -11,8 +11,9 @@ import torch
 
 from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, parse_written
+from icrl_dist.config.sections import Reproducible
 from icrl_dist.launch import train
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import Unusable, kinds
 from icrl_dist.storage import held
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from icrl_dist.telemetry import provenance
@@ -26,7 +27,7 @@ pytestmark = [
 ]
 
 
-def asked(run: Run, value: str, **sections: dict[str, Any]) -> Run:
+def asked(run: Run, value: Reproducible, **sections: dict[str, Any]) -> Run:
     """The run with ``learner.reproducible = value`` and other settings, by section."""
     changed = {name: replace(getattr(run, name), **settings) for name, settings in sections.items()}
     run = replace(run, **changed)
@@ -73,8 +74,8 @@ def test_a_gpu_a_missing_kernel_and_another_loss_are_refused(
         on_cpu = asked(run, "any-machine", learner={"device": "cpu"})
         assert train.without_auto(on_cpu, tmp_path, resume=False).learner.reproducible == "any-machine"
     with monkeypatch.context() as patch:
-        patch.setattr(reproducible, "kinds", lambda name: ())
-        refused(run, tmp_path, ["was not built", "make env"])
+        patch.setattr(reproducible, "library", lambda name: Unusable("not compiled", "install a C compiler"))
+        refused(run, tmp_path, ["cannot be used: not compiled: install a C compiler"])
     install(methods={"return-to-go": ReturnToGo})
     refused(replace(run, method="return-to-go"), tmp_path, ["method = 'return-to-go'", "use dpt, icag or icaa"])
 
@@ -96,7 +97,8 @@ def test_runs_of_versions_without_the_key_were_fitted_by_torch(small_run: Run) -
 
 
 def test_threads_are_free_only_where_digests_do_not_depend_on_them(small_run: Run) -> None:
-    for value, fixed in (("any-machine", []), ("this-machine", ["learner.threads"])):
+    cases: list[tuple[Reproducible, list[str]]] = [("any-machine", []), ("this-machine", ["learner.threads"])]
+    for value, fixed in cases:
         run = asked(small_run, value)
         other = asked(run, value, learner={"threads": 2})
         assert [d.name for d in differences(run, other)] == fixed

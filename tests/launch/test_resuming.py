@@ -19,6 +19,7 @@ from icrl_dist.config.resuming import FREE
 from icrl_dist.config.run import ConfigError, dumps, load, load_folder, override
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.learner_process import TrainFailed
+from icrl_dist.models.kernel import best_decoder
 from icrl_dist.storage.checkpoint import partial_file
 from icrl_dist.storage.files import StoreError
 from learner import reporter
@@ -28,6 +29,14 @@ from tests.learner.test_service import no_tensorboard
 pytestmark = pytest.mark.integration
 
 __all__ = ["no_tensorboard"]
+
+
+@pytest.fixture(scope="module")
+def module_run(module_run):
+    """With its decoder named, as `train` names it."""
+    return dataclasses.replace(
+        module_run, context=dataclasses.replace(module_run.context, decoder=best_decoder(module_run.model))
+    )
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import icrl_dist
 from icrl_dist.models import kernel, training_kernel
+from icrl_dist.models.compiled import kinds
 
 
 def main(folder: str, kind: str, threads: str) -> None:
     run = icrl_dist.load_run("smoke")
     learner = replace(run.learner, threads=int(threads), reproducible="any-machine")
     run = replace(run, learner=learner, evaluate=replace(run.evaluate, episodes=2, seeds=1))
-    found = kernel.kinds("training")
+    found = kinds("training")
     only = found[: found.index(kind) + 1]
     for module in (kernel, training_kernel):
         setattr(module, "kinds", lambda name="decoder": only)  # noqa: B010

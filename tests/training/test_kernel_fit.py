@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from icrl_dist.config.sections import OptimConfig
+from icrl_dist.models.compiled import kinds
 from icrl_dist.models.features import sine_and_cosine
-from icrl_dist.models.kernel import kinds
 from icrl_dist.models.weights import weights_of
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.training.kernel_fit import KernelFit, _power, cosine
@@ -155,3 +155,11 @@ def test_sine_and_cosine_are_right_to_the_last_place() -> None:
     x = np.linspace(-60, 60, 100_001).astype(np.float32)
     for own, true in zip(sine_and_cosine(x), (np.sin(x.astype(float)), np.cos(x.astype(float))), strict=True):
         np.testing.assert_array_equal(own, true.astype(np.float32))
+
+
+def test_a_prefix_beyond_the_context_is_refused() -> None:
+    case = Case()
+    batch = case.batch()
+    for wrong in (-1, case.tokens + 1):
+        with pytest.raises(ValueError, match=f"prefixes of .*a context has {case.tokens} tokens"):
+            case.fit(case.model()).gradient(replace(batch, prefix=np.full_like(batch.prefix, wrong)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import kinds
 
 FEATURES = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"
 """The instruction sets that numpy chooses from when it runs."""
