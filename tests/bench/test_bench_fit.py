@@ -111,7 +111,7 @@ def test_it_measures_every_way_with_the_same_batches(monkeypatch: pytest.MonkeyP
     assert json.loads(json.dumps(result)) == result
     assert len(drawn) == 2 * len(result["fits"]) and len(set(map(tuple, drawn.values()))) == 1
     for row, ratio in zip(result["fits"], result["fit_over_torch"], strict=True):
-        assert 1.5 < ratio < 8 and row["ways"]["fast"]["cpu_ms"] < row["ways"]["torch"]["cpu_ms"]
+        assert ratio > 1 and row["ways"]["fast"]["cpu_ms"] < row["ways"]["torch"]["cpu_ms"]
         assert 0 < row["floor_ms"] < row["dense_floor_ms"] and row["step_over_floor"] < row["torch_over_floor"]
     text = bench.describe(result)
     assert max(map(len, text.splitlines())) <= 80
