@@ -23,6 +23,7 @@ def main(folder: str, kind: str, threads: str) -> None:
     only = found[: found.index(kind) + 1]
     for module in (kernel, training_kernel):
         setattr(module, "kinds", lambda name="decoder": only)  # noqa: B010
+    assert kernel.Kernel().kind == kind
     result = icrl_dist.train(run, out=Path(folder), engine="inline").result
     print(json.dumps([result["dataset_digest"], result["weights_digest"]]))
 
