@@ -56,6 +56,11 @@ def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
     return "kernel" if kinds() and model.width <= WIDEST else "torch"
 
 
+def missing_kernel(model: ModelConfig) -> str:
+    """Why ``auto`` means torch here for a model that the kernel is fast enough for, and the remedy; empty if it does not."""
+    return str(why) if isinstance(why := library("decoder"), Unusable) and model.width <= WIDEST else ""
+
+
 def decoder_here(decoder: Decoder, model: ModelConfig) -> Literal["torch", "kernel"]:
     """What computes decisions here for ``context.decoder``: torch, where the kernel is named and there is none.
 
