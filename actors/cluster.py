@@ -65,6 +65,7 @@ class Cluster:
         self._refreshed = -REFRESH_S
         self._certificates = ""
         self._needed: Mapping[str, str] = {}
+        self._kernel = False
         self._ports: list[tuple[str, int]] = []
         self._head: str = ray.get_runtime_context().gcs_address
         self._unanswered = ""
@@ -73,12 +74,13 @@ class Cluster:
         self._own_facts = node_facts.facts()
         self._loopback = ""
 
-    def require(self, endpoint: str, connect: str, certificates: str, needed: Mapping[str, str]) -> None:
+    def require(self, endpoint: str, connect: str, certificates: str, needed: Mapping[str, str], kernel: bool = False) -> None:
         """Set what a node must reach and have: the learner at ``connect`` or else ``endpoint``, and the certificates.
 
         ``needed``: the run's problem and method, from ``plugins.of_run``; a node must have them from the same package.
+        ``kernel``: whether it needs the compiled decoder.
         """
-        self._certificates, self._needed = certificates, needed
+        self._certificates, self._needed, self._kernel = certificates, needed, kernel
         where = endpoints.parse(connect or endpoint)
         self._loopback = connect or endpoint if where.loopback else ""
         self._ports = [(where.host, where.port)]
@@ -193,6 +195,8 @@ class Cluster:
             if differing := node_facts.differences(self._own_facts, facts, self._needed):
                 remedy = "run `ray up` again, so that all nodes have the same"
                 refused += self._refuse(candidate, f"{node}: {', '.join(differing)}: {remedy}", retry=False)
+            elif self._kernel and facts["decoder"]:
+                refused += self._refuse(candidate, f"{node}: context.decoder = 'kernel': {facts['decoder']}", retry=False)
             elif problem := connection_problems(facts):
                 refused += self._refuse(candidate, f"{node}: {problem}")
             else:

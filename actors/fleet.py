@@ -136,16 +136,18 @@ class Fleet:
         note: Callable[[str], None],
         stopped: Callable[[], bool],
         needed: Mapping[str, str],
+        kernel: bool = False,
     ) -> None:
         """Wait until the cluster's nodes have joined and can reach the learner's endpoint; without a cluster do nothing.
 
-        ``endpoint`` and ``connect`` as in ``config.StreamConfig``, ``needed`` as in ``Cluster.require``.  Returns
-        early once ``stopped()``.  After ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others suffice.
+        ``endpoint`` and ``connect`` as in ``config.StreamConfig``, ``needed`` and ``kernel`` as in ``Cluster.require``.
+        Returns early once ``stopped()``.  After ``REPORT_MISSING_S`` it reports the missing nodes, and returns if the others
+        suffice.
         Raises ConfigError for a node that fails the check, or if there are too few after ``JOIN_S``.
         """
         if self._cluster is None:
             return
-        self._cluster.require(endpoint, connect, certificates, needed)
+        self._cluster.require(endpoint, connect, certificates, needed, kernel)
         began, noted, reported = self._clock(), False, False
         enough_since: float | None = None
         with self._cluster.listening(endpoint, connect):

@@ -516,6 +516,11 @@ class Method(abc.ABC):
     shows_states: ClassVar[bool] = False
     """Whether its policy calls ``watch`` with the model's final hidden states, which the OOD score is computed from."""
 
+    @property
+    def fits_by_kernel(self) -> bool:
+        """Whether model and loss are DPT's, so that the compiled kernel can fit it (``learner.reproducible``)."""
+        return False
+
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         """The values that a run of this method cannot have: key, value, remedy."""
         yield from ()

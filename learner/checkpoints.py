@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from torch import nn
 
 from icrl_dist.agent.loading import spec_from
@@ -20,6 +18,7 @@ from icrl_dist.stream import wire
 from icrl_dist.stream.validation import VERSION
 from icrl_dist.telemetry import provenance
 from icrl_dist.training.fit import Optimizer
+from icrl_dist.training.kernel_fit import KernelFit
 from icrl_dist.types import Spec, Weights
 
 
@@ -39,7 +38,7 @@ def manifest(run: Run, spec: Spec, version: int, threads: int, device: str = "cp
         "window": run.model.window,
         **registry.of(run).manifest(),
         "format": VERSION,
-        "made_by": provenance.record(run.problem, run.method, threads, device),
+        "made_by": provenance.record(run.problem, run.method, threads, device, run.learner.reproducible),
     }
 
 
@@ -49,10 +48,10 @@ def weights(version: int, model: nn.Module) -> Weights:
     return Weights(version, arrays, wire.weights_digest(arrays))
 
 
-def save(path: Path, weights: Weights, opt: Optimizer, about: Mapping[str, Any]) -> None:
+def save(path: Path, weights: Weights, opt: Optimizer | KernelFit, about: Mapping[str, Any]) -> None:
     """Write weights, optimizer state and manifest atomically."""
     arrays = {f"model/{name}": value for name, value in weights.arrays.items()}
-    arrays |= {f"optimizer/{name}": value.cpu().numpy() for name, value in opt.state().items()}
+    arrays |= {f"optimizer/{name}": value for name, value in opt.state().items()}
     save_checkpoint(path, Checkpoint(arrays, {**about, "weights_digest": weights.digest}))
 
 
@@ -61,7 +60,7 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
     return load_checkpoint(path).manifest
 
 
-def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping[str, Any]:
+def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer | KernelFit) -> Mapping[str, Any]:
     """Load a checkpoint of ``save`` into model and optimizer; returns the manifest.
 
     Raises ConfigError, and changes neither, for a checkpoint of another spec, data format, model size or optimizer.
@@ -76,7 +75,7 @@ def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer) -> Mapping
     if own != {name: array.shape for name, array in arrays.items()}:
         raise ConfigError(f"{path}: a checkpoint of another model, its arrays have other names or shapes: use another --out")
     try:
-        opt.load({name: torch.from_numpy(np.array(value)) for name, value in state.items()})
+        opt.load(state)
     except ValueError as error:
         raise ConfigError(f"{path}: a checkpoint of another optimizer ({error}): it has the run's optim.muon") from None
     load_weights(model, arrays)

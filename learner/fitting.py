@@ -13,10 +13,12 @@ import torch
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw, Method, Phase
+from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.storage import checkpoint
 from icrl_dist.storage.checkpoint import partial_file
-from icrl_dist.training import fit
+from icrl_dist.training import fit, kernel_fit
+from icrl_dist.training.kernel_fit import KernelFit
 from icrl_dist.types import Spec, Weights
 from learner import checkpoints
 from learner.recovery import continues
@@ -69,11 +71,22 @@ class Fitting:
         torch.manual_seed(run.seed)
         torch.set_deterministic_debug_mode("error")  # as use_deterministic_algorithms, which imports torch's compiler
         self._model = method.build(spec, run).to(device)
-        self._optimizer = fit.Optimizer(self._model, run.optim)
+        self._kernel = self._kernel_fit() if run.learner.reproducible == "any-machine" else None
+        self._optimizer = self._kernel or fit.Optimizer(self._model, run.optim)
         self._steps_done = 0
         self._first_loss = math.nan
         self.version = -1
         """The newest policy version that was fitted or loaded; -1 before the first."""
+
+    def _kernel_fit(self) -> KernelFit:
+        """The fit through the compiled kernel; from now on the model's parameters are views of its weights."""
+        assert isinstance(self._model, PretrainedTransformer), "another model is not fitted by the kernel"
+        self._model.draw_weights(generator(self._run.seed, RandomKey.INITIAL_WEIGHTS))
+        found = KernelFit(self._spec, self._run.model, self._run.optim, weights_of(self._model), self._threads)
+        for name, parameter in self._model.named_parameters():
+            parameter.data = torch.from_numpy(found.weights[name])
+        self._model.eval()
+        return found
 
     @property
     def steps_done(self) -> int:
@@ -114,11 +127,11 @@ class Fitting:
         finite, or the loss has become ``EXPLODED`` times as large as at the first step (or as 1, if that is more).
         """
 
-        def loss_of(step: int) -> torch.Tensor:
+        def batch_of(step: int) -> Any:
             assert draw is not None
             rng = generator(self._run.seed, RandomKey.FIT, phase.next_version, step)
-            torch.manual_seed(int(rng.integers(2**31)))
-            return self.method.loss(self._model, draw(rng))
+            torch.manual_seed(int(rng.integers(2**31)))  # for dropout
+            return draw(rng)
 
         def progress(step: int, loss: float) -> None:
             self._steps_done = step  # if damaged data ends this fit, the next call continues from here
@@ -130,13 +143,7 @@ class Fitting:
                 self._save(self._partial, self._weights(), **about)
             check()
 
-        torch_threads, first = torch.get_num_threads(), self._steps_done
-        torch.set_num_threads(self._threads)
-        try:
-            args = self._model, self._optimizer, self._run.optim, phase.learning_rate, phase.steps
-            loss = fit.fit(*args, loss_of, progress, first)
-        finally:
-            torch.set_num_threads(torch_threads)
+        loss = self._take_steps(phase, batch_of, progress)
         self._steps_done = 0
         remedy = f"lower the learning rate ({phase.learning_rate:g})"
         if phase.steps and loss > EXPLODED * max(1.0, self._first_loss):
@@ -145,6 +152,21 @@ class Fitting:
             raise FloatingPointError(f"a parameter is infinite or not a number after the last step: {remedy}")
         self.version = phase.next_version
         return loss
+
+    def _take_steps(self, phase: Phase, batch_of: Callable[[int], Any], progress: Callable[[int, float], None]) -> float:
+        """Take the remaining steps of a phase; returns the mean loss of the last ones."""
+        config, peak, steps, first = self._run.optim, phase.learning_rate, phase.steps, self._steps_done
+        if (kernel := self._kernel) is not None:
+            take = lambda step, rate: kernel.step(batch_of(step), rate)  # noqa: E731
+            return fit.take_steps(take, config, peak, steps, progress, first, kernel_fit.cosine)
+        assert isinstance(self._optimizer, fit.Optimizer)
+        loss_of = lambda step: self.method.loss(self._model, batch_of(step))  # noqa: E731
+        threads = torch.get_num_threads()
+        torch.set_num_threads(self._threads)
+        try:
+            return fit.fit(self._model, self._optimizer, config, peak, steps, loss_of, progress, first)
+        finally:
+            torch.set_num_threads(threads)
 
     def save(self, accept: Callable[[Weights], None], **fields: object) -> Weights:
         """Write the checkpoint of the newest version, with these fields in its manifest; returns its weights.

@@ -114,7 +114,7 @@ class Service:
         self._serving = False
         if newest is not None:
             self._broadcast.publish(newest)
-        made_by = provenance.record(run.problem, run.method, self._threads, self._fitting.device_name)
+        made_by = provenance.record(run.problem, run.method, self._threads, self._fitting.device_name, run.learner.reproducible)
         if changed := provenance.add_session(folder, self.version, made_by):
             self._note(changed)
             self._data.excused = changed

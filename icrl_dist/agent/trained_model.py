@@ -11,7 +11,7 @@ from icrl_dist.agent.threads import torch_threads
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import Method
-from icrl_dist.models.kernel import best_decoder
+from icrl_dist.models.kernel import decoder_here
 from icrl_dist.types import Spec
 
 if TYPE_CHECKING:
@@ -60,6 +60,6 @@ class TrainedModel:
 
     def to_deploy(self, context: ContextConfig) -> Any:
         """What ``method.policy`` takes: the stored weights if the kernel decodes and nobody has used ``model``, else that."""
-        decoder = best_decoder(self.run.model) if context.decoder == "auto" else context.decoder
+        decoder = decoder_here(context.decoder, self.run.model)
         untouched = self._model is None and self._stored is not None
         return self._stored if untouched and decoder == "kernel" else self.model

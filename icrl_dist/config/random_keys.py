@@ -30,6 +30,8 @@ class RandomKey(enum.IntEnum):
     """Contexts and queries of the comparison with the exact posterior."""
     RESULTS = 107
     """Bootstrap of all intervals of results; its seed is 0, so equal rows give equal intervals."""
+    INITIAL_WEIGHTS = 108
+    """Initial weights of a fit with ``learner.reproducible = "any-machine"``; torch draws those of other fits."""
 
 
 def strength_key(p: float) -> int:

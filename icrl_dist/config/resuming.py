@@ -25,12 +25,13 @@ FREE: Mapping[str, frozenset[str]] = {
 
 They say where and how a run is executed, watched and evaluated.  ``learner.device`` is the machine's, as with ``auto``:
 digests are equal on machines of one kind only, and a resume on other hardware says so.  Not free are
-``learner.threads`` and ``stream.job_tasks`` (digests depend on them) and ``stream.staleness`` (it makes them depend on
-timing).  The engine, the number of workers and the address of a cluster are no numbers of a run.
+``learner.threads`` (unless ``learner.reproducible`` is any-machine) and ``stream.job_tasks``, because digests depend on them,
+and ``stream.staleness``, which makes them depend on timing.  The engine, the number of workers and the address of a
+cluster are no numbers of a run.
 """
 
-AUTO = ("context.decoder", "auto")
-"""The number, with the value by which a resumed run keeps the one that it began with."""
+AUTO = ("context.decoder", "learner.reproducible")
+"""The numbers that a resumed run keeps as it began with them if they are ``auto``."""
 
 
 class Difference(NamedTuple):
@@ -55,5 +56,8 @@ def differences(before: Run, after: Run) -> list[Difference]:
         elif type(old) is type(new):
             names = _fields(type(old)) - FREE.get(item.name, frozenset())
             pairs = [(f"{item.name}.{name}", getattr(old, name), getattr(new, name)) for name in sorted(names)]
-            found += [Difference(*pair) for pair in pairs if pair[1] != pair[2] and pair[::2] != AUTO]
+            kept = [name for name, _, value in pairs if name in AUTO and value == "auto"]
+            if before.learner.reproducible == "any-machine":
+                kept.append("learner.threads")
+            found += [Difference(*pair) for pair in pairs if pair[1] != pair[2] and pair[0] not in kept]
     return found

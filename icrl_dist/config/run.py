@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -155,6 +155,8 @@ def load_run(what: str | Path, *settings: str) -> Run:
 
 
 _RUN_FILE = "run.toml"
+_FORMER: Mapping[str, Mapping[str, str]] = {"context": {"decoder": "torch"}, "learner": {"reproducible": "this-machine"}}
+"""The values of keys, by section, in files of versions without the keys: what these versions did."""
 
 
 def load_folder(folder: Path) -> Run:
@@ -237,8 +239,9 @@ def _from_tables(tables: dict[str, Any], source: str, written: bool = False) -> 
         raise ConfigError(f"{source}: {error}") from None
     if written and isinstance(problem, str):
         tables = former_names.translated(tables, names_of(kind), plugins.find("problems", problem))
-        if isinstance(context := tables.get("context", {}), dict):
-            tables = {**tables, "context": {"decoder": "torch", **context}}  # the only one of versions without the key
+        for section, former in _FORMER.items():
+            if isinstance(found := tables.get(section, {}), dict):
+                tables = {**tables, section: {**former, **found}}
     else:
         former_names.check(tables, names_of(kind), problem, source)
     run = cast(Run, build(kind, tables, source))

@@ -13,6 +13,9 @@ from icrl_dist.stream.schema import Remedy
 Decoder = Literal["auto", "torch", "kernel"]
 """What computes decisions on a CPU: see ``ContextConfig``."""
 
+Reproducible = Literal["auto", "any-machine", "this-machine"]
+"""Where a fit gives the same weights digest: see ``LearnerConfig``."""
+
 Deployment = Literal["paper", "committed"]
 """How T_theta is deployed online.
 
@@ -214,8 +217,13 @@ class LearnerConfig:
     """The learner process."""
 
     threads: NotNegative = 0
-    """CPU threads of a fit; 0 uses every core, because workers are idle during a fit.  The weights
-    digest depends on it, so the run folder records it."""
+    """CPU threads of a fit; 0 uses every core, because workers are idle during a fit.  With
+    ``reproducible = "this-machine"`` the weights digest depends on it, so the run folder records it."""
+    reproducible: Reproducible = "auto"
+    """Where a fit gives the same weights digest.  ``any-machine``: on every processor and with any number of threads,
+    through the compiled kernel, which is also faster than torch for models up to 128 wide; on the CPU, without dropout,
+    for methods with DPT's model and loss, and with ``context.decoder = "kernel"``.  ``this-machine``: on machines of one
+    kind with the same threads, by torch.  ``auto``: any-machine where it is possible.  A run keeps what it began with."""
     restarts: NotNegative = 3
     """Maximum number of restarts of the learner, and of successive restarts of a worker without progress;
     then the run fails."""

@@ -206,7 +206,16 @@ def _wheel(wheels: list[Path]) -> Check:
         return Check("wheel", False, f"{wheels[0].name}: {error}", build)
     if packed != version.digest():
         return Check("wheel", False, f"{wheels[0].name} holds code {packed[:8]}, this is {version.digest()[:8]}", build)
-    return Check("wheel", True, f"{wheels[0].name}, code {packed[:8]}")
+    *_, platforms = wheels[0].stem.rpartition("-")
+    if not any(platform == "any" or "linux" in platform for platform in platforms.split(".")):
+        remedy = f"build it on Linux, on a processor as the nodes have: {build}"
+        return Check("wheel", False, f"{wheels[0].name} cannot be installed on nodes, which run Linux", remedy)
+    with zipfile.ZipFile(wheels[0]) as archive:
+        compiled = any(Path(name).match("icrl_dist/models/_decoder_kernel*.so") for name in archive.namelist())
+    if not compiled:
+        value = f"{wheels[0].name} has no compiled decoder: torch computes decisions, which takes several times as long"
+        return Check("wheel", None, value, f"install a C compiler, then {build}")
+    return Check("wheel", True, f"{wheels[0].name}, code {packed[:8]}, for nodes with {platforms}")
 
 
 def _commands(config: dict[str, Any]) -> Iterator[Check]:

@@ -45,11 +45,14 @@ def _check_node(
         )
         return
     name = f"{facts['host']} ({address})"
-    wrong = node_facts.differences(node_facts.facts(), facts)
+    here = node_facts.facts()
+    wrong = node_facts.differences(here, facts)
     remedy = "run `ray up` again, so that all nodes have the same versions"
     yield Check(
         f"{name} versions", not wrong, ", ".join(wrong) or f"icrl-dist {facts['code'][:8]}, as here", remedy if wrong else ""
     )
+    if not wrong and facts["decoder"] and not here["decoder"]:  # runs that begin here need it
+        yield Check(f"{name} decoder", False, facts["decoder"], "or begin runs with --context.decoder torch")
     skew = max(0.0, asked_at - facts["time"], facts["time"] - time.time())
     clock = True if skew < 1 else None if skew < 60 else False
     yield Check(

@@ -29,7 +29,7 @@ from icrl_dist.diagnostics.modules import check_modules
 from icrl_dist.diagnostics.ray_address import require_cluster
 from icrl_dist.diagnostics.ray_token import check_ray_token, require_ray_token
 from icrl_dist.diagnostics.surroundings import existing, writable
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import Unusable, kinds, library
 from icrl_dist.stream import endpoints
 
 LIBRARIES = ("torch", "ray", "eclipse-zenoh", "msgpack", "gymnasium", "numpy")
@@ -53,7 +53,8 @@ def diagnose(endpoint: str, folder: Path) -> list[Check]:
         _shared_memory(Path("/dev/shm")),
         _open_files(),
         check_ray_token(),
-        _decoder(),
+        _compiled("decoder", "torch computes decisions, which takes several times as long"),
+        _compiled("training", "torch fits models, and digests are equal on machines of one kind only"),
         _gpu(),
     ]
 
@@ -162,11 +163,11 @@ def _open_files() -> Check:
     return Check("open files", ok, f"at most {soft} (hard limit {hard})", "" if ok else "ulimit -n 65536 before starting Ray")
 
 
-def _decoder() -> Check:
-    if kinds():
-        return Check("decoder", True, f"compiled, for {' and '.join(kinds())}")
-    remedy = "install a C compiler, then `make env`"
-    return Check("decoder", None, "not compiled: torch computes decisions, which takes several times as long", remedy)
+def _compiled(kernel: str, without: str) -> Check:
+    """Whether a compiled kernel can be used here, the name of the check; ``without``: what torch does in its place."""
+    if isinstance(why := library(kernel), Unusable):
+        return Check(f"{kernel} kernel", None, f"{why.why}: {without}", why.remedy)
+    return Check(f"{kernel} kernel", True, f"compiled, for {' and '.join(kinds(kernel))}")
 
 
 def _gpu() -> Check:

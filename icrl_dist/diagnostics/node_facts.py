@@ -18,6 +18,7 @@ from typing import Any
 
 import icrl_dist
 from icrl_dist.config import plugins
+from icrl_dist.models.compiled import Unusable, library
 from icrl_dist.stream import security
 from icrl_dist.stream.link import LinkError
 from icrl_dist.version import digest as code_digest
@@ -50,6 +51,8 @@ class Facts:
     """The error of its certificates; empty if they are valid or not needed."""
     unreached: tuple[str, ...]
     """One error message for each requested port that it cannot reach."""
+    decoder: str
+    """Why it cannot use the compiled decoder, with the remedy; empty if it can."""
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -75,6 +78,7 @@ def facts(certificates: str = "", ports: Sequence[tuple[str, int]] = ()) -> dict
         open_files=resource.getrlimit(resource.RLIMIT_NOFILE)[0],
         certificates=_certificates(certificates),
         unreached=tuple(filter(None, (reach(*port) for port in ports))),
+        decoder=str(built) if isinstance(built := library("decoder"), Unusable) else "",
     ).as_dict()
 
 

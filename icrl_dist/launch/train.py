@@ -28,13 +28,14 @@ from icrl_dist.launch import learner_process, run_folder, watching
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.models.kernel import best_decoder
+from icrl_dist.models.kernel import best_decoder, require_kernel
 from icrl_dist.storage import layout
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry import provenance
+from icrl_dist.training.reproducible import best_fit, require_kernel_fit
 
 FINISH_S = 10.0
 """Seconds within which the learner's last event arrives after its workers have ended."""
@@ -54,12 +55,23 @@ class TrainInterrupted(Exception):  # noqa: N818
         return type(self), (str(self), self.resumable)
 
 
-def with_decoder(run: Run, folder: Path, resume: bool) -> Run:
-    """The run with its decoder named, where this was ``auto``: the best one here, or, to resume, that of the run there."""
-    if run.context.decoder != "auto":
-        return run
-    there = load_folder(folder).context.decoder if resume and (folder / "run.toml").is_file() else "auto"
-    return replace(run, context=replace(run.context, decoder=best_decoder(run.model) if there == "auto" else there))
+def without_auto(run: Run, folder: Path, resume: bool) -> Run:
+    """The run with its decoder and its way to fit named, where they were ``auto``: the best here, or those of the run there.
+
+    Raises ConfigError for a kernel where this installation has none, and for a fit that is impossible here.
+    """
+    there = load_folder(folder) if resume and (folder / "run.toml").is_file() else run
+    decoder, fits = run.context.decoder, run.learner.reproducible
+    decoder = there.context.decoder if decoder == "auto" else decoder
+    decoder = best_decoder(run.model) if decoder == "auto" else decoder
+    if decoder == "kernel":
+        require_kernel()
+    run = replace(run, context=replace(run.context, decoder=decoder))
+    fits = there.learner.reproducible if fits == "auto" else fits
+    fits = best_fit(run) if fits == "auto" else fits
+    run = replace(run, learner=replace(run.learner, reproducible=fits))
+    require_kernel_fit(run)
+    return run
 
 
 def prepare(
@@ -263,7 +275,8 @@ def train_ray(
         stack.callback(fleet.close)
         handle_again()  # Ray replaces the handlers
         needed = plugins.of_run(run.problem, run.method)
-        fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed)
+        kernel = run.context.decoder == "kernel"
+        fleet.gather(run.stream.endpoint, run.stream.connect, certificates, note, interrupted.is_set, needed, kernel)
         if address is not None:
             if interrupted.is_set():
                 raise TrainInterrupted

@@ -36,6 +36,11 @@ class DPT(Method):
     name = "dpt"
     shows_states = True
 
+    @property
+    def fits_by_kernel(self) -> bool:
+        """False for a method of another package that changes the model or the loss."""
+        return type(self).build is DPT.build and type(self).loss is DPT.loss
+
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
         """Only the task under the null adversary."""
         return (Variation(task),)

@@ -12,6 +12,8 @@
 #ifndef KIND
 #include <stdint.h>
 
+KEEP_SOURCE
+
 #define BLOCKS 8               /* per chunk */
 #define CHUNK (LANES * BLOCKS) /* tokens per chunk */
 #define ROWS 16                /* tokens that pass through the layers together */
@@ -149,7 +151,7 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
     long most = 0, offset = b * CHUNK * width;
     V highest[QUERIES], total[QUERIES];
     for (int g = 0; g < count; g++) {
-        highest[g] = all(-1e30f), total[g] = all(0.0f);
+        highest[g] = all(-__FLT_MAX__), total[g] = all(0.0f);
         if (visible[g] > most) most = visible[g];
     }
     for (int i = 0; i < count * width; i++) store(mixed + i * LANES, all(0.0f));

@@ -6,6 +6,7 @@ token.  Observations are scaled to [-1, 1] by the spec, so the model depends on 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -61,13 +62,25 @@ class PretrainedTransformer(nn.Module):
             self.embed_taken = nn.Linear(features + spec.actions + 1, config.width)  # the name is part of every weights digest
         self.trunk = GPT(config.layers, config.heads, config.width, config.dropout)
         self.head = nn.Linear(config.width, self.action_head.outputs)
+        for linear, over_variance in self._linear_layers():
+            nn.init.normal_(linear.weight, std=over_variance**-0.5)
+            nn.init.zeros_(linear.bias)
+
+    def _linear_layers(self) -> Iterator[tuple[nn.Linear, int]]:
+        """The linear layers, each with 1 over the variance of its initial weights."""
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
                 # Variance 1 / fan-in: GPT-2's 0.02 suits widths near 1000.  Layers that add to the
                 # residual stream are smaller by the square root of their number, as in GPT-2.
-                residual = 2 * config.layers if name.endswith((".out", ".feed.2")) else 1
-                nn.init.normal_(module.weight, std=(module.in_features * residual) ** -0.5)
-                nn.init.zeros_(module.bias)
+                residual = 2 * self.config.layers if name.endswith((".out", ".feed.2")) else 1
+                yield module, module.in_features * residual
+
+    @torch.no_grad()
+    def draw_weights(self, rng: np.random.Generator) -> None:
+        """Draw new initial weights by numpy: those that torch draws depend on the processor's vector instructions."""
+        for linear, over_variance in self._linear_layers():
+            drawn = rng.standard_normal(linear.weight.shape) / math.sqrt(over_variance)
+            linear.weight.copy_(torch.from_numpy(drawn.astype(np.float32)))
 
     def features(self, observations: Float[Tensor, "*B S"]) -> Float[Tensor, "*B F"]:
         """Observations scaled to [-1, 1], with ``fourier`` sine and cosine pairs of each component."""

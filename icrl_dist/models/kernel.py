@@ -7,9 +7,8 @@ kernel runs on.  It is built when the package is installed, if there is a C comp
 from __future__ import annotations
 
 import ctypes
-import functools
-import importlib.util
 import platform
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Self
 
@@ -17,8 +16,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config.run import ConfigError
-from icrl_dist.config.sections import ModelConfig
+from icrl_dist.config.sections import Decoder, ModelConfig
 from icrl_dist.copies import CopiedWhole
+from icrl_dist.models.compiled import Unusable
+from icrl_dist.models.compiled import kinds as kinds
+from icrl_dist.models.compiled import library as library
 
 _LANES, _BLOCKS = 16, 8
 _CHUNK = _LANES * _BLOCKS
@@ -26,8 +28,6 @@ WIDEST = 128
 """The widest model for which the kernel is faster than torch in every case (docs/results/engine.md)."""
 _NEAR = 1 << 19
 """Bytes of contexts that are taken to stay in the processor's second-level cache from one decision to the next."""
-_KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",)}
-"""The instruction sets that the C file names, by machine, each including the ones before it."""
 
 _Pair = ctypes.c_void_p * 2
 
@@ -51,31 +51,25 @@ class _Decoder(ctypes.Structure):
     ]
 
 
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    found = importlib.util.find_spec("icrl_dist.models._decoder_kernel")
-    return None if found is None or found.origin is None else ctypes.CDLL(found.origin)
-
-
-@functools.cache
-def kinds() -> tuple[str, ...]:
-    """The instruction sets that the kernel can use on this processor, the widest last; none if it was not built."""
-    library = _library()
-    return () if library is None else _KINDS.get(platform.machine(), ())[: library.icrl_kinds()]
-
-
 def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
     """What ``context.decoder = "auto"`` means here: the kernel if there is one and the model is not too wide."""
     return "kernel" if kinds() and model.width <= WIDEST else "torch"
 
 
+def decoder_here(decoder: Decoder, model: ModelConfig) -> Literal["torch", "kernel"]:
+    """What computes decisions here for ``context.decoder``: torch, where the kernel is named and there is none.
+
+    That changes outputs by 1e-5.  Decisions that enter a run's digests need ``require_kernel``.
+    """
+    return best_decoder(model) if decoder == "auto" else decoder if kinds() else "torch"
+
+
 def require_kernel() -> None:
     """Raises ConfigError unless the kernel was built and this processor can run it."""
-    if not kinds():
-        why = "was not built" if _library() is None else "does not support this processor"
+    if isinstance(why := library("decoder"), Unusable):
         raise ConfigError(
-            f"context.decoder = 'kernel': the compiled decoder {why} on {platform.node()}: install a C compiler and run "
-            "`make env` there, or begin a run with context.decoder = 'torch', which has other digests"
+            f"context.decoder = 'kernel': on {platform.node()} the compiled decoder cannot be used: {why}; "
+            "or begin a run with context.decoder = 'torch', which has other digests"
         )
 
 
@@ -86,30 +80,37 @@ class Kernel(CopiedWhole):
     """
 
     def __init__(self, kind: str | None = None) -> None:
-        library = _library()
-        if library is None or not kinds() or (kind or kinds()[-1]) not in kinds():
-            raise RuntimeError(f"kernel {kind or ''}: this installation has {', '.join(kinds()) or 'none'} for this processor")
+        loaded = library("decoder")
+        if isinstance(loaded, Unusable):
+            raise RuntimeError(f"kernel: {loaded}")
+        if kind is not None and kind not in kinds():
+            raise RuntimeError(f"kernel {kind}: this processor has {', '.join(kinds())}")
         self.kind = kind or kinds()[-1]
         pointer, number = ctypes.c_void_p, ctypes.c_int
         self.run = self._function("run", pointer, pointer, pointer, *[ctypes.c_long] * 3, number)
         self._linear = self._function("linear", *[pointer] * 4, *[number] * 3)
         self._softmax = self._function("softmax", pointer, *[number] * 3)
-        library.icrl_work.restype = ctypes.c_long
-        self.work_size = library.icrl_work
+        loaded.icrl_work.restype = ctypes.c_long
+        self.work_size = loaded.icrl_work
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _kernel, (self.kind,)
 
     def _function(self, name: str, *arguments: type) -> Callable[..., None]:
-        found = getattr(_library(), f"icrl_{name}_{self.kind}")
+        found = getattr(library("decoder"), f"icrl_{name}_{self.kind}")
         found.argtypes, found.restype = arguments, None
         return found
 
     def linear(
         self, x: Float32[np.ndarray, "R I"], weight: Float32[np.ndarray, "I C"], bias: Float32[np.ndarray, " C"]
     ) -> np.ndarray:
-        """``x @ weight + bias``; each sum over I runs in order, beginning with the bias.  C is a multiple of 16."""
+        """``x @ weight + bias``; each sum over I runs in order, beginning with the bias.
+
+        ``weight`` and ``bias`` are ``padded``, so C is a multiple of 16.  Raises ValueError for shapes that do not fit.
+        """
         x = np.ascontiguousarray(x, np.float32)
+        if x.shape[1:] != weight.shape[:1] or bias.shape != weight.shape[1:]:
+            raise ValueError(f"{x.shape} times {weight.shape} plus {bias.shape}: the shapes do not fit")
         to = np.empty((len(x), weight.shape[1]), np.float32)
         self._linear(address(to), address(x), address(weight), address(bias), *weight.shape, len(x))
         return to
@@ -147,13 +148,18 @@ def padded(array: np.ndarray) -> Float32[np.ndarray, "*N C"]:
 class KernelDecoder(CopiedWhole):
     """``models.decoder.Decoder`` through the kernel: B growing contexts, float32, one thread.
 
-    ``weights``: those of ``models.gpt.GPT``, by their names there.  They are copied.
+    ``weights``: those of ``models.gpt.GPT``, by their names there.  They are copied.  Calls from several threads are
+    done one after the other.  All raise ValueError for tokens of another shape than their own.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel) -> None:
+        """``weights`` must have the shapes of ``models.stored``.  Raises ValueError for ``batch`` below 1."""
+        if batch < 1:
+            raise ValueError(f"batch {batch}: expected at least 1")
         self._made_of = weights, heads, batch, kernel
         self._batch, self._width = batch, len(weights["norm.weight"])
         self._kernel = kernel
+        self._one_call = threading.Lock()
         self._kept: list[np.ndarray] = []
         """What the kernel has pointers to."""
         self._layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
@@ -168,9 +174,12 @@ class KernelDecoder(CopiedWhole):
         self._chunks: list[np.ndarray] = []
         self.length = 0
         """Tokens in each context."""
+        self._written = 0
+        """Places from here on hold zeros."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _decoder, (*self._made_of, self._chunks, self.length)
+        with self._one_call:
+            return _decoder, (*self._made_of, [chunk.copy() for chunk in self._chunks], self.length, self._written)
 
     def _fill(self, layer: _Layer, block: Mapping[str, np.ndarray], heads: int) -> None:
         """The weights of one block, with W_k multiplied into the queries and W_v into the output projection.
@@ -205,24 +214,33 @@ class KernelDecoder(CopiedWhole):
 
     def clear(self) -> None:
         """Empty every context."""
-        self.length = 0
+        with self._one_call:
+            self.length = 0
+            self._reserve(0)
 
-    def _reserve(self, tokens: int) -> None:
-        """Make room for contexts of that many tokens."""
-        if len(self._chunks) * _CHUNK < tokens:
-            while len(self._chunks) * _CHUNK < tokens:
-                # Zeros, because lanes without a token are multiplied by a weight of 0.
+    def _reserve(self, end: int) -> None:
+        """Make room for tokens at the places before ``end``; those from there on become zeros.
+
+        They are read together with the others, with a weight of 0, and 0 times nan is nan.
+        """
+        if len(self._chunks) * _CHUNK < end:
+            while len(self._chunks) * _CHUNK < end:
                 self._chunks.append(np.zeros((self._layers, self._batch, _BLOCKS, self._width, _LANES), np.float32))
             self._point_to_chunks()
+        for number in range(end // _CHUNK, -(-self._written // _CHUNK)):
+            chunk, first, last = self._chunks[number], max(0, end - number * _CHUNK), self._written - number * _CHUNK
+            for block in range(first // _LANES, -(-min(last, _CHUNK) // _LANES)):
+                chunk[:, :, block, :, max(0, first - block * _LANES) :] = 0
+        self._written = end
 
     def _point_to_chunks(self) -> None:
         self._pointers = self._chunk_pointers(0)
         self._decoder.chunks = self._pointers
         self._decoder.far_away = sum(chunk.nbytes for chunk in self._chunks) > _NEAR
 
-    def filled(self, chunks: Sequence[np.ndarray], length: int) -> Self:
-        """This decoder with the contexts of another one."""
-        self._chunks, self.length = [np.array(chunk) for chunk in chunks], length
+    def filled(self, chunks: Sequence[np.ndarray], length: int, written: int) -> Self:
+        """This decoder with the contexts of another one, which it now owns."""
+        self._chunks, self.length, self._written = list(chunks), length, written
         self._point_to_chunks()
         return self
 
@@ -237,12 +255,11 @@ class KernelDecoder(CopiedWhole):
 
     def append(self, x: Float32[np.ndarray, "B T D"]) -> None:
         """Append embedded tokens to the contexts; each token sees its whole context up to itself."""
-        self._pass(x, x.shape[1])
-        self.length += x.shape[1]
+        self._pass(x, x.shape[1], x.shape[1])
 
     def query(self, x: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B D"]:
         """Final states of one query token per context, which sees its context and itself."""
-        return self._pass(x[:, None], 0)
+        return self._pass(x[:, None], 0, 0)
 
     def window(
         self, x: Float32[np.ndarray, "B L D"], arrived: Float32[np.ndarray, "B D"] | None = None
@@ -253,18 +270,28 @@ class KernelDecoder(CopiedWhole):
         token ``arrived`` joins the context first.
         """
         x = x if arrived is None else np.concatenate([arrived[:, None], x], axis=1)
-        states = self._pass(x, x.shape[1] - 1)
-        # The window's tokens stay after the end of the context; the next tokens overwrite them.
-        self.length += int(arrived is not None)
+        return self._pass(x, x.shape[1] - 1, int(arrived is not None))
+
+    def _pass(self, x: Float32[np.ndarray, "B T D"], first: int, joining: int) -> Float32[np.ndarray, "B D"]:
+        """Pass T tokens per context through the layers; the final states of those from ``first`` on, one or none.
+
+        The first ``joining`` tokens join the context.
+        """
+        x = self._tokens(x, self._batch)
+        states = np.empty((self._batch, self._width), np.float32)
+        with self._one_call:
+            past, end = self.length, self.length + x.shape[1]
+            self._reserve(end)
+            self._kernel.run(self._address, address(x), address(states), past, x.shape[1], first, 0)
+            self.length = past + joining
         return states
 
-    def _pass(self, x: Float32[np.ndarray, "B T D"], first: int) -> Float32[np.ndarray, "B D"]:
-        """Pass T tokens per context through the layers; the final states of those from ``first`` on, one or none."""
+    def _tokens(self, x: np.ndarray, batch: int) -> np.ndarray:
+        """Tokens as the kernel reads them, (batch, T, D)."""
         x = np.ascontiguousarray(x, np.float32)
-        self._reserve(self.length + x.shape[1])
-        states = np.empty((self._batch, self._width), np.float32)
-        self._kernel.run(self._address, address(x), address(states), self.length, x.shape[1], first, 0)
-        return states
+        if x.ndim != 3 or x.shape[::2] != (batch, self._width):
+            raise ValueError(f"tokens have the shape {x.shape}: expected ({batch}, T, {self._width})")
+        return x
 
     def query_row(
         self, row: int, x: Float32[np.ndarray, "Q D"], appended: Float32[np.ndarray, "E D"]
@@ -273,19 +300,30 @@ class KernelDecoder(CopiedWhole):
 
         They also see the ``appended`` tokens, as if these had joined the context.  The decoder does not change.
         """
-        new, queries = len(appended), len(x)
-        self._reserve(self.length + new + 1)
-        one, chunks = _Decoder.from_buffer_copy(self._decoder), self._chunk_pointers(row)
-        one.batch, one.chunks = 1, chunks
-        at, states = ctypes.addressof(one), np.empty((queries, self._width), np.float32)
-        x, appended = np.ascontiguousarray(x, np.float32), np.ascontiguousarray(appended, np.float32)
-        self._kernel.run(at, address(appended), address(states), self.length, new, new, 0)
-        self._kernel.run(at, address(x), address(states), self.length + new, queries, 0, 1)
+        if not 0 <= row < self._batch:
+            raise ValueError(f"row {row}: expected one of 0..{self._batch - 1}")
+        x, appended = self._tokens(x[None], 1), self._tokens(appended[None], 1)
+        new, queries = appended.shape[1], x.shape[1]
+        states = np.empty((queries, self._width), np.float32)
+        with self._one_call:
+            past = self.length
+            self._reserve(past + new + 1)
+            one, chunks = _Decoder.from_buffer_copy(self._decoder), self._chunk_pointers(row)
+            one.batch, one.chunks = 1, chunks
+            at = ctypes.addressof(one)
+            self._kernel.run(at, address(appended), address(states), past, new, new, 0)
+            self._kernel.run(at, address(x), address(states), past + new, queries, 0, 1)
         return states
 
 
 def _decoder(
-    weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel, chunks: Sequence[np.ndarray], length: int
+    weights: Mapping[str, np.ndarray],
+    heads: int,
+    batch: int,
+    kernel: Kernel,
+    chunks: Sequence[np.ndarray],
+    length: int,
+    written: int,
 ) -> KernelDecoder:
     """A copy: see ``KernelDecoder.__reduce__``."""
-    return KernelDecoder(weights, heads, batch, kernel).filled(chunks, length)
+    return KernelDecoder(weights, heads, batch, kernel).filled(chunks, length, written)

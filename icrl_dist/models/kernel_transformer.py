@@ -11,8 +11,10 @@ from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.deployed import Columns, WindowColumns
+from icrl_dist.models.features import Features
 from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
 from icrl_dist.models.sampling import sample, sample_gaussian
+from icrl_dist.models.stored import check_shapes, shapes
 from icrl_dist.types import Spec
 
 FLOOR = 0.05
@@ -22,19 +24,22 @@ FLOOR = 0.05
 class KernelTransformer(CopiedWhole):
     """``models.deployed.Deployed`` by the kernel.
 
-    Every sum over inputs, tokens or actions runs in the kernel and in its order, so the outputs for discrete actions
-    are equal bit by bit on all processors, with one exception: sine and cosine of ``model.fourier`` are numpy's.
+    Every sum over inputs, tokens or actions runs in the kernel and in its order, so the outputs are equal bit by bit
+    on all processors, and so are discrete actions.
     """
 
     def __init__(
         self, spec: Spec, config: ModelConfig, weights: Mapping[str, np.ndarray], batch: int, kernel: Kernel | None = None
     ) -> None:
-        """``weights``: by their names in a checkpoint, without ``model/``."""
-        self._spec, self._config, self._kernel = spec, config, kernel or Kernel()
+        """``weights``: by their names in a checkpoint, without ``model/``.
+
+        Raises ValueError for weights of another model, or for ``batch`` below 1.
+        """
+        check_shapes(shapes(spec, config), weights)
+        self._spec, self._kernel = spec, kernel or Kernel()
         trunk = {name.removeprefix("trunk."): np.array(value) for name, value in weights.items() if name.startswith("trunk.")}
         self._decoder = KernelDecoder(trunk, config.heads, batch, self._kernel)
-        low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-        self._scale, self._shift = 2 / (high - low), -(high + low) / (high - low)
+        self._features = Features(spec, config.fourier)
         self._linear = {
             name: (padded(weights[f"{name}.weight"].T), padded(weights[f"{name}.bias"]), len(weights[f"{name}.bias"]))
             for name in ("embed_transition", "embed_query", "embed_taken", "head")
@@ -53,26 +58,28 @@ class KernelTransformer(CopiedWhole):
         self._decoder.append(self._tokens(transitions))
 
     def decide(self, states: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
-        return self._outputs(self._decoder.query(self._layer("embed_query", self._features(states))))
+        return self._outputs(self._decoder.query(self._layer("embed_query", self._features.observations(states))))
 
     def decide_window(self, windows: WindowColumns, arrived: Columns | None = None) -> Float32[np.ndarray, "B O"]:
         token = None if arrived is None else self._tokens(arrived)[:, 0]
-        states = self._features(windows.states)
+        states = self._features.observations(windows.states)
         # Each state, plus the previous state of the window with its action and reward; the first has no previous one.
-        taken = [states[:, :-1], self._actions(windows.prev_actions)[:, :-1], windows.prev_rewards[:, :-1, None]]
+        taken = [states[:, :-1], self._features.actions(windows.prev_actions)[:, :-1], windows.prev_rewards[:, :-1, None]]
         tokens = self._layer("embed_query", states)
         tokens[:, 1:] += self._layer("embed_taken", np.concatenate(taken, axis=-1, dtype=np.float32))
         return self._outputs(self._decoder.window(tokens, token))
 
     def decide_row(self, row: int, states: Float32[np.ndarray, "Q S"], appended: Columns) -> Float32[np.ndarray, "Q O"]:
-        queries = self._layer("embed_query", self._features(states))
+        queries = self._layer("embed_query", self._features.observations(states))
         return self._layer("head", self._decoder.query_row(row, queries, self._tokens(appended)[0]))
 
     def act(self, outputs: Float32[np.ndarray, "B O"], u: Float[np.ndarray, "B U"]) -> Actions:
         if self._spec.discrete:
             return sample(self.probabilities(outputs), u[:, 0])
         mean, raw = np.split(outputs, 2, axis=-1)
-        return sample_gaussian(mean, FLOOR + np.logaddexp(np.float32(0), raw), u)
+        with np.errstate(invalid="ignore"):  # as torch: nan without a warning
+            deviation = FLOOR + np.logaddexp(np.float32(0), raw)
+        return sample_gaussian(mean, deviation, u)
 
     def probabilities(self, outputs: Float32[np.ndarray, "B O"]) -> Float32[np.ndarray, "B A"]:
         return self._kernel.softmax(padded(outputs), outputs.shape[1])
@@ -88,16 +95,10 @@ class KernelTransformer(CopiedWhole):
 
     def _tokens(self, transitions: Columns) -> Float32[np.ndarray, "B T D"]:
         observations, actions, after, rewards = transitions
-        columns = [self._features(observations), self._actions(actions), self._features(after), rewards[..., None]]
+        columns = [
+            self._features.observations(observations),
+            self._features.actions(actions),
+            self._features.observations(after),
+            rewards[..., None],
+        ]
         return self._layer("embed_transition", np.concatenate(columns, axis=-1, dtype=np.float32))
-
-    def _features(self, observations: Float32[np.ndarray, "*B S"]) -> Float32[np.ndarray, "*B F"]:
-        x = self._shift + np.asarray(observations, np.float32) * self._scale
-        if not self._config.fourier:
-            return x
-        half = np.float32(0.5 * np.pi)
-        waves = [f(half * k * x) for k in range(1, self._config.fourier + 1) for f in (np.sin, np.cos)]
-        return np.concatenate([x, *waves], axis=-1, dtype=np.float32)
-
-    def _actions(self, actions: np.ndarray) -> Float32[np.ndarray, "*B A"]:
-        return np.eye(self._spec.actions, dtype=np.float32)[actions] if self._spec.discrete else np.asarray(actions, np.float32)

@@ -12,6 +12,17 @@
 #ifndef LANES
 #define LANES 16
 
+#ifdef __FAST_MATH__
+#error "fast math changes the order of sums: compile without it"
+#endif
+#ifdef __ELF__
+/* Put the file into the library, after what is loaded: models/compiled.py finds libraries of other sources by it. */
+#define KEEP_SOURCE __asm__(".pushsection .icrl_source\n.incbin \"" __FILE__ "\"\n.popsection");
+#else
+#define KEEP_SOURCE
+#endif
+KEEP_SOURCE
+
 typedef const float *Linear[2]; /* weight, bias */
 
 static inline int padded(int n) { return (n + LANES - 1) / LANES * LANES; }
@@ -84,7 +95,7 @@ INLINE void store(float *p, V v) { EACH(i) *(R *)(p + i * REGISTER_LANES) = v.r[
 INLINE V all(float x) {
     const R zero = {0};
     V o;
-    EACH(i) o.r[i] = x + zero;
+    EACH(i) o.r[i] = x - zero; /* which leaves -0 as it is, so the compiler makes it a broadcast */
     return o;
 }
 #define add NAMED(add, KIND)

@@ -12,6 +12,7 @@ from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError, Deployment, parse_written, validate
 from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
+from icrl_dist.models.compiled import Unusable, library
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
@@ -76,6 +77,8 @@ def evaluate(
         if source.is_dir() and is_unfinished(source):
             text = f"{source}: this run is not finished; the newest version so far is evaluated"
             show({"event": "note", "text": text})
+        if run.context.decoder == "kernel" and isinstance(why := library("decoder"), Unusable):
+            show({"event": "note", "text": f"torch computes the decisions, not the kernel as in the run: {why}"})
         if suite == "online":
             rows = heldout.online(run, source, results, show, deploy, unstored)
             found = reports.online(run, report, rows, unstored)

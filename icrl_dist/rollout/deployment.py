@@ -13,7 +13,7 @@ from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions, Watch
 from icrl_dist.models.deployed import Columns, Deployed, WindowColumns
-from icrl_dist.models.kernel import best_decoder, require_kernel
+from icrl_dist.models.kernel import decoder_here, require_kernel
 from icrl_dist.models.kernel_transformer import KernelTransformer
 from icrl_dist.models.stored import StoredTransformer
 
@@ -194,8 +194,8 @@ class CommittedPolicy(InContextPolicy):
 def deployed(model: PretrainedTransformer | StoredTransformer, batch: int, decoder: Decoder = "auto") -> Deployed:
     """The transformer deployed in B environments by this decoder (``config.ContextConfig``).
 
-    A model on a GPU is always deployed by torch, a stored one always by the kernel.  Raises ConfigError for the kernel
-    where this installation has none.
+    A model on a GPU, or where there is no kernel, is always deployed by torch, a stored one always by the kernel; then
+    this raises ConfigError where there is none.
     """
     if isinstance(model, StoredTransformer):
         weights = model.weights
@@ -203,9 +203,7 @@ def deployed(model: PretrainedTransformer | StoredTransformer, batch: int, decod
         from icrl_dist.models.dpt import DeployedTransformer
         from icrl_dist.models.weights import weights_of
 
-        if decoder == "auto":
-            decoder = best_decoder(model.config)
-        if decoder == "torch" or model.low.device.type != "cpu":
+        if decoder_here(decoder, model.config) == "torch" or model.low.device.type != "cpu":
             return DeployedTransformer(model, batch)
         weights = weights_of(model)
     require_kernel()

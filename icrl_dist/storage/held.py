@@ -23,7 +23,8 @@ from icrl_dist.stream import wire
 _FREE: Mapping[str, tuple[str, ...] | None] = {
     "stream": ("job_tasks", "staleness"),
     "sac": tuple(field.name for field in dataclasses.fields(SACConfig) if field.name != "cache"),
-    **dict.fromkeys(("learner", "evaluate", "alerts"), ()),
+    "learner": ("reproducible",),
+    **dict.fromkeys(("evaluate", "alerts"), ()),
 }
 """Sections on whose other fields no digest depends; each with the fields on which one does."""
 

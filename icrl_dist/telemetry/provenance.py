@@ -18,6 +18,7 @@ from typing import Any
 
 from icrl_dist import __version__, version
 from icrl_dist.config import plugins
+from icrl_dist.config.sections import Reproducible
 from icrl_dist.storage.files import write_json
 
 LIBRARIES = (
@@ -29,14 +30,18 @@ LIBRARIES = (
 FILE = "env.json"
 """File of a run folder with one record per session; a session is one start of the learner."""
 
+_ANY_MACHINE = frozenset({"torch", "instruction set", "processor", "threads"})
+"""Names in a comparison that change no byte of a run with ``any_machine``."""
 _COMPARED = ("package_version", "code_digest", "libraries", "plugins", "instruction_set", "processor", "threads", "device")
 """Entries that can change the bytes of a run.  The commit is left out because the code digest states the same."""
 
 
-def record(problem: str, method: str, threads: int, device: str = "cpu") -> dict[str, Any]:
+def record(
+    problem: str, method: str, threads: int, device: str = "cpu", reproducible: Reproducible = "this-machine"
+) -> dict[str, Any]:
     """What makes the results of this process, as JSON values.
 
-    ``threads``: CPU threads of torch; ``device``: ``cpu``, or the name of the GPU.
+    ``threads``: CPU threads of a fit; ``device``: ``cpu``, or the name of the GPU; ``reproducible``: of the run's learner.
     """
     import torch
 
@@ -52,6 +57,8 @@ def record(problem: str, method: str, threads: int, device: str = "cpu") -> dict
         "platform": platform.platform(),
         "threads": threads,
         "device": device,
+        # Simulators of other packages may depend on the processor, however the fits are made.
+        "any_machine": reproducible == "any-machine" and not plugins.find("problems", problem).libraries,
     }
 
 
@@ -151,7 +158,9 @@ def _write(folder: Path, records: list[dict[str, Any]]) -> None:
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Entries that differ between two records and can change bytes, as text; entries that only one has do not count."""
     old, new = dict(_flat(then)), dict(_flat(now))
-    return ", ".join(f"{name} {old[name]} (now {new[name]})" for name in old if name in new and old[name] != new[name])
+    free = _ANY_MACHINE if then.get("any_machine") and now.get("any_machine") else frozenset[str]()
+    compared = [name for name in old if name in new and name not in free]
+    return ", ".join(f"{name} {old[name]} (now {new[name]})" for name in compared if old[name] != new[name])
 
 
 def _flat(record: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ from icrl_dist.diagnostics import node_facts
 REACH = node_facts.reach
 NEEDED = {"problems/toy": "problem 'toy'"}
 LOOPBACK = "tcp/127.0.0.1:0"
-OWN_FACTS = node_facts.facts()
+OWN_FACTS = {**node_facts.facts(), "decoder": ""}
 
 
 class FakeJobConfig:
@@ -159,7 +159,7 @@ def local_name(monkeypatch):
     monkeypatch.setattr(socket, "create_server", lambda address, **options: listen((own(address[0]), 0), **options))
 
 
-def gather(fleet, notes, endpoint="tls/localtest:0", turns=None):
+def gather(fleet, notes, endpoint="tls/localtest:0", turns=None, kernel=False):
     """Wait for the nodes, at most ``turns`` times, and start the run."""
     left = [turns]
 
@@ -169,7 +169,7 @@ def gather(fleet, notes, endpoint="tls/localtest:0", turns=None):
             return left[0] < 0
         return False
 
-    fleet.gather(endpoint, "", "", notes.append, stopped, NEEDED)
+    fleet.gather(endpoint, "", "", notes.append, stopped, NEEDED, kernel)
     fleet.start(endpoint, "run")
 
 

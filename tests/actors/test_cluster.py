@@ -48,6 +48,21 @@ def test_a_node_that_fails_the_check_is_refused_before_the_run_starts(new_fleet,
     assert not ray.placed and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("kernel", [False, True])
+def test_a_node_without_the_compiled_decoder_is_refused_for_runs_that_need_it(new_fleet, local_name, kernel):
+    ray = FakeRay(0, 2)
+    ray.answers["n1"] = {"decoder": "not compiled: run `make kernel`"}
+    fleet = new_fleet(ray, 2)
+    if kernel:
+        with pytest.raises(
+            ConfigError, match=r"^n1 \(10.0.0.1\): context.decoder = 'kernel': not compiled: run `make kernel`$"
+        ):
+            gather(fleet, [], kernel=True)
+    else:
+        gather(fleet, [])
+        assert fleet.watch(print, 0) == 2
+
+
 def test_a_node_may_have_another_version_of_a_package_that_the_run_does_not_use(new_fleet, local_name):
     ray = FakeRay(0, 1)
     ray.answers["n1"] = {"plugins": {"problems/other": ["toys", "1.1", "a" * 64]}}

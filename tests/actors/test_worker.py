@@ -24,6 +24,8 @@ from icrl_dist.config import plugins
 from icrl_dist.config.run import dumps
 from icrl_dist.interfaces import Policy
 from icrl_dist.methods import registry as methods
+from icrl_dist.models import kernel
+from icrl_dist.models.compiled import Unusable
 from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.problems.darkroom.posterior import RoomPosterior
@@ -241,6 +243,15 @@ def test_a_refused_hello_ends_the_worker_with_the_reason(hub):
     hub().serve(KEYS.work, lambda query: query.refuse("schema: worker runs another version"))
     with pytest.raises(Refused, match="another version"):
         Worker(hub(), "test", "w0").run()
+
+
+def test_a_worker_without_the_kernel_does_no_job_of_a_run_by_the_kernel(hub, small_run, monkeypatch):
+    monkeypatch.setattr(kernel, "library", lambda name: Unusable("not compiled", "run `make kernel`"))
+    run = dataclasses.replace(small_run, context=dataclasses.replace(small_run.context, decoder="kernel"))
+    learner = ScriptedLearner(hub(), run, [])
+    with pytest.raises(Refused, match=r"^context\.decoder = 'kernel': on .*: not compiled: run `make kernel`; or begin"):
+        Worker(hub(), "test", "w0").run()
+    assert [kind for kind, _ in learner.requests] == ["hello"] and learner.stored == []
 
 
 def test_a_worker_ends_when_the_learner_does_not_answer_for_long(hub):

@@ -12,6 +12,7 @@ from icrl_dist.agent import trained_model
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.config.run import ConfigError
 from icrl_dist.models import kernel
+from icrl_dist.models.compiled import Unusable
 from icrl_dist.models.kernel_transformer import KernelTransformer
 from icrl_dist.models.stored import StoredTransformer
 from icrl_dist.telemetry import processes
@@ -127,10 +128,11 @@ def test_an_agents_model_is_built_when_it_is_asked_for_and_later_contexts_use_it
 
 def test_without_a_kernel_torch_decides_and_the_kernel_is_refused(monkeypatch):
     monkeypatch.setattr(kernel, "kinds", lambda: ())
+    monkeypatch.setattr(kernel, "library", lambda name: Unusable("not compiled", "install a C compiler"))
     agent, right = load_agent("darkroom", seed=0), load_agent("darkroom", seed=0, decoder="torch")
     assert not isinstance(agent._policy._deployed, KernelTransformer)
     assert played(agent)[0] == played(right)[0]
-    with pytest.raises(ConfigError, match="decoder = 'kernel': there is no compiled decoder for this processor here"):
+    with pytest.raises(ConfigError, match="decoder = 'kernel': not compiled: install a C compiler"):
         load_agent("darkroom", decoder="kernel")
 
 

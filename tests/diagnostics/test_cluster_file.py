@@ -18,6 +18,7 @@ from icrl_dist.diagnostics.checks import table
 from icrl_dist.diagnostics.doctor import diagnose_file
 from tests.optional import known
 
+TAG, COMPILED = "cp311-abi3-linux_x86_64", "icrl_dist/models/_decoder_kernel.abi3.so"
 ROOT = Path(__file__).parents[2]
 SHIPPED = ("onprem", "aws", "gcp")
 WORKER = ("available_node_types", "worker", "node_config")
@@ -33,7 +34,8 @@ def checkout(tmp_path, monkeypatch):
     (root / "dist").mkdir(parents=True)
     for name in ("pyproject.toml", "constraints.txt", "README.md", *version.PACKAGES):
         (root / name).symlink_to(ROOT / name)
-    with zipfile.ZipFile(root / "dist" / f"icrl_dist-{__version__}-py3-none-any.whl", "w") as wheel:
+    with zipfile.ZipFile(root / "dist" / f"icrl_dist-{__version__}-{TAG}.whl", "w") as wheel:
+        wheel.writestr(COMPILED, "")
         for package in version.PACKAGES:
             for file in (ROOT / package).rglob("*"):
                 if file.suffix in (".c", ".h", ".py", ".toml", ".npz"):
@@ -192,6 +194,20 @@ def test_a_wheel_of_other_code_is_refused(diagnosed, checkout):
     assert any("not a zip" in line for line in diagnosed(shipped("aws"))[0])
     wheel.unlink()
     assert any("0 wheels" in line for line in diagnosed(shipped("aws"))[0])
+
+
+def test_a_wheel_of_another_system_is_refused_and_one_without_a_compiled_decoder_is_a_warning(diagnosed, checkout):
+    (wheel,) = (checkout / "dist").glob("*.whl")
+    mac = wheel.rename(wheel.with_name(wheel.name.replace("linux_x86_64", "macosx_14_0_arm64")))
+    (line,) = [line for line in diagnosed(shipped("aws"))[0] if "wheel" in line]
+    assert "macosx_14_0_arm64.whl cannot be installed on nodes, which run Linux  -> build it on Linux" in line
+    with zipfile.ZipFile(mac) as archive, zipfile.ZipFile(wheel, "w") as other:
+        for name in archive.namelist():
+            if name != COMPILED:
+                other.writestr(name, archive.read(name))
+    mac.unlink()
+    (line,) = [line for line in diagnosed(shipped("aws"))[1] if "wheel" in line]
+    assert "has no compiled decoder" in line and "install a C compiler" in line
 
 
 @pytest.mark.parametrize(("text", "message"), [(None, "cannot be read"), ("[1", "not YAML"), ("a: 1", "no cluster file")])

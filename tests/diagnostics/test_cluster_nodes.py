@@ -14,7 +14,7 @@ from icrl_dist.diagnostics.checks import table
 from icrl_dist.stream import endpoints
 from tests.actors.fake_ray import FakeJobConfig
 
-HERE = node_facts.facts()
+HERE = {**node_facts.facts(), "decoder": ""}
 
 
 class FakeRay:
@@ -59,6 +59,11 @@ class FakeRay:
             raise changed
         now = time.time() + changed.get("ahead_s", 0.0)
         return {**HERE, "time": now, "host": node, "unreached": (), "certificates": "", **changed}
+
+
+@pytest.fixture(autouse=True)
+def a_compiled_decoder_here(monkeypatch):
+    monkeypatch.setattr(node_facts, "library", lambda name: None)
 
 
 @pytest.fixture
@@ -121,6 +126,11 @@ def test_healthy_nodes_pass_every_check():
     ("answer", "ok", "message"),
     [
         ({"code": "0" * 64}, False, r"b \(10.0.0.b\) versions .*icrl-dist's code 00000000 there.*-> run `ray up`"),
+        (
+            {"decoder": "not compiled: run `make kernel`"},
+            False,
+            "decoder .*not compiled: run `make kernel`  -> or begin runs with",
+        ),
         ({"time": 0.0}, False, r"clock .*s off  -> run ntpd"),
         ({"ahead_s": 30.0}, None, r"clock .*s off  -> run ntpd"),
         ({"shared_memory": 64 << 20}, None, r"shared memory +0.1 GiB free  -> mount"),

@@ -4,15 +4,18 @@ import contextlib
 import os
 import sys
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from actors import fleet
-from icrl_dist.config.run import ConfigError, load, override
+from icrl_dist.config.run import ConfigError, dumps, load, override
 from icrl_dist.launch import learner_process, train
 from icrl_dist.launch.learner_process import TrainFailed
+from icrl_dist.models import kernel
+from icrl_dist.models.compiled import Unusable
 from learner.__main__ import _read_driver
 from learner.service import Service
 
@@ -68,6 +71,25 @@ def test_a_run_resumes_with_another_endpoint_but_not_with_another_seed(small_run
     assert load(str(file)) == moved and file.stat().st_mtime == 1e9
     with pytest.raises(ConfigError, match="has other settings"):
         train.prepare(override(moved, ["seed=7"], "--set"), folder, resume=True, overwrite=False)
+
+
+def test_a_run_keeps_its_decoder_and_is_refused_where_the_kernel_that_it_needs_is_missing(small_run, tmp_path, monkeypatch):
+    def decoder(there, asked, resume=True):
+        (tmp_path / "run.toml").write_text(dumps(by(there)))
+        return train.without_auto(by(asked), tmp_path, resume).context.decoder
+
+    by = lambda decoder: replace(small_run, context=replace(small_run.context, decoder=decoder))  # noqa: E731
+    monkeypatch.setattr(kernel, "library", lambda name: Unusable("not compiled", "run `make kernel`"))
+    monkeypatch.setattr(kernel, "kinds", lambda: ())
+    assert decoder("torch", "auto") == decoder("torch", "torch") == decoder("kernel", "auto", resume=False) == "torch"
+    for there, asked, resume in (("kernel", "auto", True), ("kernel", "kernel", True), ("torch", "kernel", False)):
+        with pytest.raises(
+            ConfigError, match=r"^context\.decoder = 'kernel': on .*: not compiled: run `make kernel`; or begin"
+        ):
+            decoder(there, asked, resume)
+    monkeypatch.setattr(kernel, "kinds", lambda: ("avx2",))
+    monkeypatch.setattr(kernel, "library", lambda name: None)
+    assert decoder("torch", "auto") == "torch" and decoder("kernel", "auto") == decoder("torch", "auto", False) == "kernel"
 
 
 def test_an_absent_cluster_leaves_no_run_folder(small_run, tmp_path, monkeypatch):

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import kinds
 from tests.models.deployments import IMPLEMENTATIONS, Deploy, deployment
 
 

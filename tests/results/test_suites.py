@@ -1,5 +1,6 @@
 """``icrl_dist.evaluate``: the command's evaluation as an object, and impossible calls in one line."""
 
+import dataclasses
 import inspect
 import io
 import json
@@ -14,7 +15,10 @@ from rich.console import Console
 
 import icrl_dist
 from icrl_dist.cli import main
-from icrl_dist.config.run import ConfigError
+from icrl_dist.config.run import ConfigError, parse_written
+from icrl_dist.models import kernel
+from icrl_dist.models.compiled import Unusable
+from icrl_dist.results import suites
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
 from tests.results.test_evaluate import folder
 
@@ -107,3 +111,23 @@ def test_impossible_calls_are_refused_in_one_line(folder, options, expected):
     with pytest.raises(ConfigError) as refused:
         inspect.unwrap(icrl_dist.evaluate)(folder, **options)
     assert expected in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.integration
+def test_a_run_by_the_kernel_is_evaluated_by_torch_where_there_is_no_kernel(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings: dict[str, Any] = {"episodes": 1, "seeds": 1, "p": [0.0]}
+    expected = icrl_dist.evaluate("darkroom", **settings)
+    read = parse_written
+    by_kernel = lambda run: dataclasses.replace(run, context=dataclasses.replace(run.context, decoder="kernel"))  # noqa: E731
+    monkeypatch.setattr(suites, "parse_written", lambda *given: by_kernel(read(*given)))
+    for module in (kernel, suites):
+        monkeypatch.setattr(module, "library", lambda name: Unusable("not compiled", "run `make kernel`"))
+    monkeypatch.setattr(kernel, "kinds", lambda: ())
+    events: list[dict[str, Any]] = []
+    found = icrl_dist.evaluate("darkroom", **settings, progress=events.append)
+    assert found.summary == expected.summary
+    notes = [event["text"] for event in events if event["event"] == "note"]
+    assert [note for note in notes if "kernel" in note] == [
+        "torch computes the decisions, not the kernel as in the run: not compiled: run `make kernel`"
+    ]

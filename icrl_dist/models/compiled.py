@@ -1,0 +1,64 @@
+"""The libraries that are compiled from C files of this folder when the package is installed, if there is a C compiler."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.util
+import platform
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+_BUILD = "install a C compiler and run `make kernel`, or install a wheel that was built with one"
+_KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",), "arm64": ("neon",)}
+"""The instruction sets that the C files name, by machine, each including the ones before it."""
+
+
+class Unusable(NamedTuple):
+    """Why a library cannot be used here."""
+
+    why: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.why}: {self.remedy}"
+
+
+@functools.cache
+def library(name: str) -> ctypes.CDLL | Unusable:
+    """A compiled kernel, ``decoder`` or ``training``."""
+    found = importlib.util.find_spec(f"{__package__}._{name}_kernel")
+    if found is None or found.origin is None:
+        return Unusable("not compiled", _BUILD)
+    return _load(Path(found.origin), [Path(__file__).with_name(source) for source in (f"{name}_kernel.c", "lanes.h")])
+
+
+def _load(file: Path, sources: list[Path]) -> ctypes.CDLL | Unusable:
+    try:
+        if not _is_whole(file, sources):
+            return Unusable(f"{file} is incomplete, or was built from other C files than those beside it", _BUILD)
+        loaded = ctypes.CDLL(str(file))
+        count = loaded.icrl_kinds()
+    except (OSError, AttributeError) as error:
+        return Unusable(f"{file} cannot be loaded ({error})", _BUILD)
+    if not _KINDS.get(platform.machine(), ())[:count]:
+        return Unusable(f"this processor ({platform.machine()}) has neither AVX2 with FMA nor NEON", "let torch decide")
+    return loaded
+
+
+def _is_whole(file: Path, sources: list[Path]) -> bool:
+    """Whether a library holds its own sources, as they are now.
+
+    A compiler for Linux puts them after everything that is loaded.  So a file that was cut is found too: the end of
+    the process, by a bus error, would be the result of loading it.
+    """
+    content = file.read_bytes()
+    return sys.platform != "linux" or all(source.read_bytes() in content for source in sources)
+
+
+@functools.cache
+def kinds(name: str = "decoder") -> tuple[str, ...]:
+    """The instruction sets that a kernel can use on this processor, the widest last; none if it cannot be used."""
+    found = library(name)
+    return () if isinstance(found, Unusable) else _KINDS.get(platform.machine(), ())[: found.icrl_kinds()]

@@ -1,0 +1,165 @@
+"""The fit through the compiled kernel: torch's loss, gradients and optimizers, the same on all processors and threads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from icrl_dist.config.sections import OptimConfig
+from icrl_dist.models.compiled import kinds
+from icrl_dist.models.features import sine_and_cosine
+from icrl_dist.models.weights import weights_of
+from icrl_dist.training.fit import Optimizer
+from icrl_dist.training.kernel_fit import KernelFit, _power, cosine
+from tests.training.kernel_fits import Case, by_torch
+
+pytestmark = [
+    pytest.mark.unit,
+    pytest.mark.skipif(not kinds("training"), reason="the training kernel was not built"),
+]
+
+CASES = [
+    Case(),
+    Case(contexts=1, tokens=1, queries=2),
+    Case(contexts=1, queries=1, tokens=4),
+    Case(layers=1),
+    Case(layers=4, tokens=50, queries=40),
+    Case(heads=2),
+    Case(heads=3, width=24, queries=17),
+    Case(heads=4, width=12, tokens=33),
+    Case(width=40, heads=4),
+    Case(width=64, heads=2, contexts=18, tokens=9),
+    Case(fourier=2),
+    Case(windows=3, window=4),
+    Case(windows=2, window=17, heads=2, fourier=1, layers=3),
+    Case(discrete=False, actions=2),
+    Case(discrete=False, actions=17, windows=2, window=3),
+    Case(actions=18, width=20),
+    Case(width=6, heads=2, actions=1, discrete=False),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case)))
+def test_loss_and_gradients_are_those_of_torch(case: Case) -> None:
+    model = case.model()
+    batch = case.batch()
+    loss, gradients = by_torch(model, batch)
+    own_loss, own = case.fit(model).gradient(batch)
+    assert own_loss == pytest.approx(loss, rel=1e-5)
+    assert set(own) == set(gradients)
+    for name, gradient in gradients.items():
+        np.testing.assert_allclose(
+            own[name], gradient.numpy(), rtol=0, atol=1e-4 * float(gradient.abs().max()) + 1e-8, err_msg=name
+        )
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(map(str, case)))
+def test_neither_threads_nor_instruction_sets_change_a_gradient(case: Case) -> None:
+    model = case.model()
+    batch = case.batch()
+    loss, gradients = case.fit(model).gradient(batch)
+    fits = [case.fit(model, threads=threads) for threads in (2, 3)] + [case.fit(model, kind=kind) for kind in kinds("training")]
+    for fit in fits:
+        own_loss, own = fit.gradient(batch)
+        assert own_loss == loss
+        for name, gradient in gradients.items():
+            np.testing.assert_array_equal(own[name], gradient, err_msg=name)
+
+
+@pytest.mark.parametrize(("muon", "in_float32"), [(0.0, False), (5.0, True), (5.0, False)])
+def test_steps_are_those_of_torchs_optimizers(muon: float, in_float32: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Given the same gradients, to rounding; torch computes Muon in bfloat16, with which its steps differ by a fifth."""
+    if in_float32:
+        monkeypatch.setattr(torch.Tensor, "bfloat16", torch.Tensor.float)
+    case = Case(heads=2, width=24, windows=2, window=3)
+    settings = OptimConfig(muon=muon, weight_decay=0.1, beta2=0.98, clip=0.2)
+    model = case.model()
+    optimizer = Optimizer(model, settings)
+    state: dict[str, np.ndarray] = {}
+    for seed in range(3):
+        before, batch = weights_of(model), case.batch(seed)
+        fit = fresh(case, settings, weights_of(model), state)
+        _, gradients = fit.gradient(batch)
+        for name, parameter in model.named_parameters():
+            parameter.grad = torch.from_numpy(gradients[name].copy())
+        torch.nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
+        optimizer.step(1e-3)
+        fit.step(batch, 1e-3)
+        for name, weight in weights_of(model).items():
+            change, own = weight - before[name], fit.weights[name] - before[name]
+            rough = muon and not in_float32 and name.startswith("trunk.") and weight.ndim == 2
+            assert np.linalg.norm(own - change) <= (0.3 if rough else 1e-4) * np.linalg.norm(change), name
+        state = optimizer.state()
+
+
+def fresh(case: Case, settings: OptimConfig, weights: dict[str, np.ndarray], state: dict[str, np.ndarray]) -> KernelFit:
+    """A fit that continues from a checkpoint."""
+    fit = KernelFit(case.spec, case.config, settings, weights)
+    fit.load(state)
+    return fit
+
+
+@pytest.mark.parametrize("muon", [0.0, 5.0])
+def test_a_fit_continues_from_its_state_as_if_it_had_not_stopped(muon: float) -> None:
+    case, settings = Case(), OptimConfig(muon=muon)
+    first = case.fit(case.model(), muon=muon)
+    batches = [case.batch(seed) for seed in range(4)]
+    assert first.state() == {}
+    for batch in batches[:2]:
+        first.step(batch, 1e-3)
+    second = fresh(case, settings, {name: weight.copy() for name, weight in first.weights.items()}, first.state())
+    for batch in batches[2:]:
+        assert first.step(batch, 1e-3) == second.step(batch, 1e-3)
+    for name, weight in first.weights.items():
+        np.testing.assert_array_equal(second.weights[name], weight)
+    for name, value in first.state().items():
+        np.testing.assert_array_equal(second.state()[name], value)
+    torch_state = Optimizer(case.model(), settings)
+    torch_state.load(first.state())
+    assert set(torch_state.state()) == set(first.state()), "torch's optimizer has the same state"
+
+
+def test_the_state_of_another_optimizer_is_refused() -> None:
+    case = Case()
+    fit = case.fit(case.model())
+    fit.step(case.batch(), 1e-3)
+    with pytest.raises(ValueError, match="of these"):
+        case.fit(case.model(), muon=1.0).load(fit.state())
+
+
+def test_a_prefix_decides_what_is_computed_but_padding_does_not_matter() -> None:
+    """Tokens that no query sees have no effect, whatever they hold."""
+    case = Case()
+    batch = case.batch()
+    loss, gradients = case.fit(case.model()).gradient(batch)
+    hidden = np.arange(case.tokens) >= batch.prefix.max(axis=1)[:, None]
+    assert hidden.any()
+    rewards = np.where(hidden, np.float32(np.nan), batch.rewards)
+    own_loss, own = case.fit(case.model()).gradient(replace(batch, rewards=rewards))
+    assert own_loss == loss
+    for name, gradient in gradients.items():
+        np.testing.assert_array_equal(own[name], gradient, err_msg=name)
+
+
+def test_powers_and_cosines_need_no_library() -> None:
+    assert [_power(0.98, n) for n in (0, 1, 2, 7, 2000)] == pytest.approx([0.98**n for n in (0, 1, 2, 7, 2000)], rel=1e-12)
+    angles = np.linspace(0, math.pi, 1001)
+    assert [cosine(float(x)) for x in angles] == pytest.approx(np.cos(angles).tolist(), abs=1e-14)
+
+
+def test_sine_and_cosine_are_right_to_the_last_place() -> None:
+    x = np.linspace(-60, 60, 100_001).astype(np.float32)
+    for own, true in zip(sine_and_cosine(x), (np.sin(x.astype(float)), np.cos(x.astype(float))), strict=True):
+        np.testing.assert_array_equal(own, true.astype(np.float32))
+
+
+def test_a_prefix_beyond_the_context_is_refused() -> None:
+    case = Case()
+    batch = case.batch()
+    for wrong in (-1, case.tokens + 1):
+        with pytest.raises(ValueError, match=f"prefixes of .*a context has {case.tokens} tokens"):
+            case.fit(case.model()).gradient(replace(batch, prefix=np.full_like(batch.prefix, wrong)))
