@@ -24,7 +24,7 @@ import torch
 
 from icrl_dist.agent import ood_score
 from icrl_dist.agent.trained_model import TrainedModel
-from icrl_dist.bench.samples import Sample, all_trials, random_trajectories
+from icrl_dist.bench.samples import RandomWeights, Sample, all_trials, random_trajectories
 from icrl_dist.collect import kinds
 from icrl_dist.collect.adapt import Rollouts
 from icrl_dist.config.run import Run
@@ -43,6 +43,8 @@ from icrl_dist.stream.link import StreamKeys
 from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry import processes
 from icrl_dist.training import fit
+from icrl_dist.training.kernel_fit import KernelFit
+from icrl_dist.training.reproducible import best_fit
 from icrl_dist.types import Job, Trajectory
 from learner.ingest import Ingest
 
@@ -124,16 +126,6 @@ def _env_steps(job: Job, horizon: int) -> int:
     return steps * len(job.variations)
 
 
-class _RandomWeights:
-    """A policy source with an untrained model: the cost of a decision does not depend on the weights."""
-
-    def __init__(self, model: torch.nn.Module) -> None:
-        self._model = model
-
-    def at(self, version: int) -> tuple[torch.nn.Module, str]:
-        return self._model, "0" * 64
-
-
 def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[Trajectory]]:
     """Seconds of the job, and trajectories like its own: all trials of some of its variations."""
     if isinstance(job.payload, ExpertHistories):
@@ -141,7 +133,7 @@ def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[
         return _training(job, problem, job.payload.sac, budget_s), random_trajectories(job, problem)
     run, by_model = trained.run, isinstance(job.payload, Rollouts)
     rows, trajectories, times = len(job.variations), [], [time.perf_counter()]
-    work = kinds.do(job, registry.of(run), trained.method, _RandomWeights(trained.model), "plan")
+    work = kinds.do(job, registry.of(run), trained.method, RandomWeights(trained.model), "plan")
     while group := list(itertools.islice(work, rows)):
         trajectories += group
         times.append(time.perf_counter())
@@ -195,8 +187,8 @@ def _fit(trained: TrainedModel, phase: Phase, data: Sample, budget_s: float) -> 
     draw = method.data(run, dataclasses.replace(phase, round=0), data)
     optim, times = run.optim, [0.0]
 
-    def loss_of(step: int) -> torch.Tensor:
-        return method.loss(model, draw(np.random.default_rng(step)))
+    def batch_of(step: int) -> Any:
+        return draw(np.random.default_rng(step))
 
     def progress(step: int, loss: float) -> None:
         times.append(time.perf_counter())
@@ -204,7 +196,12 @@ def _fit(trained: TrainedModel, phase: Phase, data: Sample, budget_s: float) -> 
             raise _BudgetSpent
 
     with contextlib.suppress(_BudgetSpent):
-        fit.fit(model, fit.Optimizer(model, optim), optim, 1e-6, 200, loss_of, progress)
+        if run.learner.reproducible != "this-machine" and best_fit(run) == "any-machine":
+            kernel = KernelFit(trained.spec, run.model, optim, weights_of(model), torch.get_num_threads())
+            fit.take_steps(lambda step, rate: kernel.step(batch_of(step), rate), optim, 1e-6, 200, progress)
+        else:
+            loss_of = lambda step: method.loss(model, batch_of(step))  # noqa: E731
+            fit.fit(model, fit.Optimizer(model, optim), optim, 1e-6, 200, loss_of, progress)
     return float(np.mean(np.diff(times[2:])))  # the mean, not the median: contexts differ in length between steps
 
 

@@ -6,12 +6,33 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
+from icrl_dist.collect import kinds
+from icrl_dist.config.run import Run
 from icrl_dist.experts.payloads import ExpertHistories
-from icrl_dist.interfaces import Problem, VariationKey
+from icrl_dist.interfaces import Phase, Problem, VariationKey
+from icrl_dist.methods import registry as methods
+from icrl_dist.problems import registry
 from icrl_dist.rollout.episode import episode
 from icrl_dist.rollout.policies import RandomVectorPolicy
 from icrl_dist.types import Job, Trajectory
+
+
+class RandomWeights:
+    """A source of weights with an untrained model: the cost of a decision does not depend on the weights."""
+
+    def __init__(self, model: torch.nn.Module) -> None:
+        self._model = model
+
+    def at(self, version: int) -> tuple[torch.nn.Module, str]:
+        return self._model, "0" * 64
+
+
+def collected(run: Run, phase: Phase, model: torch.nn.Module) -> list[Trajectory]:
+    """The trajectories of the first job of a phase; ``model`` acts where a job needs one."""
+    method = methods.of(run)
+    return list(kinds.do(method.ask(run, phase)[0], registry.of(run), method, RandomWeights(model), "bench"))
 
 
 def all_trials(job: Job, trajectories: Sequence[Trajectory]) -> list[Trajectory]:

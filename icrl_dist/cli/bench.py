@@ -29,6 +29,7 @@ class BenchArguments:
             "soak",
             "fuzz",
             "incontext",
+            "fit",
             "first-action",
             "experts",
             "disturbance",
@@ -42,9 +43,9 @@ class BenchArguments:
     and ``ray.get``.  ``recovery``: time until a run continues after a worker or the learner is killed.
     ``soak``: memory growth of every process in a long run.  ``fuzz``: 100,000 hostile inputs to every
     function that decodes bytes.  ``incontext``: deployment and training of the model, beside DPT's
-    official layout, and the compiled decoder beside torch's.  ``first-action``: time from the start of
-    Python to the first action of an agent, by the compiled decoder and by torch.  ``experts``: batched
-    updates of many experts, beside stable-baselines3.
+    official layout.  ``fit``: training steps, beside torch's and beside the time of their matrix products alone.
+    ``first-action``: time from the start of Python to the first action of an agent, by the compiled decoder and
+    by torch.  ``experts``: batched updates of many experts, beside stable-baselines3.
     ``disturbance``: the return that an undisturbed expert loses under each default adversary.
     ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
     problem: str | None = None
@@ -53,8 +54,9 @@ class BenchArguments:
     seconds: float | None = None
     """Duration of the measurement (env, stream, ingest, scale and soak)."""
     quick: bool = False
-    """Measure less: one seed instead of three (incontext), 3 repetitions instead of 15 (experts), briefly
-    trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of 8 (monitor)."""
+    """Measure less: one seed instead of three (incontext), 10 rounds instead of 40 (fit), 3 repetitions instead of 15
+    (experts), briefly trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of
+    8 (monitor)."""
     decisions: bool = False
     """incontext: compare only the compiled decoder with torch's, in about a minute, and train nothing."""
     drop: float | None = None
@@ -82,6 +84,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         experts,
         experts_gpu,
         first_action,
+        fit,
         fuzz,
         incontext,
         ingest,
@@ -96,6 +99,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
         "broadcast",
         "disturbance",
         "experts",
+        "fit",
         "first-action",
         "fuzz",
         "incontext",
@@ -143,6 +147,10 @@ def bench(arguments: BenchArguments, console: Console) -> int:
                 show_part = lambda part: status.update(f"incontext: {part}")  # noqa: E731
                 result = incontext.run(arguments.folder, arguments.quick, show_part, arguments.decisions)
             text = incontext.describe(result)
+        case "fit":
+            with console.status("fit") as status:
+                result = fit.run(arguments.quick, lambda part: status.update(f"fit: {part}"))
+            text = fit.describe(result)
         case "first-action":
             with console.status("first-action"):
                 result = first_action.run()

@@ -9,7 +9,7 @@ import ctypes
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
@@ -182,7 +182,8 @@ class Problem:
         labels[..., : spec.actions] = inputs.labels
         tokens, states = (np.ascontiguousarray(array, np.float32) for array in (inputs.tokens, inputs.queries))
         numbers = [np.ascontiguousarray(array, np.int32) for array in (inputs.length, inputs.prefix, inputs.own)]
-        self._kept: tuple[Any, ...] = kernel._places.place, kernel._weight, kernel._back, tokens, states, labels, *numbers
+        self._kept: list[np.ndarray] = [kernel._places.place, kernel._weight, kernel._back, tokens, states, labels, *numbers]
+        """What the kernel has pointers to."""
         contexts, queries = inputs.prefix.shape
         if (inputs.prefix < 0).any() or (inputs.prefix > inputs.length[:, None]).any() or inputs.length.max() > tokens.shape[1]:
             raise ValueError(

@@ -9,11 +9,19 @@ import time
 import numpy as np
 import pytest
 
+from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.bench import rates as measuring
+from icrl_dist.bench.samples import Sample, collected
 from icrl_dist.cli import main
 from icrl_dist.cli.exit_codes import OK, USAGE
-from icrl_dist.config.run import ConfigError
+from icrl_dist.config.run import ConfigError, load_run
 from icrl_dist.diagnostics.estimate import PhaseRates, Rates, describe, estimate
+from icrl_dist.methods import registry as methods
+from icrl_dist.problems import registry
+from icrl_dist.training import fit
+from icrl_dist.training.kernel_fit import KernelFit
+from icrl_dist.training.reproducible import best_fit
+from tests.calls import noting
 
 PRETRAIN = PhaseRates("pretrain/0", 8, 8000, 800_000, 80_000, 10.0, 1e6, 9e5, 100, 0.5)
 ROUND = PhaseRates("adapt/0", 4, 400, 40_000, 0, 30.0, 1000.0, 900.0, 10, 0.5)
@@ -78,6 +86,21 @@ def test_the_time_of_trials_that_were_not_measured_is_extrapolated():
     assert measuring._extrapolated(spent, 6, 100) == pytest.approx(10 + 5 + 6)
     assert measuring._extrapolated(spent[:1], 3, 100) == pytest.approx(3)  # one was all that there was time for
     assert measuring._extrapolated(spent, 8, 5) == pytest.approx(10 + 5 + 6 + 6 + 6)  # contexts are full
+
+
+@pytest.mark.parametrize("reproducible", ["auto", "any-machine", "this-machine"])
+def test_a_step_of_the_fit_is_timed_as_the_run_takes_it(monkeypatch, reproducible):
+    run = load_run("smoke", f"learner.reproducible={reproducible}", "learner.device=cpu")
+    if best_fit(run) != "any-machine":
+        pytest.skip("the training kernel was not built")
+    method, taken = methods.of(run), list[str]()
+    trained = TrainedModel(run, method, registry.of(run).spec, method.build(registry.of(run).spec, run))
+    phase = method.phases(run)[0]
+    data = Sample({phase.stage: collected(run, phase, trained.model)})
+    monkeypatch.setattr(KernelFit, "step", noting(taken, lambda *_: "kernel", KernelFit.step))
+    monkeypatch.setattr(fit, "fit", noting(taken, lambda *_: "torch", fit.fit))
+    assert measuring._fit(trained, phase, data, 0.0) > 0
+    assert set(taken) == {"torch" if reproducible == "this-machine" else "kernel"}
 
 
 SHORT = [

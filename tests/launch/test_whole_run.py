@@ -290,7 +290,8 @@ def test_quarantined_variations_are_in_the_result_and_give_exit_code_1(module_ru
 
 
 def test_load_run_takes_names_files_and_folders(made, module_run, tmp_path):
-    assert icrl_dist.load_run(made.result.folder) == icrl_dist.load_run(str(made.result.folder)) == module_run
+    begun = launch.without_auto(module_run, tmp_path, resume=False)
+    assert icrl_dist.load_run(made.result.folder) == icrl_dist.load_run(str(made.result.folder)) == begun
     (tmp_path / "small.toml").write_text(dumps(module_run))
     for what in (tmp_path / "small.toml", str(tmp_path / "small.toml")):
         assert icrl_dist.load_run(what, "seed=3") == dataclasses.replace(module_run, seed=3)

@@ -70,7 +70,8 @@ class Case(NamedTuple):
         def labels(*shape: int) -> np.ndarray:
             if not self.discrete:
                 return rng.uniform(-1, 1, size=(*shape, self.actions)).astype(np.float32)
-            return rng.dirichlet(np.ones(self.actions), size=shape).astype(np.float32)
+            weights = rng.integers(0, 4, size=(*shape, self.actions)).astype(np.float32) + np.float32(0.25)
+            return weights / weights.sum(axis=-1, keepdims=True)
 
         def prefix(count: int) -> np.ndarray:
             found = rng.integers(0, lengths[:, None] + 1, size=(b, count))
