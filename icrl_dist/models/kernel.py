@@ -232,7 +232,8 @@ class KernelDecoder(CopiedWhole):
             while len(self._chunks) * _CHUNK < end:
                 self._chunks.append(np.zeros((self._layers, self._batch, _BLOCKS, self._width, _LANES), np.float32))
             self._point_to_chunks()
-        for number in range(end // _CHUNK, -(-self._written // _CHUNK)):
+        # Usually as many places are written again as before, and then nothing is to be done.
+        for number in range(end // _CHUNK, -(-self._written // _CHUNK)) if end < self._written else ():
             chunk, first, last = self._chunks[number], max(0, end - number * _CHUNK), self._written - number * _CHUNK
             for block in range(first // _LANES, -(-min(last, _CHUNK) // _LANES)):
                 chunk[:, :, block, :, max(0, first - block * _LANES) :] = 0
