@@ -105,7 +105,7 @@ def train(
     transaction: FolderTransaction | None = None
     try:
         with interruptible(), reporting(progress) as show, contextlib.ExitStack() as locks:
-            settings = launch.without_auto(settings, folder, going_on)
+            settings = launch.without_auto(settings, folder, going_on, lambda text: show({"event": "note", "text": text}))
             transaction = launch.prepare(settings, folder, resume, overwrite, parent, resume_or_begin)
             started = time.monotonic()
             if warning := without_locks(folder):

@@ -216,6 +216,8 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
     float *h = m->work, *normed = h + ROWS * wide, *q = normed + ROWS * wide, *attended = q + ROWS * q_wide;
     float *up = attended + ROWS * q_wide, *mixed = up + ROWS * up_wide;
     long tokens = m->batch * length;
+    /* A token is stored when its context is read, if no other token of the call sees it: then its place is in the cache. */
+    int late = alone || (length == 1 && first == 0);
     Ahead far = {.m = m, .tokens = past + length, .once = length == 1 && heads < QUERIES};
     Ahead *ahead = m->far_away && length <= ROWS ? &far : 0;
     if (ahead) this_chunk(ahead);
@@ -228,7 +230,7 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
             const Layer *layer = m->layer + l;
             for (int r = 0; r < rows; r++) {
                 layer_norm(normed + r * wide, h + r * wide, layer->norm_attention, width);
-                if (!alone) put(m, l, (start + r) / length, past + (start + r) % length, normed + r * wide);
+                if (!late) put(m, l, (start + r) / length, past + (start + r) % length, normed + r * wide);
             }
             if (l == m->layers - 1 && first >= length) break; /* nobody reads these tokens' final states */
             linear(q, q_wide, normed, wide, layer->query, width, rows, 0);
@@ -237,7 +239,7 @@ TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *state
                 float *to[QUERIES];
                 long visible[QUERIES], b = (start + i / heads) / length;
                 int count = 0, again = i % heads; /* whether the context has just been read for other heads */
-                if (alone && i % heads == 0) put(m, l, b, past, normed + i / heads * wide);
+                if (late && i % heads == 0) put(m, l, b, past, normed + i / heads * wide);
                 for (; count < QUERIES && i < rows * heads; i++) {
                     long row = start + i / heads;
                     if (row / length != b || (alone && count && i % heads == 0)) break;

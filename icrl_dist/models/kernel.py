@@ -56,6 +56,11 @@ def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
     return "kernel" if kinds() and model.width <= WIDEST else "torch"
 
 
+def missing_kernel(model: ModelConfig) -> str:
+    """Why ``auto`` means torch here for a model that the kernel is fast enough for, and the remedy; empty if it does not."""
+    return str(why) if isinstance(why := library("decoder"), Unusable) and model.width <= WIDEST else ""
+
+
 def decoder_here(decoder: Decoder, model: ModelConfig) -> Literal["torch", "kernel"]:
     """What computes decisions here for ``context.decoder``: torch, where the kernel is named and there is none.
 
@@ -227,7 +232,8 @@ class KernelDecoder(CopiedWhole):
             while len(self._chunks) * _CHUNK < end:
                 self._chunks.append(np.zeros((self._layers, self._batch, _BLOCKS, self._width, _LANES), np.float32))
             self._point_to_chunks()
-        for number in range(end // _CHUNK, -(-self._written // _CHUNK)):
+        # Usually as many places are written again as before, and then nothing is to be done.
+        for number in range(end // _CHUNK, -(-self._written // _CHUNK)) if end < self._written else ():
             chunk, first, last = self._chunks[number], max(0, end - number * _CHUNK), self._written - number * _CHUNK
             for block in range(first // _LANES, -(-min(last, _CHUNK) // _LANES)):
                 chunk[:, :, block, :, max(0, first - block * _LANES) :] = 0

@@ -76,12 +76,15 @@ def test_a_run_resumes_with_another_endpoint_but_not_with_another_seed(small_run
 def test_a_run_keeps_its_decoder_and_is_refused_where_the_kernel_that_it_needs_is_missing(small_run, tmp_path, monkeypatch):
     def decoder(there, asked, resume=True):
         (tmp_path / "run.toml").write_text(dumps(by(there)))
-        return train.without_auto(by(asked), tmp_path, resume).context.decoder
+        return train.without_auto(by(asked), tmp_path, resume, notes.append).context.decoder
 
+    notes: list[str] = []
     by = lambda decoder: replace(small_run, context=replace(small_run.context, decoder=decoder))  # noqa: E731
     monkeypatch.setattr(kernel, "library", lambda name: Unusable("not compiled", "run `make kernel`"))
     monkeypatch.setattr(kernel, "kinds", lambda: ())
-    assert decoder("torch", "auto") == decoder("torch", "torch") == decoder("kernel", "auto", resume=False) == "torch"
+    assert decoder("torch", "auto") == decoder("torch", "torch") == "torch" and not notes
+    assert decoder("kernel", "auto", resume=False) == "torch"
+    assert [note.split(". ")[0] for note in notes] == ["compiled decoder: not compiled: run `make kernel`"]
     for there, asked, resume in (("kernel", "auto", True), ("kernel", "kernel", True), ("torch", "kernel", False)):
         with pytest.raises(
             ConfigError, match=r"^context\.decoder = 'kernel': on .*: not compiled: run `make kernel`; or begin"
@@ -90,6 +93,7 @@ def test_a_run_keeps_its_decoder_and_is_refused_where_the_kernel_that_it_needs_i
     monkeypatch.setattr(kernel, "kinds", lambda: ("avx2",))
     monkeypatch.setattr(kernel, "library", lambda name: None)
     assert decoder("torch", "auto") == "torch" and decoder("kernel", "auto") == decoder("torch", "auto", False) == "kernel"
+    assert len(notes) == 1
 
 
 def test_an_absent_cluster_leaves_no_run_folder(small_run, tmp_path, monkeypatch):

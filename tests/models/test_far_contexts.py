@@ -39,3 +39,15 @@ def test_decisions_do_not_depend_on_other_contexts_and_equal_torchs(
         alone.append(context[row : row + 1].numpy())
         assert (alone.query(query[row : row + 1].numpy())[0] == found[0][row]).all()
         assert (alone.window(window[row : row + 1].numpy())[0] == found[1][row]).all()
+
+
+def test_a_repeated_decision_clears_no_places() -> None:
+    """Clearing places that the next call writes again took as long as a tenth of the decision."""
+    trunk = GPT(1, 1, 16, 0.0)
+    made = kernel.KernelDecoder({name: value.numpy() for name, value in trunk.state_dict().items()}, 1, 2, kernel.Kernel())
+    made.append(np.ones((2, 20, 16), np.float32))
+    first = made.query(np.ones((2, 16), np.float32))
+    made._chunks[0].flags.writeable = False
+    assert (made.query(np.ones((2, 16), np.float32)) == first).all()
+    with pytest.raises(ValueError, match="read-only"):
+        made.clear()

@@ -171,7 +171,7 @@ RECORDED = "8e97486e932da77253dfaa90474489189389cd0477ea2144153992390418687f"
 
 
 def test_weights_have_the_recorded_digest() -> None:
-    """Equal on all processors: numbers that numpy draws, then steps of AdamW and Muon, with all that a model can have."""
+    """Equal on all processors: numpy's draws, then steps of AdamW and Muon, with all that a model can have."""
     whole = hashlib.sha256()
     shapes = Case(heads=2, windows=2, window=3, fourier=2, contexts=18), Case(discrete=False, actions=2, width=20, layers=3)
     for case in shapes:
