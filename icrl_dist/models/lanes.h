@@ -180,14 +180,6 @@ INLINE V gelu(V x) {
     return choose(greater(squared, all(5.1f * 5.1f)), maximum(x, all(0.0f)), inside);
 }
 
-/* 1 over the standard deviation, given the sum of squares.  A variance that overflows gives nan, as in torch: 0 would
-   turn huge numbers into zeros, and hide them from every check of results. */
-#define inverse_deviation NAMED(inverse_deviation, KIND)
-INLINE float inverse_deviation(float squares, int width) {
-    float variance = squares / (float)width;
-    return 1.0f / __builtin_sqrtf(variance - variance + variance + 1e-5f);
-}
-
 /* Layer normalization of one row. */
 #define layer_norm NAMED(layer_norm, KIND)
 INLINE void layer_norm(float *to, const float *x, const Linear norm, int width) {
@@ -199,7 +191,7 @@ INLINE void layer_norm(float *to, const float *x, const Linear norm, int width) 
         squares = fma(d, d, squares);
         store(to + i, d);
     }
-    V scale = all(inverse_deviation(sum(squares), width));
+    V scale = all(1.0f / __builtin_sqrtf(sum(squares) / (float)width + 1e-5f));
     for (int i = 0; i < width; i += LANES)
         store(to + i, fma(mul(load(to + i), scale), load(norm[0] + i), load(norm[1] + i)));
 }

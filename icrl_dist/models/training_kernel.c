@@ -180,7 +180,8 @@ INLINE V gelu_slope(V x) {
 }
 
 /* dx += the gradient of the input x of a layer normalization, given that of its output, dy; the gradients of its
-   weight and bias are added to theirs. */
+   weight and bias are added to theirs.  All are nan if the variance overflows: `layer_norm` then gives zeros, and a fit
+   would go on without these numbers. */
 #define layer_norm_back NAMED(layer_norm_back, KIND)
 INLINE void layer_norm_back(float *dx, const float *dy, const float *x, const float *weight, float *d_weight, float *d_bias,
                             int width) {
@@ -191,7 +192,8 @@ INLINE void layer_norm_back(float *dx, const float *dy, const float *x, const fl
         V d = choose(first_lanes(width - i), sub(load(x + i), mean), all(0.0f));
         squares = fma(d, d, squares);
     }
-    V scale = all(inverse_deviation(sum(squares), width));
+    float variance = sum(squares) / (float)width;
+    V scale = all(1.0f / __builtin_sqrtf(variance - variance + variance + 1e-5f));
     for (int i = 0; i < width; i += LANES) {
         V normed = mul(sub(load(x + i), mean), scale), d = load(dy + i), weighted = mul(d, load(weight + i));
         store(d_weight + i, fma(d, normed, load(d_weight + i)));

@@ -266,10 +266,8 @@ def test_a_weight_that_is_no_finite_number_reaches_the_loss(discrete: bool, valu
 @pytest.mark.parametrize("discrete", [True, False])
 @pytest.mark.parametrize("field", ["rewards", "observations", "queries", "labels"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
-def test_the_loss_of_values_that_cannot_be_fitted_is_not_finite_where_torchs_is_not(
-    discrete: bool, field: str, value: float
-) -> None:
-    """And a step warns of nothing: the fit ends by its loss, with the message of ``training.fit.take_steps``."""
+def test_values_that_cannot_be_fitted_end_the_fit_as_they_end_torchs(discrete: bool, field: str, value: float) -> None:
+    """By the loss of this step or the next, without a warning.  Torch's loss is nan too where a variance overflows."""
     case = Case(discrete=discrete)
     batch = case.batch()
     changed = getattr(batch, field).copy()
@@ -277,10 +275,11 @@ def test_the_loss_of_values_that_cannot_be_fitted_is_not_finite_where_torchs_is_
     batch = replace(batch, **{field: changed})
     expected, _ = by_torch(case.model(), batch)
     fit = case.fit(case.model())
-    assert math.isfinite(fit.step(batch, 1e-3)) == math.isfinite(expected)
-    if not math.isfinite(expected):
-        with pytest.raises(FloatingPointError, match="at step 0: lower the learning rate"):
-            take_steps(lambda step, rate: fit.step(batch, rate), OptimConfig(), 1e-3, 5)
+    if math.isfinite(expected):
+        assert math.isfinite(fit.step(batch, 1e-3))
+        return
+    with pytest.raises(FloatingPointError, match=r"at step [01]: lower the learning rate"):
+        take_steps(lambda step, rate: fit.step(batch, rate), OptimConfig(), 1e-3, 5)
 
 
 def test_an_error_leaves_no_thread_that_writes_into_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
