@@ -15,10 +15,11 @@ def steps_of(stored: Mapping[str, np.ndarray], adamw: Sequence[tuple[int, ...]],
     """
     if not stored:
         return set()
-    places = {tuple(key.split("/")[:2]) for key in stored}
-    own = {(str(part), str(index)) for part, shapes in enumerate((adamw, muon)) for index in range(len(shapes))}
-    if places != own:
-        raise ValueError(f"it holds the state of {len(places)} parameters, not of these {len(own)}")
+    trained = [len({key.split("/")[1] for key in stored if key.startswith(f"{part}/")}) for part in (0, 1)]
+    if trained != [len(adamw), len(muon)]:
+        raise ValueError(
+            f"AdamW and Muon train {trained[0]} and {trained[1]} parameters there, {len(adamw)} and {len(muon)} here"
+        )
     expected = {f"1/{index}/momentum_buffer": shape for index, shape in enumerate(muon)}
     for index, shape in enumerate(adamw):
         expected |= {f"0/{index}/step": (), f"0/{index}/exp_avg": shape, f"0/{index}/exp_avg_sq": shape}
