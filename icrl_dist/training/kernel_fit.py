@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from icrl_dist.config.sections import ModelConfig, OptimConfig
 from icrl_dist.copies import NotCopied
 from icrl_dist.models.features import Features
-from icrl_dist.models.training_kernel import Inputs, TrainingKernel
+from icrl_dist.models.training_kernel import Contexts, Inputs, TrainingKernel
 from icrl_dist.training.batches import TrainingBatch
 from icrl_dist.types import Spec
 
@@ -93,26 +93,25 @@ class KernelFit(NotCopied):
 
     def _gradient(self, batch: TrainingBatch) -> tuple[float, Float32[np.ndarray, " P"]]:
         self._kernel.load(self._parameters)
-        problem = self._kernel.problem(self._inputs(batch))
-        contexts = len(batch.prefix)
-        groups = min(_GROUPS, contexts)
+        contexts, count = Contexts(self._kernel, self._inputs(batch)), len(batch.prefix)
+        groups = min(_GROUPS, count)
         if len(self._parts) < groups:
             self._parts = np.empty((groups, self._kernel.gradient_size), np.float32)
-        losses, turns = np.empty(contexts), itertools.count()
+        losses, turns = np.empty(count), itertools.count()
 
         def work(thread: int) -> None:
-            if len(self._work[thread]) < problem.work_size:
-                self._work[thread] = np.empty(problem.work_size, np.float32)
+            if len(self._work[thread]) < contexts.work_size:
+                self._work[thread] = np.empty(contexts.work_size, np.float32)
             while (group := next(turns)) < groups:
                 self._parts[group] = 0
-                for context in range(group, contexts, groups):
-                    losses[context] = problem.add(context, self._parts[group], self._work[thread])
+                for context in range(group, count, groups):
+                    losses[context] = contexts.add(context, self._parts[group], self._work[thread])
 
         others = [self._pool.submit(work, thread) for thread in range(1, len(self._work))]
         work(0)
         for other in others:
             other.result()
-        return math.fsum(losses) / problem.count, self._kernel.gradient(self._parts[:groups])
+        return math.fsum(losses) / contexts.labels, self._kernel.gradient(self._parts[:groups])
 
     def _inputs(self, batch: TrainingBatch) -> Inputs:
         """A batch as the kernel takes it: with the queries of each context in the order of their prefixes."""

@@ -166,6 +166,16 @@ def test_a_prefix_beyond_the_context_is_refused() -> None:
             case.fit(case.model()).gradient(replace(batch, prefix=np.full_like(batch.prefix, wrong)))
 
 
+def test_windows_longer_than_the_models_and_labels_of_another_model_are_refused() -> None:
+    """The kernel would write beyond its memory."""
+    case = Case(windows=2, window=3)
+    fit = case.fit(case.model())
+    with pytest.raises(ValueError, match=r"^windows of up to 40 states: model\.window = 3$"):
+        fit.gradient(case._replace(window=40).batch())
+    with pytest.raises(ValueError, match=r"^arrays of the shapes .*: not those of a batch of this model$"):
+        fit.gradient(case._replace(actions=3).batch())
+
+
 RECORDED = "8e97486e932da77253dfaa90474489189389cd0477ea2144153992390418687f"
 """SHA-256 of the weights below, recorded on an AMD EPYC with AVX-512."""
 
