@@ -12,7 +12,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from icrl_dist.bench import peer
-from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, PROBLEM, pretraining_data, tensors
+from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, PROBLEM, kernel_of, pretraining_data, tensors
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import Policy
 from icrl_dist.methods.dpt_loss import batch_loss
@@ -147,13 +147,16 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
 
 
 def _our_step(data: PretrainingData, device: str, batch: int) -> tuple[Callable[[], object], int]:
-    """A training step on one drawn batch, and its number of labelled queries."""
+    """A training step on one drawn batch, as a run takes it on this device, and its number of labelled queries."""
     model = PretrainedTransformer(data.spec, MODEL).to(device).train()
-    optimizer = fit.Optimizer(model, OPTIM)
+    kernel, optimizer = kernel_of(model) if device == "cpu" else None, fit.Optimizer(model, OPTIM)
     contexts = data.draw(0, 0, batch, OPTIM.queries)
     examples = contexts.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=contexts.query.shape))
 
     def step() -> None:
+        if kernel is not None:
+            kernel.step(examples, OPTIM.learning_rate)
+            return
         loss = batch_loss(model, examples)
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), OPTIM.clip)
