@@ -72,7 +72,7 @@ def training(rounds: int) -> dict[str, float]:
     """Labelled queries per CPU-second through forward, backward and optimizer; both sides alternate."""
     data = pretraining_data(0)
     torch.manual_seed(0)
-    step, labels = _our_step(data, "cpu", OPTIM.batch)
+    step, labels = _our_step(data, OPTIM.batch)
     model = peer.Peer(data.spec)
     optimizer, batch = peer.optimizer(model), tensors(data.draw(0, 0, peer.BATCH, 1))
     ours, theirs = [], []
@@ -123,7 +123,7 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     """
     source = pretraining_data(0)
     torch.manual_seed(0)
-    step, labels = _our_step(source, device, batch)
+    step, labels = _our_step(source, batch, device)
     step()
     with FlopCounterMode(display=False) as counter:
         step()
@@ -146,10 +146,13 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     }
 
 
-def _our_step(data: PretrainingData, device: str, batch: int) -> tuple[Callable[[], object], int]:
-    """A training step on one drawn batch, as a run takes it on this device, and its number of labelled queries."""
-    model = PretrainedTransformer(data.spec, MODEL).to(device).train()
-    kernel, optimizer = kernel_of(model) if device == "cpu" else None, fit.Optimizer(model, OPTIM)
+def _our_step(data: PretrainingData, batch: int, device: str | None = None) -> tuple[Callable[[], object], int]:
+    """A training step on one drawn batch, and its number of labelled queries.
+
+    ``device``: torch takes the step there; None: as a run takes it on the CPU.
+    """
+    model = PretrainedTransformer(data.spec, MODEL).to(device or "cpu").train()
+    kernel, optimizer = None if device else kernel_of(model), fit.Optimizer(model, OPTIM)
     contexts = data.draw(0, 0, batch, OPTIM.queries)
     examples = contexts.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=contexts.query.shape))
 
