@@ -1,6 +1,6 @@
-"""A fit through the compiled kernel (``models.training_kernel``): the same weights on every processor, with any threads.
+"""A fit by the training kernel: the same weights on every processor and with any number of threads.
 
-All that computes is in the kernel, or in numpy one number at a time: batches, gradients, their norm, AdamW and Muon.
+The kernel (``models.training_kernel``) computes every sum; numpy computes the rest, number by number.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 from jaxtyping import Float32
@@ -108,7 +108,10 @@ class KernelFit(NotCopied):
                     losses[context] = contexts.add(context, self._parts[group], self._work[thread])
 
         others = [self._pool.submit(work, thread) for thread in range(1, len(self._work))]
-        work(0)
+        try:
+            work(0)
+        finally:  # nobody may write to the parts after this call, also if it was interrupted
+            wait(others)
         for other in others:
             other.result()
         return math.fsum(losses) / contexts.labels, self._kernel.gradient(self._parts[:groups])
@@ -116,9 +119,8 @@ class KernelFit(NotCopied):
     def _inputs(self, batch: TrainingBatch) -> Inputs:
         """A batch as the kernel takes it: with the queries of each context in the order of their prefixes."""
         features, actions = self._features.observations, self._features.actions
-        one = np.ones((*batch.rewards.shape, 1), np.float32)
         columns = features(batch.observations), actions(batch.actions), features(batch.next_observations)
-        tokens = np.concatenate([*columns, batch.rewards[..., None], one], axis=-1)
+        tokens = _with_one(np.concatenate([*columns, batch.rewards[..., None]], axis=-1))
         order = np.argsort(batch.prefix, axis=1, kind="stable")
         queries = _with_one(features(np.take_along_axis(batch.queries, order[..., None], 1)))
         labels = np.take_along_axis(batch.labels, order[..., None], 1)
@@ -131,18 +133,15 @@ class KernelFit(NotCopied):
             )
             states = features(states)
             # Each state, and the previous state of the window with its action and reward; the first has no previous one.
-            before = _with_one(np.concatenate([states, actions(taken), rewards[..., None]], axis=-1, dtype=np.float32))[
-                ..., :-1, :
-            ]
-            before = np.pad(before, ((0, 0), (0, 0), (1, 0), (0, 0)))
+            before = np.concatenate([states, actions(taken), rewards[..., None]], axis=-1, dtype=np.float32)
+            before = np.pad(_with_one(before)[..., :-1, :], ((0, 0), (0, 0), (1, 0), (0, 0)))
             rows, length = len(order), states.shape[2]
             windows = np.concatenate([_with_one(states), before], axis=-1).reshape(rows, -1, queries.shape[2] + before.shape[3])
             queries = np.pad(queries, ((0, 0), (0, 0), (0, before.shape[3])))
             queries = np.concatenate([queries, windows], axis=1)
             labels = np.concatenate([labels, window_labels.reshape(rows, -1, labels.shape[2])], axis=1)
-            prefix = np.concatenate(
-                [prefix, np.repeat(np.take_along_axis(batch.window_prefix, order, 1), length, axis=1)], axis=1
-            )
+            window_prefix = np.repeat(np.take_along_axis(batch.window_prefix, order, 1), length, axis=1)
+            prefix = np.concatenate([prefix, window_prefix], axis=1)
             own = np.concatenate([own, np.tile(np.arange(1, length + 1, dtype=np.int32), states.shape[1])])
         return Inputs(tokens, queries, labels, prefix.max(axis=1).astype(np.int32), prefix.astype(np.int32), own)
 
@@ -199,7 +198,7 @@ class KernelFit(NotCopied):
 
 
 def _with_one(x: Float32[np.ndarray, "*N I"]) -> Float32[np.ndarray, "*N J"]:
-    """The rows with a 1 at their ends, which bias is multiplied by."""
+    """The rows with a 1 at their ends, by which the bias is multiplied."""
     return np.concatenate([x, np.ones((*x.shape[:-1], 1), np.float32)], axis=-1)
 
 

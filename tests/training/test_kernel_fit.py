@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,7 @@ import torch
 from icrl_dist.config.sections import OptimConfig
 from icrl_dist.models.compiled import kinds
 from icrl_dist.models.features import sine_and_cosine
+from icrl_dist.models.training_kernel import Contexts
 from icrl_dist.models.weights import weights_of
 from icrl_dist.training.fit import Optimizer
 from icrl_dist.training.kernel_fit import KernelFit, _power, cosine
@@ -174,6 +177,26 @@ def test_windows_longer_than_the_models_and_labels_of_another_model_are_refused(
         fit.gradient(case._replace(window=40).batch())
     with pytest.raises(ValueError, match=r"^arrays of the shapes .*: not those of a batch of this model$"):
         fit.gradient(case._replace(actions=3).batch())
+
+
+def test_no_thread_writes_to_gradients_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next step would use the same memory."""
+    done: list[int] = []
+
+    def add(contexts: Contexts, context: int, *arrays: np.ndarray) -> float:
+        if threading.current_thread() is threading.main_thread():
+            raise MemoryError
+        time.sleep(0.02)
+        done.append(context)
+        return 0.0
+
+    monkeypatch.setattr(Contexts, "add", add)
+    case = Case(contexts=4)
+    with pytest.raises(MemoryError):
+        case.fit(case.model(), threads=2).gradient(case.batch())
+    before = len(done)
+    time.sleep(0.1)
+    assert len(done) == before >= 3
 
 
 RECORDED = "8e97486e932da77253dfaa90474489189389cd0477ea2144153992390418687f"
