@@ -40,7 +40,7 @@ class Shape(NamedTuple):
     environments: int
     transitions: int
     bound: float
-    """``kernel_over_torch``: at least so many times as fast as torch."""
+    """Least ``kernel_over_torch``: the time of torch's decision, in units of the kernel's."""
 
 
 SHAPES = (Shape(1, 100, 15), Shape(20, 100, 4), Shape(20, 1000, 2.5), Shape(512, 100, 2.2), Shape(512, 400, 2.5))
@@ -49,9 +49,9 @@ BATCHES = (20, 512)
 EPISODES = 3
 """Online episodes of a rollout; with 100 steps each its contexts have 0, 100 and 200 transitions."""
 ROLLOUT_BOUND = 2.0
-"""Decisions per second of rollouts: at least so many times as many as with torch."""
+"""Least decisions per second of rollouts, in units of torch's."""
 ROUNDS_BOUND = 0.6
-"""Time of a job of the demo's adaptation rounds: at most this part of torch's."""
+"""Most time of a job of the demo's adaptation rounds, in units of torch's."""
 _SECONDS = 0.02
 """CPU time that is measured at once."""
 

@@ -143,7 +143,7 @@ INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const 
 }
 
 /* Attention of up to QUERIES queries of context b in layer l, query g over its first visible[g] tokens.
-   What the tokens are weighted to goes to to[g], (width). */
+   The weighted mean of the tokens goes to to[g], (width). */
 #define attend NAMED(attend, KIND)
 INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float *const *to, const long *visible, int count,
                    float *mixed, Ahead *ahead) {
