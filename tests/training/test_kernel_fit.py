@@ -16,7 +16,7 @@ import torch
 from icrl_dist.config.sections import OptimConfig
 from icrl_dist.models.compiled import kinds
 from icrl_dist.models.features import sine_and_cosine
-from icrl_dist.models.training_kernel import Problem
+from icrl_dist.models.training_kernel import Contexts
 from icrl_dist.models.weights import weights_of
 from icrl_dist.training.fit import Optimizer, take_steps
 from icrl_dist.training.kernel_fit import KernelFit, _power, cosine
@@ -233,6 +233,36 @@ def test_a_prefix_beyond_the_context_is_refused() -> None:
             case.fit(case.model()).gradient(replace(batch, prefix=np.full_like(batch.prefix, wrong)))
 
 
+def test_windows_longer_than_the_models_and_labels_of_another_model_are_refused() -> None:
+    """The kernel would write beyond its memory."""
+    case = Case(windows=2, window=3)
+    fit = case.fit(case.model())
+    with pytest.raises(ValueError, match=r"^windows of up to 40 states: model\.window = 3$"):
+        fit.gradient(case._replace(window=40).batch())
+    with pytest.raises(ValueError, match=r"^arrays of the shapes .*: not those of a batch of this model$"):
+        fit.gradient(case._replace(actions=3).batch())
+
+
+def test_no_thread_writes_to_gradients_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next step would use the same memory."""
+    done: list[int] = []
+
+    def add(contexts: Contexts, context: int, *arrays: np.ndarray) -> float:
+        if threading.current_thread() is threading.main_thread():
+            raise MemoryError
+        time.sleep(0.02)
+        done.append(context)
+        return 0.0
+
+    monkeypatch.setattr(Contexts, "add", add)
+    case = Case(contexts=4)
+    with pytest.raises(MemoryError):
+        case.fit(case.model(), threads=2).gradient(case.batch())
+    before = len(done)
+    time.sleep(0.1)
+    assert len(done) == before >= 3
+
+
 RECORDED = "8e97486e932da77253dfaa90474489189389cd0477ea2144153992390418687f"
 """SHA-256 of the weights below, recorded on an AMD EPYC with AVX-512."""
 
@@ -281,24 +311,3 @@ def test_values_that_cannot_be_fitted_end_the_fit_as_they_end_torchs(discrete: b
         return
     with pytest.raises(FloatingPointError, match=r"at step [01]: lower the learning rate"):
         take_steps(lambda step, rate: fit.step(batch, rate), OptimConfig(), 1e-3, 5)
-
-
-def test_an_error_leaves_no_thread_that_writes_into_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    case, active = Case(contexts=2), list[int]()
-    fit = case.fit(case.model(), threads=2)
-    began = threading.Event()
-
-    def add(self: Problem, context: int, gradient: np.ndarray, work: np.ndarray) -> float:
-        if threading.current_thread() is threading.main_thread():
-            assert began.wait(10)
-            raise KeyboardInterrupt
-        active.append(context)
-        began.set()
-        time.sleep(0.05)
-        active.pop()
-        return 0.0
-
-    monkeypatch.setattr(Problem, "add", add)
-    with pytest.raises(KeyboardInterrupt):
-        fit.step(case.batch(), 1e-3)
-    assert began.is_set() and not active
