@@ -19,6 +19,7 @@ from icrl_dist.bench import incontext_cost as cost
 from icrl_dist.bench import incontext_decoder as decoder
 from icrl_dist.bench import incontext_quality as quality
 from icrl_dist.bench import peer
+from icrl_dist.models.compiled import kinds
 from icrl_dist.storage.files import write_json
 
 FLOORS = {"training": 600.0, "deployment": 1100.0}
@@ -130,7 +131,7 @@ def _settings() -> dict[str, Any]:
     """Everything that the result of a training depends on."""
     constants = {name: getattr(module, name) for module in (quality, peer) for name in vars(module) if name.isupper()}
     numbers = {name: value for name, value in constants.items() if isinstance(value, (int, float))}
-    machine = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability()}
+    machine = {"torch": torch.__version__, "cpu": torch.backends.cpu.get_cpu_capability(), "kernel": bool(kinds("training"))}
     return numbers | {"model": asdict(quality.MODEL), "optim": asdict(quality.OPTIM)} | machine
 
 

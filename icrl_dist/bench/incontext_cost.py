@@ -12,7 +12,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from icrl_dist.bench import peer
-from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, PROBLEM, pretraining_data, tensors
+from icrl_dist.bench.incontext_quality import LENGTH, MODEL, OPTIM, PROBLEM, kernel_of, pretraining_data, tensors
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import Policy
 from icrl_dist.methods.dpt_loss import batch_loss
@@ -72,7 +72,7 @@ def training(rounds: int) -> dict[str, float]:
     """Labelled queries per CPU-second through forward, backward and optimizer; both sides alternate."""
     data = pretraining_data(0)
     torch.manual_seed(0)
-    step, labels = _our_step(data, "cpu", OPTIM.batch)
+    step, labels = _our_step(data, OPTIM.batch)
     model = peer.Peer(data.spec)
     optimizer, batch = peer.optimizer(model), tensors(data.draw(0, 0, peer.BATCH, 1))
     ours, theirs = [], []
@@ -123,7 +123,7 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     """
     source = pretraining_data(0)
     torch.manual_seed(0)
-    step, labels = _our_step(source, device, batch)
+    step, labels = _our_step(source, batch, device)
     step()
     with FlopCounterMode(display=False) as counter:
         step()
@@ -146,14 +146,20 @@ def on_device(device: str, batch: int = 1024, environments: int = 4096, size: in
     }
 
 
-def _our_step(data: PretrainingData, device: str, batch: int) -> tuple[Callable[[], object], int]:
-    """A training step on one drawn batch, and its number of labelled queries."""
-    model = PretrainedTransformer(data.spec, MODEL).to(device).train()
-    optimizer = fit.Optimizer(model, OPTIM)
+def _our_step(data: PretrainingData, batch: int, device: str | None = None) -> tuple[Callable[[], object], int]:
+    """A training step on one drawn batch, and its number of labelled queries.
+
+    ``device``: torch takes the step there; None: as a run takes it on the CPU.
+    """
+    model = PretrainedTransformer(data.spec, MODEL).to(device or "cpu").train()
+    kernel, optimizer = None if device else kernel_of(model), fit.Optimizer(model, OPTIM)
     contexts = data.draw(0, 0, batch, OPTIM.queries)
     examples = contexts.batch(np.random.default_rng(0).integers(1, LENGTH + 1, size=contexts.query.shape))
 
     def step() -> None:
+        if kernel is not None:
+            kernel.step(examples, OPTIM.learning_rate)
+            return
         loss = batch_loss(model, examples)
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), OPTIM.clip)

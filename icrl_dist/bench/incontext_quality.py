@@ -18,11 +18,14 @@ import torch
 from icrl_dist.bench import peer
 from icrl_dist.config.sections import ModelConfig, OptimConfig
 from icrl_dist.methods.dpt_loss import batch_loss
+from icrl_dist.models.compiled import kinds
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.models.heads import Categorical
+from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.problems.benchmarks import DrawnContexts, PretrainingData
-from icrl_dist.training import fit
+from icrl_dist.training import fit, kernel_fit
+from icrl_dist.training.batches import TrainingBatch
 
 PROBLEM = "darkroom"
 SIZE, LENGTH, GOALS = 10, 100, 80
@@ -79,21 +82,34 @@ class _Stopwatch:
 Report = Callable[[str], None]
 
 
+def kernel_of(model: PretrainedTransformer) -> kernel_fit.KernelFit | None:
+    """The fit of a run with ``learner.reproducible = "auto"``: by the kernel, which trains the weights of ``model``.
+
+    None where there is no kernel; then torch trains it.
+    """
+    if not kinds("training"):
+        return None
+    found = kernel_fit.KernelFit(model.spec, MODEL, OPTIM, weights_of(model))
+    for name, parameter in model.named_parameters():
+        parameter.data = torch.from_numpy(found.weights[name])
+    return found
+
+
 def ours(seed: int, report: Report = lambda text: None, steps: int = STEPS, close: float = CLOSE) -> dict[str, Any]:
-    """Fit a ``PretrainedTransformer`` by ``training.fit`` until it reaches the target loss, for at most ``steps`` steps."""
+    """Fit a ``PretrainedTransformer`` as a run does until it reaches the target loss, for at most ``steps`` steps."""
     data, watch, curve = pretraining_data(seed), _Stopwatch(), []
     torch.manual_seed(seed)
     model = PretrainedTransformer(data.spec, MODEL)
     held_out = data.draw(1, 0, HELD_OUT, 1)
     floor = data.floor(held_out)
 
-    def loss_of(step: int) -> torch.Tensor:
+    def batch_of(step: int) -> TrainingBatch:
         watch.pause()
         contexts = data.draw(0, step, OPTIM.batch, OPTIM.queries)
         prefix = np.random.default_rng((seed, step)).integers(1, LENGTH + 1, size=contexts.query.shape)
         examples = contexts.batch(prefix)
         watch.resume()
-        return batch_loss(model, examples)
+        return examples
 
     def evaluate(step: int, _: float) -> None:
         if step % EVERY and step < steps:
@@ -106,10 +122,15 @@ def ours(seed: int, report: Report = lambda text: None, steps: int = STEPS, clos
             raise _TargetReached
         watch.resume()
 
-    optimizer = fit.Optimizer(model, OPTIM)
+    kernel, optimizer = kernel_of(model), fit.Optimizer(model, OPTIM)
     watch.resume()
     try:
-        fit.fit(model, optimizer, OPTIM, OPTIM.learning_rate, steps, loss_of, evaluate)
+        if kernel is None:
+            loss_of = lambda step: batch_loss(model, batch_of(step))  # noqa: E731
+            fit.fit(model, optimizer, OPTIM, OPTIM.learning_rate, steps, loss_of, evaluate)
+        else:
+            take = lambda step, rate: kernel.step(batch_of(step), rate)  # noqa: E731
+            fit.take_steps(take, OPTIM, OPTIM.learning_rate, steps, evaluate, cosine=kernel_fit.cosine)
     except _TargetReached:
         return _outcome(True, curve, floor)
     return _outcome(False, curve, floor)

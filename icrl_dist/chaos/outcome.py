@@ -13,6 +13,7 @@ from rich.table import Table
 
 from icrl_dist.chaos.disk import allocated
 from icrl_dist.config.run import ConfigError, Run, load_folder
+from icrl_dist.launch.train import without_auto
 
 SAME = ("dataset_digest", "weights_digest", "trajectories")
 """Fields of ``result.json`` that must be equal in every run."""
@@ -31,13 +32,15 @@ class ReferenceRun:
     def of(cls, folder: Path, run: Run) -> ReferenceRun:
         """Read the folder of a finished run; its evaluation settings may differ from ``run``'s.
 
-        Raises ConfigError if the folder holds no finished run, or one with other settings.
+        ``auto`` is what a run that begins here has.  Raises ConfigError if the folder holds no finished run, or one with
+        other settings.
         """
         try:
             result = json.loads((folder / "result.json").read_text())
         except (OSError, ValueError) as error:
             raise ConfigError(f"--reference {folder}: holds no result of a finished run ({error})") from None
-        if dataclasses.replace(load_folder(folder), evaluate=run.evaluate) != run:
+        wanted = without_auto(run, folder, resume=False)
+        if dataclasses.replace(load_folder(folder), evaluate=run.evaluate) != wanted:
             raise ConfigError(f"--reference {folder}: is a run with other settings; omit --reference to run one with these")
         return cls(
             result, allocated(folder) - allocated(folder / "report") - allocated(folder / "results"), float(result["seconds"])

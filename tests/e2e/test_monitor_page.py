@@ -344,7 +344,7 @@ def test_a_recording_is_controlled_by_keyboard(page):
 
 def test_a_real_run_and_a_killed_worker(page, tmp_path):
     folder = tmp_path / "watched"
-    many = ("--pretrain.steps", "5", "--icaa.rounds", "100", "--icaa.steps", "5")
+    many = ("--pretrain.steps", "5", "--icaa.rounds", "2000", "--icaa.steps", "5")  # more than the test sees
     training = start("train", *SMOKE, *many, "--out", folder, start_new_session=True)
     view = None
     try:

@@ -14,8 +14,18 @@ from icrl_dist.stream.zenoh_link import ZenohLink
 from icrl_dist.telemetry import processes
 
 CLI = [sys.executable, "-m", "icrl_dist.cli"]
-# Both of smoke's rounds, with fewer trajectories in each.
-SMALLER = ["smoke", "--pretrain.contexts", "140", "--icaa.trials", "20", "--icaa.context-trials", "6"]
+# Both of smoke's rounds, with fewer trajectories in each, and a first fit of about a second, which tests can interrupt.
+SMALLER = [
+    "smoke",
+    "--pretrain.contexts",
+    "140",
+    "--icaa.trials",
+    "20",
+    "--icaa.context-trials",
+    "6",
+    "--pretrain.steps",
+    "600",
+]
 # The same with a very small evaluation.
 SMOKE = [*SMALLER, "--evaluate.episodes", "1", "--evaluate.seeds", "1", "--evaluate.p", "0"]
 # For runs in which no process dies: no spare worker is kept.
