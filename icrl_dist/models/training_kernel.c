@@ -155,12 +155,13 @@ INLINE void add_scaled(float *to, float factor, const float *x, int n) {
     for (int i = 0; i < n; i += LANES) store(to + i, fma(all(factor), load(x + i), load(to + i)));
 }
 
-/* The natural logarithm of x > 0, to 2 units in the last place. */
+/* The natural logarithm of x > 0, to 2 units in the last place; infinity and nan as they are. */
 #define logarithm NAMED(logarithm, KIND)
 INLINE V logarithm(V x) {
     static const float coefficient[] = {-1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f, 1.4249322787e-1f,
                                         -1.6668057665e-1f, 2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f};
-    V power, p = all(7.0376836292e-2f);
+    V power, p = all(7.0376836292e-2f), given = x;
+    M finite = greater(all(__builtin_inff()), x);
     EACH(i) { /* x = 2^power times a number from sqrt(1/2) to sqrt(2) */
         B bits = (B)x.r[i], whole = (bits - 0x3f3504f3) >> 23;
         power.r[i] = __builtin_convertvector(whole, R);
@@ -171,7 +172,7 @@ INLINE V logarithm(V x) {
     UNROLL for (int i = 0; i < 8; i++) p = fma(p, x, all(coefficient[i]));
     p = fma(power, all(-2.12194440e-4f), mul(mul(p, x), squared));
     p = fma(squared, all(-0.5f), p);
-    return fma(power, all(0.693359375f), add(x, p));
+    return choose(finite, fma(power, all(0.693359375f), add(x, p)), given);
 }
 
 /* The derivative of the GELU, to 5e-6: like `gelu`, 1/2 plus x times a polynomial in x^2. */
@@ -187,7 +188,8 @@ INLINE V gelu_slope(V x) {
 }
 
 /* dx += the gradient of the input x of a layer normalization, given that of its output, dy; the gradients of its
-   weight and bias are added to theirs. */
+   weight and bias are added to theirs.  All are nan if the variance overflows: `layer_norm` then gives zeros, and a fit
+   would go on without these numbers. */
 #define layer_norm_back NAMED(layer_norm_back, KIND)
 INLINE void layer_norm_back(float *dx, const float *dy, const float *x, const float *weight, float *d_weight, float *d_bias,
                             int width) {
@@ -198,7 +200,8 @@ INLINE void layer_norm_back(float *dx, const float *dy, const float *x, const fl
         V d = choose(first_lanes(width - i), sub(load(x + i), mean), all(0.0f));
         squares = fma(d, d, squares);
     }
-    V scale = all(1.0f / __builtin_sqrtf(sum(squares) / (float)width + 1e-5f));
+    float variance = sum(squares) / (float)width;
+    V scale = all(1.0f / __builtin_sqrtf(variance - variance + variance + 1e-5f));
     for (int i = 0; i < width; i += LANES) {
         V normed = mul(sub(load(x + i), mean), scale), d = load(dy + i), weighted = mul(d, load(weight + i));
         store(d_weight + i, fma(d, normed, load(d_weight + i)));

@@ -18,6 +18,7 @@ from icrl_dist.copies import NotCopied
 from icrl_dist.models.features import Features
 from icrl_dist.models.training_kernel import Contexts, Inputs, TrainingKernel
 from icrl_dist.training.batches import TrainingBatch
+from icrl_dist.training.optimizer_state import steps_of
 from icrl_dist.types import Spec
 
 _GROUPS = 16
@@ -77,6 +78,10 @@ class KernelFit(NotCopied):
 
     def step(self, batch: TrainingBatch, learning_rate: float) -> float:
         """Update the weights by the gradient of one batch; returns its loss before the update."""
+        with np.errstate(all="ignore"):  # as torch: the loss tells of a number that is infinite or none
+            return self._step(batch, learning_rate)
+
+    def _step(self, batch: TrainingBatch, learning_rate: float) -> float:
         loss, gradient = self._gradient(batch)
         norm = self._kernel.norm(gradient)
         gradient *= np.float32(min(1.0, self._optim.clip / (norm + 1e-6)))
@@ -110,11 +115,12 @@ class KernelFit(NotCopied):
         others = [self._pool.submit(work, thread) for thread in range(1, len(self._work))]
         try:
             work(0)
-        finally:  # nobody may write to the parts after this call, also if it was interrupted
-            wait(others)
+        finally:
+            wait(others)  # also after an error: they write where the next step does
         for other in others:
             other.result()
-        return math.fsum(losses) / contexts.labels, self._kernel.gradient(self._parts[:groups])
+        total = math.fsum(losses) if np.isfinite(losses).all() else float(losses.sum())  # fsum refuses inf - inf
+        return total / contexts.labels, self._kernel.gradient(self._parts[:groups])
 
     def _inputs(self, batch: TrainingBatch) -> Inputs:
         """A batch as the kernel takes it: with the queries of each context in the order of their prefixes."""
@@ -181,13 +187,9 @@ class KernelFit(NotCopied):
 
     def load(self, stored: Mapping[str, np.ndarray]) -> None:
         """The inverse of ``state``.  Raises ValueError for the state of another optimizer."""
-        steps = {int(value) for key, value in stored.items() if key.endswith("/step")}
-        places = {tuple(key.split("/")[:2]) for key in stored}
-        own = {
-            (str(part), str(index)) for part, names in enumerate((self._others, self._matrices)) for index in range(len(names))
-        }
-        if stored and (places != own or len(steps) != 1):
-            raise ValueError(f"it holds the state of {len(places)} parameters, not of these {len(own)}")
+        steps = steps_of(stored, *([self._shapes[name] for name in names] for names in (self._others, self._matrices)))
+        if len(steps) > 1:
+            raise ValueError(f"its parameters took {min(steps)} to {max(steps)} steps, not the same number")
         self._steps = steps.pop() if steps else 0
         self._first[:], self._second[:] = 0, 0
         first, second = self._views(self._first), self._views(self._second)
