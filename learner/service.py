@@ -115,6 +115,7 @@ class Service:
         if newest is not None:
             self._broadcast.publish(newest)
         made_by = provenance.record(run.problem, run.method, self._threads, self._fitting.device_name, run.learner.reproducible)
+        self._any_machine: bool = made_by["any_machine"]
         if changed := provenance.add_session(folder, self.version, made_by):
             self._note(changed)
             self._data.excused = changed
@@ -230,6 +231,7 @@ class Service:
             "lag": {str(lag): count for lag, count in self.store.index.lags().items()},
             "threads": self._threads,
             "instruction_set": torch.backends.cpu.get_cpu_capability(),
+            "any_machine": self._any_machine,
         }
 
     def _next_phase(self) -> Phase | None:

@@ -5,8 +5,8 @@ A refactoring must not change a byte of what runs produce.  Usage, from the repo
     python tools/digests.py record digests.json
     python tools/digests.py compare digests.json [--only smoke]
 
-Digests depend on the processor's instruction set and on library versions, so a record is valid
-on one machine only and is not committed.
+Digests depend on library versions, and on the processor where torch fits or decides, or where a simulator or a SAC expert
+computes.  So a record is valid on one machine only and is not committed.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class BenchArguments:
     (experts), briefly trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of
     8 (monitor)."""
     decisions: bool = False
-    """incontext: compare only the compiled decoder with torch's, in about a minute, and train nothing."""
+    """incontext: compare only the compiled decoder with torch's, in about two minutes, and train nothing."""
     drop: float | None = None
     """disturbance: instead, find the strength at which this fraction of the return is lost, such as 0.25.  The
     strength of each problem is kept for later runs with ``control.strength = "drop:0.25"``."""

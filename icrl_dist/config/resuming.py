@@ -23,11 +23,10 @@ FREE: Mapping[str, frozenset[str]] = {
 }
 """The numbers, by section, on which neither the dataset nor the weights depend, so that a resume may change them.
 
-They say where and how a run is executed, watched and evaluated.  ``learner.device`` is the machine's, as with ``auto``:
-digests are equal on machines of one kind only, and a resume on other hardware says so.  Not free are
-``learner.threads`` (unless ``learner.reproducible`` is any-machine) and ``stream.job_tasks``, because digests depend on them,
-and ``stream.staleness``, which makes them depend on timing.  The engine, the number of workers and the address of a
-cluster are no numbers of a run.
+They say where and how a run is executed, watched and evaluated.  ``learner.device`` is the machine's, as with ``auto``: where
+torch fits, a resume on another device says that digests can differ.  Not free are ``learner.threads`` (unless
+``learner.reproducible`` is any-machine) and ``stream.job_tasks``, because digests depend on them, and ``stream.staleness``,
+which makes them depend on timing.  The engine, the number of workers and the address of a cluster are no numbers of a run.
 """
 
 AUTO = ("context.decoder", "learner.reproducible")

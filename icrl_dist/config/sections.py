@@ -220,17 +220,17 @@ class LearnerConfig:
     """CPU threads of a fit; 0 uses every core, because workers are idle during a fit.  With
     ``reproducible = "this-machine"`` the weights digest depends on it, so the run folder records it."""
     reproducible: Reproducible = "auto"
-    """Where a fit gives the same weights digest.  ``any-machine``: on every processor and with any number of threads,
-    through the compiled kernel, which is also faster than torch for models up to 128 wide; on the CPU, without dropout,
-    for methods with DPT's model and loss, and with ``context.decoder = "kernel"``.  ``this-machine``: on machines of one
-    kind with the same threads, by torch.  ``auto``: any-machine where it is possible.  A run keeps what it began with."""
+    """Where a repetition of the run has the same weights digest.  ``any-machine``: on every processor and with any number
+    of threads; the compiled kernel fits, which is also faster than torch.  It needs a CPU, a model up to 128 wide without
+    dropout, a method with DPT's model and loss, and ``context.decoder = "kernel"``.  ``this-machine``: on machines of one
+    kind with the same threads; torch fits.  ``auto``: any-machine where it is possible.  A run keeps what it began with."""
     restarts: NotNegative = 3
     """Maximum number of restarts of the learner, and of successive restarts of a worker without progress;
     then the run fails."""
     cache_mb: NotNegative = 1024
     """Megabytes of the dataset that a fit keeps in memory; other trajectories are read when they are drawn."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device of the fits; ``auto`` uses a GPU if there is one."""
+    """Device of the fits; ``auto`` uses a GPU if there is one.  On a GPU torch fits."""
     prometheus: str = ""
     """HOST:PORT on which to serve the newest metrics for Prometheus, such as 127.0.0.1:9464; empty: off."""
 

@@ -78,7 +78,7 @@ def evaluate(
             text = f"{source}: this run is not finished; the newest version so far is evaluated"
             show({"event": "note", "text": text})
         if run.context.decoder == "kernel" and isinstance(why := library("decoder"), Unusable):
-            show({"event": "note", "text": f"torch computes the decisions, not the kernel as in the run: {why}"})
+            show({"event": "note", "text": f"torch computes the decisions, not the compiled decoder as in the run: {why}"})
         if suite == "online":
             rows = heldout.online(run, source, results, show, deploy, unstored)
             found = reports.online(run, report, rows, unstored)

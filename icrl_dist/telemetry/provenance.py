@@ -185,4 +185,5 @@ def text(made_by: Mapping[str, Any]) -> str:
     parts += [f"{name} {made_by.get('libraries', {}).get(name, 'unknown')}" for name in ("python", "torch", "numpy")]
     parts.append(made_by.get("instruction_set", ""))
     parts.append(f"threads {made_by['threads']}" if "threads" in made_by else "")
+    parts.append("the same bytes on any machine" if made_by.get("any_machine") else "")
     return ", ".join(part for part in parts if part)

@@ -115,8 +115,8 @@ class KernelFit(NotCopied):
         others = [self._pool.submit(work, thread) for thread in range(1, len(self._work))]
         try:
             work(0)
-        finally:  # nobody may write to the parts after this call, also if it was interrupted
-            wait(others)
+        finally:
+            wait(others)  # also after an error: they write where the next step does
         for other in others:
             other.result()
         total = math.fsum(losses) if np.isfinite(losses).all() else float(losses.sum())  # fsum refuses inf - inf

@@ -33,13 +33,15 @@ def _objection(run: Run) -> str:
     if run.model.width > WIDEST:
         return f"model.width = {run.model.width}: the kernel is for models up to {WIDEST} wide: use at most {WIDEST}"
     if run.model.dropout:
-        return f"model.dropout = {run.model.dropout}: the kernel has none: use 0"
+        return f"model.dropout = {run.model.dropout}: the kernel has no dropout: use 0"
     if isinstance(why := library("training"), Unusable):
         return f"on {platform.node()} the training kernel cannot be used: {why}"
     if run.context.decoder == "torch":
-        return "context.decoder = 'torch': its decisions depend on the processor: use kernel"
+        return "context.decoder = 'torch', whose decisions depend on the processor: set context.decoder = 'kernel'"
     if run.learner.device == "cuda" or (run.learner.device == "auto" and _gpu()):
-        return f"learner.device = {run.learner.device!r} is a GPU here, and the kernel runs on the CPU: use cpu"
+        return (
+            f"learner.device = {run.learner.device!r} means a GPU, and the kernel runs on the CPU: set learner.device = 'cpu'"
+        )
     return ""
 
 

@@ -119,7 +119,16 @@ def test_it_measures_every_way_with_the_same_batches(monkeypatch: pytest.MonkeyP
 
 
 def test_a_missed_bound_is_a_reason() -> None:
-    row = {"run": "demo", "threads": 2, "fit_over_torch": 1.5, "step_over_floor": 2.0}
+    row = {"run": "demo", "threads": 2, "ways": {"torch": {}, "kernel": {}}, "fit_over_torch": 1.5, "step_over_floor": 2.0}
     assert not bench._missed(row)
     assert bench._missed(row | {"fit_over_torch": 1.4}) == ["demo, 2 threads: 1.40 steps per step of torch, below 1.5"]
     assert bench._missed(row | {"step_over_floor": 2.1}) == ["demo, 2 threads: a step takes 2.10 times its floor, above 2"]
+
+
+def test_without_the_kernel_nothing_is_compared() -> None:
+    way = {"torch": {"steps_per_s": 10.0, "cpu_ms": 60.0}}
+    numbers = {"fit_over_torch": 1.0, "step_over_floor": 3.9, "floor_ms": 15.0, "dense_floor_ms": 20.0, "parts": {}}
+    row = {"run": "demo", "threads": 2, "ways": way} | numbers
+    assert not bench._missed(row), "torch is no worse than itself"
+    text = bench.describe({"fits": [row], "reasons": []})
+    assert "icrl-dist doctor" in text and max(map(len, text.splitlines())) <= 80

@@ -13,6 +13,7 @@ from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, parse_written
 from icrl_dist.config.sections import Reproducible
 from icrl_dist.launch import auto, train
+from icrl_dist.models import kernel
 from icrl_dist.models.compiled import Unusable, kinds
 from icrl_dist.storage import held
 from icrl_dist.storage.checkpoint import load_checkpoint, version_file
@@ -44,8 +45,8 @@ def test_auto_is_any_machine_where_that_is_possible(small_run: Run, tmp_path: Pa
     [
         ({"model": {"width": 144}}, ["model.width = 144", "at most 128"]),
         ({"model": {"dropout": 0.1}}, ["model.dropout = 0.1", "use 0"]),
-        ({"context": {"decoder": "torch"}}, ["context.decoder = 'torch'", "use kernel"]),
-        ({"learner": {"device": "cuda"}}, ["learner.device = 'cuda'", "use cpu"]),
+        ({"context": {"decoder": "torch"}}, ["context.decoder = 'torch'", "set context.decoder = 'kernel'"]),
+        ({"learner": {"device": "cuda"}}, ["learner.device = 'cuda'", "set learner.device = 'cpu'"]),
     ],
 )
 def test_what_the_kernel_cannot_fit_is_refused_and_fitted_by_torch_with_auto(
@@ -70,7 +71,7 @@ def test_a_gpu_a_missing_kernel_and_another_loss_are_refused(
     with monkeypatch.context() as patch:
         patch.setattr(reproducible, "_GPU_FILES", (str(tmp_path),))
         patch.setattr(torch.cuda, "is_available", lambda: True)
-        refused(run, tmp_path, ["learner.device = 'auto' is a GPU here", "use cpu"])
+        refused(run, tmp_path, ["learner.device = 'auto' means a GPU", "set learner.device = 'cpu'"])
         on_cpu = asked(run, "any-machine", learner={"device": "cpu"})
         assert auto.without_auto(on_cpu, tmp_path, resume=False).learner.reproducible == "any-machine"
     with monkeypatch.context() as patch:
@@ -89,6 +90,40 @@ def test_a_run_keeps_what_it_began_with(small_run: Run, tmp_path: Path) -> None:
     assert not differences(begun, small_run), "auto is what the run began with"
     assert [d.name for d in differences(begun, asked(begun, "any-machine"))] == ["learner.reproducible"]
     assert held.differences(begun, asked(begun, "any-machine")), "a checkpoint of the other way to fit is another run's"
+
+
+@pytest.mark.parametrize(
+    ("there", "section", "change"),
+    [
+        ("any-machine", "context", {"decoder": "torch"}),
+        ("any-machine", "model", {"dropout": 0.1}),
+        ("this-machine", "learner", {"reproducible": "any-machine", "threads": 7}),
+    ],
+)
+def test_a_resume_with_other_settings_names_them(
+    small_run: Run, tmp_path: Path, there: Reproducible, section: str, change: dict[str, Any]
+) -> None:
+    """It gives no remedy of the kernel that another resume would refuse."""
+    folder = tmp_path / "run"
+    train.prepare(asked(small_run, there, context={"decoder": "kernel"}), folder, resume=False, overwrite=False)
+    changed = asked(small_run, "auto") if section != "learner" else small_run
+    changed = replace(changed, **{section: replace(getattr(changed, section), **change)})
+    named = auto.without_auto(changed, folder, resume=True)
+    with pytest.raises(ConfigError, match=rf"has other settings.*{section}\.{next(iter(change))}"):
+        train.prepare(named, folder, resume=True, overwrite=False)
+
+
+def test_a_refused_run_is_not_announced(small_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = Unusable("not compiled", "install a C compiler")
+    monkeypatch.setattr(kernel, "kinds", lambda: ())
+    monkeypatch.setattr(kernel, "library", lambda name: missing)
+    monkeypatch.setattr(reproducible, "library", lambda name: missing)
+    notes: list[str] = []
+    with pytest.raises(ConfigError, match="training kernel cannot be used"):
+        auto.without_auto(asked(small_run, "any-machine"), tmp_path, False, notes.append)
+    assert not notes, "a note that the run uses torch contradicts the refusal"
+    auto.without_auto(small_run, tmp_path, False, notes.append)
+    assert len(notes) == 1 and "equal only on machines of one kind" in notes[0]
 
 
 def test_runs_of_versions_without_the_key_were_fitted_by_torch(small_run: Run) -> None:

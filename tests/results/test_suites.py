@@ -129,5 +129,5 @@ def test_a_run_by_the_kernel_is_evaluated_by_torch_where_there_is_no_kernel(tmp_
     assert found.summary == expected.summary
     notes = [event["text"] for event in events if event["event"] == "note"]
     assert [note for note in notes if "kernel" in note] == [
-        "torch computes the decisions, not the kernel as in the run: not compiled: run `make kernel`"
+        "torch computes the decisions, not the compiled decoder as in the run: not compiled: run `make kernel`"
     ]

@@ -124,6 +124,7 @@ def test_run_checkpoint_agent_and_rows_say_what_made_them(
     assert session["libraries"].keys() >= DECIDES_BYTES and session["libraries"]["torch"] == metadata.version("torch")
     assert session["threads"] == result["threads"] == 1 and session["device"] == "cpu"
     assert session["instruction_set"] == result["instruction_set"] and session["processor"]
+    assert session["any_machine"] == result["any_machine"]
     assert session["commit"].removesuffix("-dirty") == git(Path(__file__).parent, "rev-parse", "HEAD")
     made_by = load_checkpoint(version_file(folder, 1)).manifest["made_by"]
     assert made_by.items() <= session.items() and made_by.keys() == provenance.record("darkroom", "icaa", 1).keys()
@@ -207,6 +208,7 @@ def test_the_file_of_0_1_0_is_the_first_session(tmp_path: Path) -> None:
     assert first["libraries"] == {"python": "3.11.2", "torch": "2.8.0", "gone": "1"} and first["cores"] == 2
     assert second["policy_version"] == 3 and now.items() <= second.items()
     assert provenance.text(first) == "icrl-dist 0.1.0, python 3.11.2, torch 2.8.0, numpy unknown"
+    assert provenance.text({**first, "threads": 2, "any_machine": True}).endswith(", threads 2, the same bytes on any machine")
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{", "null", '{"sessions": 3}', '{"sessions": [3]}', '{"versions": 3}'])
