@@ -77,7 +77,7 @@ def restore(path: Path, spec: Spec, model: nn.Module, opt: Optimizer | KernelFit
     try:
         opt.load(state)
     except ValueError as error:
-        raise ConfigError(f"{path}: a checkpoint of another optimizer ({error}): it has the run's optim.muon") from None
+        raise ConfigError(f"{path}: a checkpoint of another optimizer ({error}): use the optim.muon of its run") from None
     load_weights(model, arrays)
     return checkpoint.manifest
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from icrl_dist.config.random_keys import RandomKey, generator
-from icrl_dist.config.run import Run
+from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.interfaces import Draw, Method, Phase
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
@@ -21,7 +21,7 @@ from icrl_dist.training import fit, kernel_fit
 from icrl_dist.training.kernel_fit import KernelFit
 from icrl_dist.types import Spec, Weights
 from learner import checkpoints
-from learner.recovery import continues
+from learner.recovery import continues, starts_again
 
 SAVE_STEPS = 1000
 """Optimizer steps between checkpoints of a fit that is not finished."""
@@ -106,9 +106,14 @@ class Fitting:
             checkpoints.restore(file, self._spec, self._model, self._optimizer)
             self.version = newest
             loaded = Weights(newest, weights_of(self._model), str(self._intact[newest]["weights_digest"]))
-        if continues(self._partial, self._run, self.version, self.note):
-            manifest = checkpoints.restore(self._partial, self._spec, self._model, self._optimizer)
-            self._steps_done, self._first_loss = manifest["step"], float(manifest.get("first_loss", math.nan))
+        steps = {phase.next_version: phase.steps for phase in self.method.phases(self._run)}.get(self.version + 1, 0)
+        if continues(self._partial, self._run, self.version, steps, self.note):
+            try:
+                manifest = checkpoints.restore(self._partial, self._spec, self._model, self._optimizer)
+            except ConfigError as error:
+                self.note(starts_again(error, self.version))
+            else:
+                self._steps_done, self._first_loss = manifest["step"], float(manifest.get("first_loss", math.nan))
         return loaded
 
     def fit(

@@ -64,8 +64,11 @@ def _origin(folder: Path) -> str:
     return f"it was fitted with other settings than this run's, so it is lost here: copy it from {parent}"
 
 
-def continues(path: Path, run: Run, version: int, note: Note) -> bool:
-    """Whether ``path`` holds an unfinished fit of T^(version + 1) that can be continued; a broken one is expendable."""
+def continues(path: Path, run: Run, version: int, steps: int, note: Note) -> bool:
+    """Whether ``path`` holds an unfinished fit of T^(version + 1) that can be continued; a broken one is expendable.
+
+    ``steps``: those of the whole fit.
+    """
     if not path.exists():
         return False
     try:
@@ -73,12 +76,20 @@ def continues(path: Path, run: Run, version: int, note: Note) -> bool:
         if checkpoint.manifest.get("next_version") != version + 1:
             return False
         hold(checkpoint, path, version, run)
-        if not isinstance(checkpoint.manifest.get("step"), int):
-            raise DamagedCheckpoint(f"{path}: damaged, it does not say its step")
+        step = checkpoint.manifest.get("step")
+        if not isinstance(step, int) or not 0 < step <= steps:
+            raise DamagedCheckpoint(f"{path}: damaged, its step is {step!r}, not one of 1 to {steps}")
+        if not checkpoint.part("optimizer"):
+            raise DamagedCheckpoint(f"{path}: damaged, it holds no state of the optimizer")
     except (StoreError, ValueError) as error:
-        note(f"{error}: the fit of T^{version + 1} starts at its beginning")
+        note(starts_again(error, version))
         return False
     return True
+
+
+def starts_again(error: Exception, version: int) -> str:
+    """What is said about an unfinished fit of T^(version + 1) that cannot be continued."""
+    return f"{error}: the fit of T^{version + 1} starts at its beginning"
 
 
 def largest_values(store: Dataset, spec: Spec, version: int) -> str:

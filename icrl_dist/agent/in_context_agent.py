@@ -19,8 +19,7 @@ from icrl_dist.config.sections import Decoder
 from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
-from icrl_dist.models import kernel
-from icrl_dist.models.compiled import Unusable
+from icrl_dist.models.compiled import Unusable, library
 from icrl_dist.models.outcome_readout import OutcomeModel
 
 if TYPE_CHECKING:
@@ -182,5 +181,5 @@ def _check_decoder(decoder: object) -> None:
     if decoder not in get_args(Decoder):
         choices = get_args(Decoder)
         raise ConfigError(f"decoder = {decoder!r}{nearest(str(decoder), choices)}: choose one of {', '.join(choices)}")
-    if decoder == "kernel" and isinstance(why := kernel.library("decoder"), Unusable):
+    if decoder == "kernel" and isinstance(why := library("decoder"), Unusable):
         raise ConfigError(f"decoder = 'kernel': {why}; or leave decoder at 'auto'")

@@ -9,7 +9,7 @@ import subprocess
 import time
 from typing import Any
 
-from icrl_dist.models import kernel
+from icrl_dist.models.compiled import kinds
 from icrl_dist.telemetry import processes
 
 BOUND = 0.5
@@ -20,7 +20,7 @@ _ACT = "import icrl_dist\nicrl_dist.load_agent('darkroom', seed=0, decoder={!r})
 
 def sides() -> dict[str, str]:
     """What each side executes, by its name; ``kernel`` only where it was built."""
-    built = {"kernel": _ACT.format("kernel")} if kernel.kinds() else {}
+    built = {"kernel": _ACT.format("kernel")} if kinds() else {}
     return {"numpy": "import numpy", **built, "torch": _ACT.format("torch")}
 
 

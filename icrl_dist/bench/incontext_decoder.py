@@ -17,14 +17,17 @@ import numpy as np
 import torch
 
 from icrl_dist.bench.incontext_quality import MODEL, PROBLEM
+from icrl_dist.bench.samples import RandomWeights
 from icrl_dist.collect.adapt import rollouts
 from icrl_dist.config.run import load_run
 from icrl_dist.config.sections import ContextConfig, Decoder
 from icrl_dist.methods import registry as methods
 from icrl_dist.models import decoder as by_torch
+from icrl_dist.models.compiled import kinds
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.gpt import GPT
-from icrl_dist.models.kernel import Kernel, KernelDecoder, kinds
+from icrl_dist.models.kernel import Kernel
+from icrl_dist.models.kernel_decoder import KernelDecoder
 from icrl_dist.problems import registry
 from icrl_dist.rollout.deployment import InContextPolicy
 from icrl_dist.rollout.episode import deploy_online
@@ -37,7 +40,7 @@ class Shape(NamedTuple):
     environments: int
     transitions: int
     bound: float
-    """``kernel_over_torch``: at least so many times as fast as torch."""
+    """Least ``kernel_over_torch``: the time of torch's decision, in units of the kernel's."""
 
 
 SHAPES = (Shape(1, 100, 15), Shape(20, 100, 4), Shape(20, 1000, 2.5), Shape(512, 100, 2.2), Shape(512, 400, 2.5))
@@ -46,9 +49,9 @@ BATCHES = (20, 512)
 EPISODES = 3
 """Online episodes of a rollout; with 100 steps each its contexts have 0, 100 and 200 transitions."""
 ROLLOUT_BOUND = 2.0
-"""Decisions per second of rollouts: at least so many times as many as with torch."""
+"""Least decisions per second of rollouts, in units of torch's."""
 ROUNDS_BOUND = 0.6
-"""Time of a job of the demo's adaptation rounds: at most this part of torch's."""
+"""Most time of a job of the demo's adaptation rounds, in units of torch's."""
 _SECONDS = 0.02
 """CPU time that is measured at once."""
 
@@ -190,21 +193,11 @@ def rounds(repeats: int) -> Sides:
     return alternately({side: _job(side) for side in _BOTH}, repeats)
 
 
-class _OneModel:
-    """The weights of every policy version: one untrained model, because time does not depend on weights."""
-
-    def __init__(self, model: torch.nn.Module) -> None:
-        self._model = model
-
-    def at(self, version: int) -> tuple[torch.nn.Module, str]:
-        return self._model, ""
-
-
 def _job(decoder: Decoder) -> Callable[[], None]:
     settings = load_run("demo", f"context.decoder={decoder}")
     problem, method = registry.of(settings), methods.of(settings)
     torch.manual_seed(0)
-    weights = _OneModel(method.build(problem.spec, settings).eval())
+    weights = RandomWeights(method.build(problem.spec, settings).eval())
     job: Job = method.ask(settings, next(phase for phase in method.phases(settings) if phase.stage == "adapt"))[0]
 
     def work() -> None:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from icrl_dist.chaos.disk import allocated
 from icrl_dist.config.run import ConfigError, Run, load_folder
-from icrl_dist.launch.train import without_auto
+from icrl_dist.launch.auto import without_auto
 
 SAME = ("dataset_digest", "weights_digest", "trajectories")
 """Fields of ``result.json`` that must be equal in every run."""

@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +27,12 @@ from icrl_dist.launch import learner_process, run_folder, watching
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.launch.run_folder import FolderTransaction
-from icrl_dist.models.kernel import best_decoder, missing_kernel, require_kernel
 from icrl_dist.storage import layout
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.storage.fork import fork
 from icrl_dist.stream import endpoints, security
 from icrl_dist.stream.link import StreamKeys
 from icrl_dist.telemetry import provenance
-from icrl_dist.training.reproducible import best_fit, require_kernel_fit
 
 FINISH_S = 10.0
 """Seconds within which the learner's last event arrives after its workers have ended."""
@@ -53,36 +50,6 @@ class TrainInterrupted(Exception):  # noqa: N818
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (str(self), self.resumable)
-
-
-def without_auto(run: Run, folder: Path, resume: bool, note: Callable[[str], None] = lambda text: None) -> Run:
-    """The run with its decoder and its way to fit named, where they were ``auto``: the best here, or those of the run there.
-
-    ``note`` gets a line if a run begins with torch because the compiled decoder cannot be used here.
-    Raises ConfigError for a kernel where this installation has none, and for a fit that is impossible here; not for a run
-    with other settings than the one there, because ``prepare`` refuses it and names them.
-    """
-    before = load_folder(folder) if resume and (folder / "run.toml").is_file() else None
-    there, changed = before or run, before is not None and differences(before, run)
-    decoder, fits, missing = run.context.decoder, run.learner.reproducible, ""
-    decoder = there.context.decoder if decoder == "auto" else decoder
-    if decoder == "auto":
-        decoder, missing = best_decoder(run.model), missing_kernel(run.model)
-    run = replace(run, context=replace(run.context, decoder=decoder))
-    fits = there.learner.reproducible if fits == "auto" else fits
-    fits = best_fit(run) if fits == "auto" else fits
-    run = replace(run, learner=replace(run.learner, reproducible=fits))
-    if changed:
-        return run
-    if decoder == "kernel":
-        require_kernel()
-    require_kernel_fit(run)
-    if missing:
-        note(
-            f"compiled decoder: {missing}. This run uses torch, which is slower, and its digests are equal only on machines "
-            "of one kind"
-        )
-    return run
 
 
 def prepare(

@@ -15,6 +15,7 @@ from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, override, run_folder_of
 from icrl_dist.console.display import ReportEvent, Show, reporting
 from icrl_dist.console.signals import interruptible
+from icrl_dist.launch import auto
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
@@ -105,7 +106,7 @@ def train(
     transaction: FolderTransaction | None = None
     try:
         with interruptible(), reporting(progress) as show, contextlib.ExitStack() as locks:
-            settings = launch.without_auto(settings, folder, going_on, lambda text: show({"event": "note", "text": text}))
+            settings = auto.without_auto(settings, folder, going_on, lambda text: show({"event": "note", "text": text}))
             transaction = launch.prepare(settings, folder, resume, overwrite, parent, resume_or_begin)
             started = time.monotonic()
             if warning := without_locks(folder):

@@ -1,4 +1,4 @@
-"""The libraries that are compiled from C files of this folder when the package is installed, if there is a C compiler."""
+"""The libraries of the kernels: C files of this folder, compiled when the package is installed, if there is a C compiler."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+LANES = 16
+"""``LANES`` of lanes.h: rows of the kernels are padded with zeros to a multiple of so many numbers."""
+WIDEST = 128
+"""The widest model for which the kernels are faster than torch in every case (docs/results/engine.md)."""
 _BUILD = "install a C compiler and run `make kernel`, or install a wheel that was built with one"
 _KINDS = {"x86_64": ("avx2", "avx512"), "aarch64": ("neon",), "arm64": ("neon",)}
 """The instruction sets that the C files name, by machine, each including the ones before it."""
@@ -27,7 +31,7 @@ class Unusable(NamedTuple):
 
 @functools.cache
 def library(name: str) -> ctypes.CDLL | Unusable:
-    """A compiled kernel, ``decoder`` or ``training``."""
+    """The library of a kernel, ``decoder`` or ``training``, or why it cannot be used here."""
     found = importlib.util.find_spec(f"{__package__}._{name}_kernel")
     if found is None or found.origin is None:
         return Unusable("not compiled", _BUILD)
@@ -50,8 +54,8 @@ def _load(file: Path, sources: list[Path]) -> ctypes.CDLL | Unusable:
 def _is_whole(file: Path, sources: list[Path]) -> bool:
     """Whether a library holds its own sources, as they are now.
 
-    A compiler for Linux puts them after everything that is loaded.  So a file that was cut is found too: the end of
-    the process, by a bus error, would be the result of loading it.
+    A compiler for Linux puts them after everything that is loaded.  So a file that was cut is found too; loading it would
+    end the process by a bus error.
     """
     content = file.read_bytes()
     return sys.platform != "linux" or all(source.read_bytes() in content for source in sources)

@@ -17,7 +17,7 @@ KEEP_SOURCE
 #define BLOCKS 8               /* per chunk */
 #define CHUNK (LANES * BLOCKS) /* tokens per chunk */
 #define ROWS 16                /* tokens that pass through the layers together */
-#define LEAD 1024             /* rows of 16 numbers that are brought nearer ahead of their use: 64 KiB */
+#define LEAD 1024              /* rows of 16 numbers that are brought nearer ahead of their use: 64 KiB */
 #define QUERIES 4              /* queries of one context that read a chunk together */
 
 typedef struct {
@@ -29,7 +29,7 @@ typedef struct {
     const Layer *layer;
     Linear norm;
     float **chunks; /* chunk c of layer l at [c * layers + l]: (batch, BLOCKS, width, LANES) */
-    float *work;    /* icrl_work() numbers */
+    float *work;      /* icrl_work() numbers */
     int32_t far_away; /* whether the chunks are so large that they do not stay in the second-level cache */
 } Decoder;
 
@@ -143,7 +143,7 @@ INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const 
 }
 
 /* Attention of up to QUERIES queries of context b in layer l, query g over its first visible[g] tokens.
-   What the tokens are weighted to goes to to[g], (width). */
+   The weighted mean of the tokens goes to to[g], (width). */
 #define attend NAMED(attend, KIND)
 INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float *const *to, const long *visible, int count,
                    float *mixed, Ahead *ahead) {
@@ -211,7 +211,8 @@ INLINE void put(const Decoder *m, int l, long b, long t, const float *token) {
    new ones.  The final states of the tokens `first`, `first` + 1, ... of every context go to `states`
    (batch, length - first, width).  The new tokens stay in the chunks at the places from `past` on, which the
    caller has reserved; if `alone`, only the last one stays. */
-TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *states, long past, long length, long first, int alone) {
+TARGET void NAMED(icrl_run, KIND)(const Decoder *m, const float *x, float *states, long past, long length, long first,
+                                  int alone) {
     int width = m->width, heads = m->heads, wide = padded(width), q_wide = padded(heads * width), up_wide = padded(4 * width);
     float *h = m->work, *normed = h + ROWS * wide, *q = normed + ROWS * wide, *attended = q + ROWS * q_wide;
     float *up = attended + ROWS * q_wide, *mixed = up + ROWS * up_wide;

@@ -41,7 +41,7 @@ class Features:
 
 
 def sine_and_cosine(x: Float32[np.ndarray, "*N"]) -> tuple[Float32[np.ndarray, "*N"], Float32[np.ndarray, "*N"]]:
-    """Sine and cosine to the last place, for \\|x\\| up to 1e6; those of libraries differ between processors."""
+    """Sine and cosine to the last place, of numbers up to 1e6 in size.  Those of libraries differ between processors."""
     angle = np.asarray(x, np.float64)
     turns = np.rint(angle * (2 / math.pi))  # quarter turns
     rest = angle - turns * (math.pi / 2)

@@ -13,11 +13,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn import functional as F
 
-from icrl_dist.models.sampling import sample, sample_gaussian
+from icrl_dist.models.sampling import FLOOR, sample, sample_gaussian
 from icrl_dist.types import Spec
-
-FLOOR = 0.05
-"""Smallest standard deviation of a Gaussian: without a floor, eq. (1) has no minimum where labels are certain."""
 
 
 class ActionHead(Protocol):

@@ -1,4 +1,4 @@
-"""The deployed trunk through a compiled kernel, ``decoder_kernel.c``, with numpy and without torch.
+"""The functions of the compiled decoder, ``decoder_kernel.c``, and where it decides in place of torch.
 
 Results are equal to those of ``models.decoder`` to 1e-5, and equal bit by bit on all processors that the
 kernel runs on.  It is built when the package is installed, if there is a C compiler.
@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import platform
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Self
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,37 +17,7 @@ from jaxtyping import Float32
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import Decoder, ModelConfig
 from icrl_dist.copies import CopiedWhole
-from icrl_dist.models.compiled import Unusable
-from icrl_dist.models.compiled import kinds as kinds
-from icrl_dist.models.compiled import library as library
-
-_LANES, _BLOCKS = 16, 8
-_CHUNK = _LANES * _BLOCKS
-WIDEST = 128
-"""The widest model for which the kernel is faster than torch in every case (docs/results/engine.md)."""
-_NEAR = 1 << 19
-"""Bytes of contexts that are taken to stay in the processor's second-level cache from one decision to the next."""
-
-_Pair = ctypes.c_void_p * 2
-
-
-class _Layer(ctypes.Structure):
-    """``Layer`` of decoder_kernel.c."""
-
-    _fields_ = [(name, _Pair) for name in ("norm_attention", "query", "out", "norm_mlp", "up", "down")]
-
-
-class _Decoder(ctypes.Structure):
-    """``Decoder`` of decoder_kernel.c."""
-
-    _fields_ = [
-        *((name, ctypes.c_int32) for name in ("width", "heads", "layers", "batch")),
-        ("layer", ctypes.POINTER(_Layer)),
-        ("norm", _Pair),
-        ("chunks", ctypes.POINTER(ctypes.c_void_p)),
-        ("work", ctypes.c_void_p),
-        ("far_away", ctypes.c_int32),
-    ]
+from icrl_dist.models.compiled import LANES, WIDEST, Unusable, kinds, library
 
 
 def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
@@ -57,14 +26,14 @@ def best_decoder(model: ModelConfig) -> Literal["torch", "kernel"]:
 
 
 def missing_kernel(model: ModelConfig) -> str:
-    """Why ``auto`` means torch here for a model that the kernel is fast enough for, and the remedy; empty if it does not."""
+    """Why ``auto`` means torch here although the model is not too wide for the kernel, and the remedy; else empty."""
     return str(why) if isinstance(why := library("decoder"), Unusable) and model.width <= WIDEST else ""
 
 
 def decoder_here(decoder: Decoder, model: ModelConfig) -> Literal["torch", "kernel"]:
-    """What computes decisions here for ``context.decoder``: torch, where the kernel is named and there is none.
+    """What ``context.decoder`` means here.  If it is ``kernel`` and there is none here, it means torch.
 
-    That changes outputs by 1e-5.  Decisions that enter a run's digests need ``require_kernel``.
+    Then outputs differ by 1e-5.  Decisions that enter a run's digests need ``require_kernel``.
     """
     return best_decoder(model) if decoder == "auto" else decoder if kinds() else "torch"
 
@@ -79,7 +48,7 @@ def require_kernel() -> None:
 
 
 class Kernel(CopiedWhole):
-    """The functions of the kernel for one instruction set; None: the widest of this processor.
+    """The functions of the kernel for one instruction set, ``kind``; None: the widest that this processor has.
 
     Raises RuntimeError if the kernel was not built or cannot be used here.
     """
@@ -92,19 +61,20 @@ class Kernel(CopiedWhole):
             raise RuntimeError(f"kernel {kind}: this processor has {', '.join(kinds())}")
         self.kind = kind or kinds()[-1]
         pointer, number = ctypes.c_void_p, ctypes.c_int
-        self.run = self._function("run", pointer, pointer, pointer, *[ctypes.c_long] * 3, number)
-        self._linear = self._function("linear", *[pointer] * 4, *[number] * 3)
-        self._softmax = self._function("softmax", pointer, *[number] * 3)
+
+        def function(name: str, *arguments: type) -> Callable[..., None]:
+            found = getattr(loaded, f"icrl_{name}_{self.kind}")
+            found.argtypes, found.restype = arguments, None
+            return found
+
+        self.run = function("run", pointer, pointer, pointer, *[ctypes.c_long] * 3, number)
+        self._linear = function("linear", *[pointer] * 4, *[number] * 3)
+        self._softmax = function("softmax", pointer, *[number] * 3)
         loaded.icrl_work.restype = ctypes.c_long
         self.work_size = loaded.icrl_work
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _kernel, (self.kind,)
-
-    def _function(self, name: str, *arguments: type) -> Callable[..., None]:
-        found = getattr(library("decoder"), f"icrl_{name}_{self.kind}")
-        found.argtypes, found.restype = arguments, None
-        return found
 
     def linear(
         self, x: Float32[np.ndarray, "R I"], weight: Float32[np.ndarray, "I C"], bias: Float32[np.ndarray, " C"]
@@ -145,191 +115,6 @@ def address(array: np.ndarray) -> int:
 def padded(array: np.ndarray) -> Float32[np.ndarray, "*N C"]:
     """The array with its last axis filled up with zeros to a multiple of 16."""
     used = array.shape[-1]
-    wide = np.zeros((*array.shape[:-1], used + -used % _LANES), np.float32)
+    wide = np.zeros((*array.shape[:-1], used + -used % LANES), np.float32)
     wide[..., :used] = array
     return wide
-
-
-class KernelDecoder(CopiedWhole):
-    """``models.decoder.Decoder`` through the kernel: B growing contexts, float32, one thread.
-
-    ``weights``: those of ``models.gpt.GPT``, by their names there.  They are copied.  Calls from several threads are
-    done one after the other.  All raise ValueError for tokens of another shape than their own.
-    """
-
-    def __init__(self, weights: Mapping[str, np.ndarray], heads: int, batch: int, kernel: Kernel) -> None:
-        """``weights`` must have the shapes of ``models.stored``.  Raises ValueError for ``batch`` below 1."""
-        if batch < 1:
-            raise ValueError(f"batch {batch}: expected at least 1")
-        self._made_of = weights, heads, batch, kernel
-        self._batch, self._width = batch, len(weights["norm.weight"])
-        self._kernel = kernel
-        self._one_call = threading.Lock()
-        self._kept: list[np.ndarray] = []
-        """What the kernel has pointers to."""
-        self._layers = len({name.split(".")[1] for name in weights if name.startswith("blocks.")})
-        layers = (_Layer * self._layers)()
-        for number, layer in enumerate(layers):
-            self._fill(layer, {n.split(".", 2)[2]: w for n, w in weights.items() if n.startswith(f"blocks.{number}.")}, heads)
-        work = np.zeros(kernel.work_size(self._width, heads), np.float32)
-        self._kept.append(work)
-        norm = self._pair(weights["norm.weight"], weights["norm.bias"])
-        self._decoder = _Decoder(self._width, heads, self._layers, batch, layers, norm, None, address(work))
-        self._address = ctypes.addressof(self._decoder)
-        self._chunks: list[np.ndarray] = []
-        self.length = 0
-        """Tokens in each context."""
-        self._written = 0
-        """Places from here on hold zeros."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        with self._one_call:
-            return _decoder, (*self._made_of, [chunk.copy() for chunk in self._chunks], self.length, self._written)
-
-    def _fill(self, layer: _Layer, block: Mapping[str, np.ndarray], heads: int) -> None:
-        """The weights of one block, with W_k multiplied into the queries and W_v into the output projection.
-
-        ``models.decoder._Layer`` does the same with torch and says why.
-        """
-        d = self._width
-        e = d // heads
-        wq, wk, wv = block["qkv.weight"].reshape(3, heads, e, d)
-        bq, _, bv = block["qkv.bias"].reshape(3, heads, e)
-        out = block["out.weight"].reshape(d, heads, e).transpose(1, 2, 0)
-        # A query's matrix and bias, then both scaled: (heads, D + 1, D).
-        query = np.stack([self._product(np.vstack([wq[h].T, bq[h]]), wk[h]) for h in range(heads)]) * np.float32(e**-0.5)
-        mixed = np.concatenate([self._product(wv[h].T, out[h]) for h in range(heads)])
-        passed = self._product(bv.reshape(1, d), out.reshape(d, d))[0]
-        layer.norm_attention = self._pair(block["norm_attention.weight"], block["norm_attention.bias"])
-        layer.query = self._pair(query[:, :-1].transpose(1, 0, 2).reshape(d, heads * d), query[:, -1].reshape(-1))
-        layer.out = self._pair(mixed, block["out.bias"] + passed)
-        layer.norm_mlp = self._pair(block["norm_feed.weight"], block["norm_feed.bias"])
-        layer.up = self._pair(block["feed.0.weight"].T, block["feed.0.bias"])
-        layer.down = self._pair(block["feed.2.weight"].T, block["feed.2.bias"])
-
-    def _product(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """``a @ b``, with sums in the kernel's order."""
-        wide = padded(b)
-        return self._kernel.linear(a, wide, np.zeros(wide.shape[1], np.float32))[:, : b.shape[1]]
-
-    def _pair(self, weight: np.ndarray, bias: np.ndarray) -> ctypes.Array[ctypes.c_void_p]:
-        pair = [padded(weight), padded(bias)]
-        self._kept += pair
-        return _Pair(*map(address, pair))
-
-    def clear(self) -> None:
-        """Empty every context."""
-        with self._one_call:
-            self.length = 0
-            self._reserve(0)
-
-    def _reserve(self, end: int) -> None:
-        """Make room for tokens at the places before ``end``; those from there on become zeros.
-
-        They are read together with the others, with a weight of 0, and 0 times nan is nan.
-        """
-        if len(self._chunks) * _CHUNK < end:
-            while len(self._chunks) * _CHUNK < end:
-                self._chunks.append(np.zeros((self._layers, self._batch, _BLOCKS, self._width, _LANES), np.float32))
-            self._point_to_chunks()
-        # Usually as many places are written again as before, and then nothing is to be done.
-        for number in range(end // _CHUNK, -(-self._written // _CHUNK)) if end < self._written else ():
-            chunk, first, last = self._chunks[number], max(0, end - number * _CHUNK), self._written - number * _CHUNK
-            for block in range(first // _LANES, -(-min(last, _CHUNK) // _LANES)):
-                chunk[:, :, block, :, max(0, first - block * _LANES) :] = 0
-        self._written = end
-
-    def _point_to_chunks(self) -> None:
-        self._pointers = self._chunk_pointers(0)
-        self._decoder.chunks = self._pointers
-        self._decoder.far_away = sum(chunk.nbytes for chunk in self._chunks) > _NEAR
-
-    def filled(self, chunks: Sequence[np.ndarray], length: int, written: int) -> Self:
-        """This decoder with the contexts of another one, which it now owns."""
-        self._chunks, self.length, self._written = list(chunks), length, written
-        self._point_to_chunks()
-        return self
-
-    def _chunk_pointers(self, row: int) -> ctypes.Array[ctypes.c_void_p]:
-        """Pointers to the chunks, from context ``row`` on."""
-        places = [
-            address(chunk) + layer * chunk.strides[0] + row * chunk.strides[1]
-            for chunk in self._chunks
-            for layer in range(self._layers)
-        ]
-        return (ctypes.c_void_p * len(places))(*places)
-
-    def append(self, x: Float32[np.ndarray, "B T D"]) -> None:
-        """Append embedded tokens to the contexts; each token sees its whole context up to itself."""
-        self._pass(x, x.shape[1], x.shape[1])
-
-    def query(self, x: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B D"]:
-        """Final states of one query token per context, which sees its context and itself."""
-        return self._pass(x[:, None], 0, 0)
-
-    def window(
-        self, x: Float32[np.ndarray, "B L D"], arrived: Float32[np.ndarray, "B D"] | None = None
-    ) -> Float32[np.ndarray, "B D"]:
-        """Final state of the last token of one window per context.
-
-        Each token of the window sees its context, the tokens before it in the window, and itself.  A
-        token ``arrived`` joins the context first.
-        """
-        x = x if arrived is None else np.concatenate([arrived[:, None], x], axis=1)
-        return self._pass(x, x.shape[1] - 1, int(arrived is not None))
-
-    def _pass(self, x: Float32[np.ndarray, "B T D"], first: int, joining: int) -> Float32[np.ndarray, "B D"]:
-        """Pass T tokens per context through the layers; the final states of those from ``first`` on, one or none.
-
-        The first ``joining`` tokens join the context.
-        """
-        x = self._tokens(x, self._batch)
-        states = np.empty((self._batch, self._width), np.float32)
-        with self._one_call:
-            past, end = self.length, self.length + x.shape[1]
-            self._reserve(end)
-            self._kernel.run(self._address, address(x), address(states), past, x.shape[1], first, 0)
-            self.length = past + joining
-        return states
-
-    def _tokens(self, x: np.ndarray, batch: int) -> np.ndarray:
-        """Tokens as the kernel reads them, (batch, T, D)."""
-        x = np.ascontiguousarray(x, np.float32)
-        if x.ndim != 3 or x.shape[::2] != (batch, self._width):
-            raise ValueError(f"tokens have the shape {x.shape}: expected ({batch}, T, {self._width})")
-        return x
-
-    def query_row(
-        self, row: int, x: Float32[np.ndarray, "Q D"], appended: Float32[np.ndarray, "E D"]
-    ) -> Float32[np.ndarray, "Q D"]:
-        """Final states of Q query tokens, each of which sees the whole of context ``row`` and itself.
-
-        They also see the ``appended`` tokens, as if these had joined the context.  The decoder does not change.
-        """
-        if not 0 <= row < self._batch:
-            raise ValueError(f"row {row}: expected one of 0..{self._batch - 1}")
-        x, appended = self._tokens(x[None], 1), self._tokens(appended[None], 1)
-        new, queries = appended.shape[1], x.shape[1]
-        states = np.empty((queries, self._width), np.float32)
-        with self._one_call:
-            past = self.length
-            self._reserve(past + new + 1)
-            one, chunks = _Decoder.from_buffer_copy(self._decoder), self._chunk_pointers(row)
-            one.batch, one.chunks = 1, chunks
-            at = ctypes.addressof(one)
-            self._kernel.run(at, address(appended), address(states), past, new, new, 0)
-            self._kernel.run(at, address(x), address(states), past + new, queries, 0, 1)
-        return states
-
-
-def _decoder(
-    weights: Mapping[str, np.ndarray],
-    heads: int,
-    batch: int,
-    kernel: Kernel,
-    chunks: Sequence[np.ndarray],
-    length: int,
-    written: int,
-) -> KernelDecoder:
-    """A copy: see ``KernelDecoder.__reduce__``."""
-    return KernelDecoder(weights, heads, batch, kernel).filled(chunks, length, written)

@@ -1,4 +1,4 @@
-"""The deployed transformer through the compiled kernel, without torch: ``models.dpt.DeployedTransformer`` on numpy."""
+"""The deployed transformer by the compiled decoder: ``models.dpt.DeployedTransformer`` on numpy, without torch."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.deployed import Columns, WindowColumns
 from icrl_dist.models.features import Features
-from icrl_dist.models.kernel import Kernel, KernelDecoder, padded
-from icrl_dist.models.sampling import sample, sample_gaussian
+from icrl_dist.models.kernel import Kernel, padded
+from icrl_dist.models.kernel_decoder import KernelDecoder
+from icrl_dist.models.sampling import FLOOR, sample, sample_gaussian
 from icrl_dist.models.stored import check_shapes, shapes
 from icrl_dist.types import Spec
-
-FLOOR = 0.05
-"""Smallest standard deviation of a Gaussian, as in ``models.heads``."""
 
 
 class KernelTransformer(CopiedWhole):
@@ -37,7 +35,7 @@ class KernelTransformer(CopiedWhole):
         """
         check_shapes(shapes(spec, config), weights)
         self._spec, self._kernel = spec, kernel or Kernel()
-        trunk = {name.removeprefix("trunk."): np.array(value) for name, value in weights.items() if name.startswith("trunk.")}
+        trunk = {name.removeprefix("trunk."): value for name, value in weights.items() if name.startswith("trunk.")}
         self._decoder = KernelDecoder(trunk, config.heads, batch, self._kernel)
         self._features = Features(spec, config.fourier)
         self._linear = {

@@ -216,7 +216,7 @@ INLINE void tile(float *to, int columns, const float *x, int stride, const float
    what is in `to` (rows, columns) if `more`. */
 #define linear NAMED(linear, KIND)
 INLINE void linear(float *to, int columns, const float *x, int stride, const Linear layer, int inputs, int rows, int more) {
-    int r = 0;
+    long r = 0;
 #define TILES(rows_, vectors)                                                                                                  \
     for (; c + vectors * LANES <= columns; c += vectors * LANES)                                                               \
     tile(to + r * columns + c, columns, x + r * stride, stride, layer[0] + c, layer[1] + c, inputs, rows_, vectors, more)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
+FLOOR = 0.05
+"""Smallest standard deviation of a Gaussian: without a floor, eq. (1) has no minimum where labels are certain."""
+
 
 def sample(probabilities: Float[np.ndarray, "B A"], u: Float[np.ndarray, " B"]) -> Int64[np.ndarray, " B"]:
     """The action of each row that its uniform number u in [0, 1) selects."""

@@ -31,11 +31,13 @@ typedef struct {
     const int64_t *place;
     const float *weight; /* matrices (inputs, outputs) and biases */
     const float *back;   /* the same matrices as (outputs, inputs) */
-    const float *token, *query, *label; /* (B, tokens, token_inputs), (B, queries, query_inputs), (B, queries, padded actions) */
-    const int32_t *length;              /* (B): the first tokens, which are used */
-    const int32_t *prefix;              /* (B, queries): the tokens that each query sees */
-    const int32_t *own;                 /* (queries): the rows of its own window, up to itself */
-    float share;                        /* weight of the loss of one query */
+    const float *token;    /* (B, tokens, token_inputs) */
+    const float *query;    /* (B, queries, query_inputs) */
+    const float *label;    /* (B, queries, padded actions) */
+    const int32_t *length; /* (B): the first tokens, which are used */
+    const int32_t *prefix; /* (B, queries): the tokens that each query sees */
+    const int32_t *own;    /* (queries): the rows of its own window, up to itself */
+    float share;           /* weight of the loss of one query */
 } Fit;
 
 /* What the backward pass needs of a layer, by row: its input, the normalized input, q, k and v, what attention
@@ -45,8 +47,11 @@ typedef struct {
 } Saved;
 
 typedef struct {
-    int width, wide, heads, head, mixed, up, tokens, rows, span; /* wide, head, mixed, up: padded; span: of a row of weights */
-    int *limit, *own; /* tokens and rows of its own window that each row sees */
+    int width, heads, tokens, rows;
+    int wide, head, up; /* padded: the width, that of a head, that of the feed-forward layer */
+    long mixed;         /* heads * head */
+    long span;          /* attention weights of a row: of the tokens, then of its own window, both padded */
+    int *limit, *own;   /* tokens and rows of its own window that each row sees */
 } Shape;
 
 /* Numbers of scratch memory for a context of this many tokens. */
@@ -63,6 +68,9 @@ static inline float *take(float **work, long n) { return (*work += n) - n; }
 /* Rows and vectors of a tile of a product, so that its sums fit into registers. */
 #define TILE_ROWS (REGISTERS == 1 ? 8 : 6)
 #define TILE_VECTORS (REGISTERS == 1 ? 2 : 1)
+
+/* A function that is called, not made a part of its callers: it is large, and has several. */
+#define APART static __attribute__((noinline)) TARGET
 
 #define SOURCE "training_kernel.c"
 #include "lanes.h"
@@ -91,17 +99,17 @@ INLINE void product_tile(float *c, long cs, const float *a, long ar, long ai, co
    a (rows, inner), number (r, i) at a[r ar + i ai]; b (inner, columns), row i at b + i bs.  Every number of c
    is a sum over `inner` in order. */
 #define product NAMED(product, KIND)
-static __attribute__((noinline)) TARGET void product(float *c, long cs, const float *a, long ar, long ai, const float *b, long bs,
-                                                     long inner, const float *start, long ss, long rows, long columns) {
-#define ROWS_OF(rows_, vectors)                                                                                                  \
+APART void product(float *c, long cs, const float *a, long ar, long ai, const float *b, long bs, long inner, const float *start,
+                   long ss, long rows, long columns) {
+#define ROWS_OF(rows_, vectors)                                                                                                \
     for (; r + rows_ <= rows; r += rows_)                                                                                      \
     product_tile(c + r * cs + k, cs, a + r * ar, ar, ai, b + k, bs, inner, start ? start + r * ss + k : 0, ss, rows_, vectors)
 #define COLUMNS(vectors)                                                                                                       \
     for (; k + vectors * LANES <= columns; k += vectors * LANES) {                                                             \
         long r = 0;                                                                                                            \
-        ROWS_OF(TILE_ROWS, vectors);                                                                                             \
-        ROWS_OF(4, vectors);                                                                                                     \
-        ROWS_OF(1, vectors);                                                                                                     \
+        ROWS_OF(TILE_ROWS, vectors);                                                                                           \
+        ROWS_OF(4, vectors);                                                                                                   \
+        ROWS_OF(1, vectors);                                                                                                   \
     }
     long k = 0;
     COLUMNS(TILE_VECTORS)
@@ -112,7 +120,7 @@ static __attribute__((noinline)) TARGET void product(float *c, long cs, const fl
 
 /* The first `columns` numbers of each of `rows` rows as columns: to (columns, stride). */
 #define transpose NAMED(transpose, KIND)
-static __attribute__((noinline)) TARGET void transpose(float *to, long stride, const float *x, long xs, long rows, long columns) {
+APART void transpose(float *to, long stride, const float *x, long xs, long rows, long columns) {
     for (long c = 0; c < columns; c++) {
         for (long r = 0; r < rows; r++) to[c * stride + r] = x[r * xs + c];
         for (long r = rows; r < stride; r++) to[c * stride + r] = 0.0f;
@@ -147,12 +155,13 @@ INLINE void add_scaled(float *to, float factor, const float *x, int n) {
     for (int i = 0; i < n; i += LANES) store(to + i, fma(all(factor), load(x + i), load(to + i)));
 }
 
-/* The natural logarithm of x > 0, to 2 units in the last place. */
+/* The natural logarithm of x > 0, to 2 units in the last place; infinity and nan as they are. */
 #define logarithm NAMED(logarithm, KIND)
 INLINE V logarithm(V x) {
     static const float coefficient[] = {-1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f, 1.4249322787e-1f,
                                         -1.6668057665e-1f, 2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f};
-    V power, p = all(7.0376836292e-2f);
+    V power, p = all(7.0376836292e-2f), given = x;
+    M finite = greater(all(__builtin_inff()), x);
     EACH(i) { /* x = 2^power times a number from sqrt(1/2) to sqrt(2) */
         B bits = (B)x.r[i], whole = (bits - 0x3f3504f3) >> 23;
         power.r[i] = __builtin_convertvector(whole, R);
@@ -163,7 +172,7 @@ INLINE V logarithm(V x) {
     UNROLL for (int i = 0; i < 8; i++) p = fma(p, x, all(coefficient[i]));
     p = fma(power, all(-2.12194440e-4f), mul(mul(p, x), squared));
     p = fma(squared, all(-0.5f), p);
-    return fma(power, all(0.693359375f), add(x, p));
+    return choose(finite, fma(power, all(0.693359375f), add(x, p)), given);
 }
 
 /* The derivative of the GELU, to 5e-6: like `gelu`, 1/2 plus x times a polynomial in x^2. */
@@ -179,7 +188,8 @@ INLINE V gelu_slope(V x) {
 }
 
 /* dx += the gradient of the input x of a layer normalization, given that of its output, dy; the gradients of its
-   weight and bias are added to theirs. */
+   weight and bias are added to theirs.  All are nan if the variance overflows: `layer_norm` then gives zeros, and a fit
+   would go on without these numbers. */
 #define layer_norm_back NAMED(layer_norm_back, KIND)
 INLINE void layer_norm_back(float *dx, const float *dy, const float *x, const float *weight, float *d_weight, float *d_bias,
                             int width) {
@@ -190,7 +200,8 @@ INLINE void layer_norm_back(float *dx, const float *dy, const float *x, const fl
         V d = choose(first_lanes(width - i), sub(load(x + i), mean), all(0.0f));
         squares = fma(d, d, squares);
     }
-    V scale = all(1.0f / __builtin_sqrtf(sum(squares) / (float)width + 1e-5f));
+    float variance = sum(squares) / (float)width;
+    V scale = all(1.0f / __builtin_sqrtf(variance - variance + variance + 1e-5f));
     for (int i = 0; i < width; i += LANES) {
         V normed = mul(sub(load(x + i), mean), scale), d = load(dy + i), weighted = mul(d, load(weight + i));
         store(d_weight + i, fma(d, normed, load(d_weight + i)));
@@ -215,7 +226,7 @@ static TARGET void weigh(float *p, const Shape *s, int first, int rows, int colu
     product(p, s->span, q, stride, 1, across, padded(s->tokens), s->head, 0, 0, rows, columns);
     for (int r = 0; r < rows; r++) {
         int limit = s->limit[first + r], own = s->own[first + r], end = columns + padded(own);
-        float *row = p + (long)r * s->span, lanes[LANES];
+        float *row = p + r * s->span, lanes[LANES];
         for (int j = 0; j < own; j++) row[columns + j] = dot(q + r * stride, k + (first + r - own + 1 + j) * stride, s->head);
         for (int j = own; j < end - columns; j++) row[columns + j] = 0.0f;
 #define SEEN(c) first_lanes((c) < columns ? limit - (c) : own + columns - (c))
@@ -254,7 +265,7 @@ INLINE int block_rows(const Shape *s, int first) {
 #define attention NAMED(attention, KIND)
 static TARGET void attention(float *mixed, const float *qkv, const Shape *s, int from, float *work) {
     long stride = 3 * s->mixed;
-    float *p = work, *across = p + (long)BLOCK * s->span;
+    float *p = work, *across = p + BLOCK * s->span;
     for (int h = 0; h < s->heads; h++) {
         const float *q = qkv + h * s->head, *k = q + s->mixed, *v = k + s->mixed;
         float *to = mixed + h * s->head;
@@ -264,10 +275,10 @@ static TARGET void attention(float *mixed, const float *qkv, const Shape *s, int
             int most = most_seen(s, first, rows), columns = padded(most);
             weigh(p, s, first, rows, columns, q + first * stride, k, across);
             product(to + first * s->mixed, s->mixed, p, s->span, 1, v, stride, most, 0, 0, rows, s->head);
-            for (int r = first; r < first + rows; r++)
-                for (int j = 0; j < s->own[r]; j++)
-                    add_scaled(to + r * s->mixed, p[(long)(r - first) * s->span + columns + j], v + (r - s->own[r] + 1 + j) * stride,
-                               s->head);
+            for (int r = 0; r < rows; r++)
+                for (int own = s->own[first + r], j = 0; j < own; j++)
+                    add_scaled(to + (first + r) * s->mixed, p[r * s->span + columns + j],
+                               v + (first + r - own + 1 + j) * stride, s->head);
         }
     }
 }
@@ -276,7 +287,8 @@ static TARGET void attention(float *mixed, const float *qkv, const Shape *s, int
 #define attention_back NAMED(attention_back, KIND)
 static TARGET void attention_back(float *d, const float *d_mixed, const float *qkv, const Shape *s, int from, float *work) {
     long stride = 3 * s->mixed, span = s->span;
-    float *p = work, *dp = p + BLOCK * span, *across = dp + BLOCK * span, *v_across = across + (long)s->head * padded(s->tokens);
+    float *p = work, *dp = p + BLOCK * span, *across = dp + BLOCK * span;
+    float *v_across = across + (long)s->head * padded(s->tokens);
     memset(d, 0, (long)s->rows * stride * sizeof(float));
     for (int h = 0; h < s->heads; h++) {
         const float *q = qkv + h * s->head, *k = q + s->mixed, *v = k + s->mixed, *given = d_mixed + h * s->head;
@@ -292,8 +304,9 @@ static TARGET void attention_back(float *d, const float *d_mixed, const float *q
             for (int r = 0; r < rows; r++) {
                 int own = s->own[first + r], end = columns + padded(own);
                 float *row = p + r * span, *d_row = dp + r * span;
-                for (int j = 0; j < end - columns; j++)
-                    d_row[columns + j] = j < own ? dot(block + r * s->mixed, v + (first + r - own + 1 + j) * stride, s->head) : 0.0f;
+                for (int j = 0; j < own; j++)
+                    d_row[columns + j] = dot(block + r * s->mixed, v + (first + r - own + 1 + j) * stride, s->head);
+                for (int j = own; j < end - columns; j++) d_row[columns + j] = 0.0f;
                 V mean = all(dot(row, d_row, end));
                 for (int c = 0; c < end; c += LANES) store(d_row + c, mul(load(row + c), sub(load(d_row + c), mean)));
             }
@@ -378,15 +391,18 @@ TARGET float NAMED(icrl_fit, KIND)(const Fit *m, long b, float *gradient, float 
 #define BACK(i) (back + m->place[i])
 #define G(i) (gradient + m->place[i])
 #define NORM_OF(i) ((const Linear){W(i), W(i + 1)})
+#define NORM_BACK(i, x, r) \
+    layer_norm_back(d + r * D, d_normed + r * D, x + r * D, W(at + i), G(at + i), G(at + i + 1), s.width)
     const float *token = m->token + b * m->tokens * m->token_inputs, *query = m->query + b * m->queries * m->query_inputs;
     product(saved->x, D, token, m->token_inputs, 1, W(TOKEN), D, m->token_inputs, 0, 0, T, D);
     product(saved->x + T * D, D, query, m->query_inputs, 1, W(QUERY), D, m->query_inputs, 0, 0, m->queries, D);
     for (int l = 0; l < m->layers; l++) {
         Saved now = saved[l];
         int at = LAYERS + l * PER_LAYER, from = l == m->layers - 1 ? T : 0, left = rows - from;
+        const float *qkv = W(at + QKV), *bias = W(at + QKV_BIAS);
         for (int r = 0; r < rows; r++) layer_norm(now.normed + r * D, now.x + r * D, NORM_OF(at + NORM_1), s.width);
-        product(now.qkv + from * stride, stride, now.normed + from * D, D, 1, W(at + QKV), stride, D, W(at + QKV_BIAS), 0, left, H);
-        product(now.qkv + H, stride, now.normed, D, 1, W(at + QKV) + H, stride, D, W(at + QKV_BIAS) + H, 0, rows, 2 * H);
+        product(now.qkv + from * stride, stride, now.normed + from * D, D, 1, qkv, stride, D, bias, 0, left, H);
+        product(now.qkv + H, stride, now.normed, D, 1, qkv + H, stride, D, bias + H, 0, rows, 2 * H);
         attention(now.mixed, now.qkv, &s, from, work);
         for (int r = from; r < rows; r++) add_to(now.middle + r * D, now.x + r * D, W(at + OUT_BIAS), D);
         product(now.middle + from * D, D, now.mixed + from * H, H, 1, W(at + OUT), D, H, now.middle + from * D, D, left, D);
@@ -401,8 +417,9 @@ TARGET float NAMED(icrl_fit, KIND)(const Fit *m, long b, float *gradient, float 
     float *last = saved[m->layers].x + T * D, *normed = saved[m->layers].normed, loss = 0.0f;
     for (int r = 0; r < m->queries; r++) layer_norm(normed + r * D, last + r * D, NORM_OF(NORM), s.width);
     product(y, outputs, normed, D, 1, W(HEAD), outputs, D, W(HEAD_BIAS), 0, m->queries, outputs);
+    const float *label = m->label + b * m->queries * padded(m->actions);
     for (int r = 0; r < m->queries; r++)
-        loss += query_loss(y + r * outputs, m->label + (b * m->queries + r) * padded(m->actions), m->actions, m->gaussian, m->share);
+        loss += query_loss(y + r * outputs, label + r * padded(m->actions), m->actions, m->gaussian, m->share);
 
     product(G(HEAD), outputs, normed, 1, D, y, outputs, m->queries, G(HEAD), outputs, D, outputs);
     add_rows(G(HEAD_BIAS), y, outputs, m->queries, outputs);
@@ -425,18 +442,17 @@ TARGET float NAMED(icrl_fit, KIND)(const Fit *m, long b, float *gradient, float 
         product(G(at + UP), U, now.normed_middle + from * D, 1, D, d_up + from * U, U, left, G(at + UP), U, D, U);
         add_rows(G(at + UP_BIAS), d_up + from * U, U, left, U);
         product(d_normed + from * D, D, d_up + from * U, U, 1, BACK(at + UP), D, U, 0, 0, left, D);
-        for (int r = from; r < rows; r++)
-            layer_norm_back(d + r * D, d_normed + r * D, now.middle + r * D, W(at + NORM_2), G(at + NORM_2), G(at + NORM_2_BIAS), s.width);
+        for (int r = from; r < rows; r++) NORM_BACK(NORM_2, now.middle, r);
         product(G(at + OUT), D, now.mixed + from * H, 1, H, d_from, D, left, G(at + OUT), D, H, D);
         add_rows(G(at + OUT_BIAS), d_from, D, left, D);
         product(d_mixed + from * H, H, d_from, D, 1, BACK(at + OUT), H, D, 0, 0, left, H);
         attention_back(d_qkv, d_mixed, now.qkv, &s, from, work);
-        product(G(at + QKV), stride, now.normed + from * D, 1, D, d_qkv + from * stride, stride, left, G(at + QKV), stride, D, H);
-        product(G(at + QKV) + H, stride, now.normed, 1, D, d_qkv + H, stride, rows, G(at + QKV) + H, stride, D, 2 * H);
+        float *g = G(at + QKV);
+        product(g, stride, now.normed + from * D, 1, D, d_qkv + from * stride, stride, left, g, stride, D, H);
+        product(g + H, stride, now.normed, 1, D, d_qkv + H, stride, rows, g + H, stride, D, 2 * H);
         add_rows(G(at + QKV_BIAS), d_qkv, stride, rows, stride);
         product(d_normed, D, d_qkv, stride, 1, BACK(at + QKV), D, stride, 0, 0, rows, D);
-        for (int r = 0; r < rows; r++)
-            layer_norm_back(d + r * D, d_normed + r * D, now.x + r * D, W(at + NORM_1), G(at + NORM_1), G(at + NORM_1_BIAS), s.width);
+        for (int r = 0; r < rows; r++) NORM_BACK(NORM_1, now.x, r);
     }
     product(G(TOKEN), D, token, 1, m->token_inputs, d, D, T, G(TOKEN), D, m->token_inputs, D);
     product(G(QUERY), D, query, 1, m->query_inputs, d + T * D, D, m->queries, G(QUERY), D, m->query_inputs, D);

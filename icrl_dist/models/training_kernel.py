@@ -16,11 +16,10 @@ from jaxtyping import Float32, Int32, Int64
 
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.copies import NotCopied
-from icrl_dist.models.compiled import Unusable, kinds, library
-from icrl_dist.models.kernel import address
+from icrl_dist.models.compiled import LANES, Unusable, kinds, library
+from icrl_dist.models.kernel import address, padded
 from icrl_dist.types import Spec
 
-_LANES = 16
 _LAYER = ("norm_attention", "qkv", "out", "norm_feed", "feed.0", "feed.2")
 """The parameters of a block, each a weight and a bias, in the order of training_kernel.c."""
 
@@ -71,6 +70,8 @@ class _Places:
             _spread(np.vstack([_with_bias(ids, name) for name in ("embed_query", *taken)]), 1, 1),
             *(_spread(ids[f"trunk.norm.{part}"], 0, 1) for part in ("weight", "bias")),
         ]
+        self.token_inputs, self.query_inputs = len(columns[0]), (len(ids["embed_query.weight"].T) + 1, len(columns[1]))
+        """Numbers of a token; numbers of a query of a batch without and with windows."""
         parts = 1 if spec.discrete else 2  # means and deviations are padded apart
         columns += [_spread(_spread(ids["head.weight"].T, 0, 1), 1, parts), _spread(ids["head.bias"], 0, parts)]
         for layer in range(config.layers):
@@ -104,12 +105,12 @@ def _with_bias(ids: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 def _spread(ids: np.ndarray, axis: int, parts: int) -> np.ndarray:
     """The array with each of the equal parts of an axis filled up with -1 to a multiple of 16."""
     split = np.split(ids, parts, axis)
-    fill = [(0, 0)] * axis + [(0, -split[0].shape[axis] % _LANES)] + [(0, 0)] * (ids.ndim - axis - 1)
+    fill = [(0, 0)] * axis + [(0, -split[0].shape[axis] % LANES)] + [(0, 0)] * (ids.ndim - axis - 1)
     return np.concatenate([np.pad(part, fill, constant_values=-1) for part in split], axis)
 
 
 class TrainingKernel(NotCopied):
-    """The kernel for one model, for one instruction set; None: the widest of this processor.
+    """The kernel for one model and one instruction set, ``kind``; None: the widest that this processor has.
 
     Raises RuntimeError if the kernel was not built or cannot be used here.
     """
@@ -144,10 +145,6 @@ class TrainingKernel(NotCopied):
         self._weight[self._places.forward] = scaled
         self._back[self._places.back] = scaled
 
-    def problem(self, inputs: Inputs) -> Problem:
-        """The fit to these inputs."""
-        return Problem(self, inputs)
-
     def gradient(self, parts: Float32[np.ndarray, "G N"]) -> Float32[np.ndarray, " P"]:
         """The sum of gradients of the kernel, in order, as one number per parameter."""
         total = np.empty(parts.shape[1], np.float32)
@@ -158,7 +155,7 @@ class TrainingKernel(NotCopied):
 
     def norm(self, x: Float32[np.ndarray, " N"]) -> float:
         """The Euclidean norm."""
-        x = np.pad(x, (0, -len(x) % _LANES))
+        x = padded(x)
         return math.sqrt(self._squares(address(x), len(x)))
 
     def orthogonal(self, x: Float32[np.ndarray, "R C"], a: float, b: float, c: float) -> Float32[np.ndarray, "R C"]:
@@ -166,35 +163,46 @@ class TrainingKernel(NotCopied):
         wide = len(x) <= x.shape[1]
         used = x if wide else x.T
         rows, columns = used.shape
-        work = np.ascontiguousarray(np.pad(used, ((0, -rows % _LANES), (0, -columns % _LANES))), np.float32)
+        work = np.ascontiguousarray(np.pad(used, ((0, -rows % LANES), (0, -columns % LANES))), np.float32)
         room = np.empty(2 * len(work) * sum(work.shape), np.float32)
         self._orthogonal(address(work), *work.shape, a, b, c, address(room))
         found = work[:rows, :columns]
         return found if wide else found.T
 
 
-class Problem:
+def _check(inputs: Inputs, places: _Places, spec: Spec, window: int) -> None:
+    """The kernel reads and writes where the inputs say, so they are held to their shapes and bounds before."""
+    contexts, count = inputs.prefix.shape
+    tokens, own = inputs.tokens.shape[1], inputs.own
+    expected = [(contexts, tokens, places.token_inputs), (contexts, count, spec.actions), (contexts,), (count,)]
+    found = [array.shape for array in (inputs.tokens, inputs.labels, inputs.length, own)]
+    if found != expected or inputs.queries.shape not in [(contexts, count, numbers) for numbers in places.query_inputs]:
+        raise ValueError(f"arrays of the shapes {[array.shape for array in inputs]}: not those of a batch of this model")
+    if (inputs.prefix < 0).any() or (inputs.prefix > inputs.length[:, None]).any() or inputs.length.max() > tokens:
+        raise ValueError(f"prefixes of {inputs.prefix.min()} to {inputs.prefix.max()}: a context has {tokens} tokens")
+    if (own < 1).any() or (own > np.arange(1, count + 1)).any() or own.max() > window:
+        raise ValueError(f"windows of up to {own.max()} states: model.window = {window}")
+
+
+class Contexts:
     """The contexts of one batch, whose losses and gradients the kernel computes one at a time, from any thread."""
 
     def __init__(self, kernel: TrainingKernel, inputs: Inputs) -> None:
+        """Raises ValueError for inputs of another model, and for prefixes and windows that do not fit the contexts."""
         spec, config = kernel._spec, kernel._config
-        labels = np.zeros((*inputs.labels.shape[:2], spec.actions + -spec.actions % _LANES), np.float32)
-        labels[..., : spec.actions] = inputs.labels
+        _check(inputs, kernel._places, spec, config.window)
+        labels = padded(inputs.labels)
         tokens, states = (np.ascontiguousarray(array, np.float32) for array in (inputs.tokens, inputs.queries))
         numbers = [np.ascontiguousarray(array, np.int32) for array in (inputs.length, inputs.prefix, inputs.own)]
         self._kept: list[np.ndarray] = [kernel._places.place, kernel._weight, kernel._back, tokens, states, labels, *numbers]
         """What the kernel has pointers to."""
         contexts, queries = inputs.prefix.shape
-        if (inputs.prefix < 0).any() or (inputs.prefix > inputs.length[:, None]).any() or inputs.length.max() > tokens.shape[1]:
-            raise ValueError(
-                f"prefixes of {inputs.prefix.min()} to {inputs.prefix.max()}: a context has {tokens.shape[1]} tokens"
-            )
-        self.count = contexts * queries
-        """Labels: the loss of a batch is a mean over them."""
+        self.labels = contexts * queries
+        """Number of labels: the loss of a batch is a mean over them."""
         sizes = config.width, config.heads, config.layers, spec.actions
         shapes = inputs.tokens.shape[2], inputs.queries.shape[2], inputs.tokens.shape[1], queries
         pointers = [address(array) for array in self._kept]
-        self._fit = _Fit(*sizes, not spec.discrete, config.window, *shapes, *pointers, 1 / self.count)
+        self._fit = _Fit(*sizes, not spec.discrete, config.window, *shapes, *pointers, 1 / self.labels)
         self._at, self._run = ctypes.addressof(self._fit), kernel._fit
         longest = int(inputs.length.max())
         self.work_size: int = kernel._work(*sizes, longest, queries, config.window)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from icrl_dist.config.sections import OptimConfig
 from icrl_dist.training import optimizers
+from icrl_dist.training.optimizer_state import steps_of
 
 
 class Optimizer:
@@ -46,13 +47,12 @@ class Optimizer:
     def load(self, stored: Mapping[str, np.ndarray]) -> None:
         """The inverse of ``state``.  Raises ValueError for the state of another optimizer."""
         groups = [part.state_dict()["param_groups"] for part, _ in self._parts]
-        places = {(number, index) for number, (group,) in enumerate(groups) for index in group["params"]}
+        shapes = [[tuple(p.shape) for group in part.param_groups for p in group["params"]] for part, _ in self._parts]
+        steps_of(stored, shapes[0], shapes[1] if len(shapes) > 1 else [])
         states: dict[tuple[int, int], dict[str, Tensor]] = {}
         for key, value in stored.items():
             first, second, name = key.split("/")
             states.setdefault((int(first), int(second)), {})[name] = torch.from_numpy(np.array(value))
-        if states and set(states) != places:
-            raise ValueError(f"it holds the state of {len(states)} parameters, not of these {len(places)}")
         for number, (part, _) in enumerate(self._parts):
             own = {index: state for (group, index), state in states.items() if group == number}
             part.load_state_dict({"state": own, "param_groups": groups[number]})

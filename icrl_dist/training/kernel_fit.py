@@ -1,6 +1,6 @@
-"""A fit through the compiled kernel (``models.training_kernel``): the same weights on every processor, with any threads.
+"""A fit by the training kernel: the same weights on every processor and with any number of threads.
 
-All that computes is in the kernel, or in numpy one number at a time: batches, gradients, their norm, AdamW and Muon.
+The kernel (``models.training_kernel``) computes every sum; numpy computes the rest, number by number.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 from jaxtyping import Float32
@@ -16,8 +16,9 @@ from jaxtyping import Float32
 from icrl_dist.config.sections import ModelConfig, OptimConfig
 from icrl_dist.copies import NotCopied
 from icrl_dist.models.features import Features
-from icrl_dist.models.training_kernel import Inputs, TrainingKernel
+from icrl_dist.models.training_kernel import Contexts, Inputs, TrainingKernel
 from icrl_dist.training.batches import TrainingBatch
+from icrl_dist.training.optimizer_state import steps_of
 from icrl_dist.types import Spec
 
 _GROUPS = 16
@@ -77,6 +78,10 @@ class KernelFit(NotCopied):
 
     def step(self, batch: TrainingBatch, learning_rate: float) -> float:
         """Update the weights by the gradient of one batch; returns its loss before the update."""
+        with np.errstate(all="ignore"):  # as torch: the loss tells of a number that is infinite or none
+            return self._step(batch, learning_rate)
+
+    def _step(self, batch: TrainingBatch, learning_rate: float) -> float:
         loss, gradient = self._gradient(batch)
         norm = self._kernel.norm(gradient)
         gradient *= np.float32(min(1.0, self._optim.clip / (norm + 1e-6)))
@@ -93,33 +98,35 @@ class KernelFit(NotCopied):
 
     def _gradient(self, batch: TrainingBatch) -> tuple[float, Float32[np.ndarray, " P"]]:
         self._kernel.load(self._parameters)
-        problem = self._kernel.problem(self._inputs(batch))
-        contexts = len(batch.prefix)
-        groups = min(_GROUPS, contexts)
+        contexts, count = Contexts(self._kernel, self._inputs(batch)), len(batch.prefix)
+        groups = min(_GROUPS, count)
         if len(self._parts) < groups:
             self._parts = np.empty((groups, self._kernel.gradient_size), np.float32)
-        losses, turns = np.empty(contexts), itertools.count()
+        losses, turns = np.empty(count), itertools.count()
 
         def work(thread: int) -> None:
-            if len(self._work[thread]) < problem.work_size:
-                self._work[thread] = np.empty(problem.work_size, np.float32)
+            if len(self._work[thread]) < contexts.work_size:
+                self._work[thread] = np.empty(contexts.work_size, np.float32)
             while (group := next(turns)) < groups:
                 self._parts[group] = 0
-                for context in range(group, contexts, groups):
-                    losses[context] = problem.add(context, self._parts[group], self._work[thread])
+                for context in range(group, count, groups):
+                    losses[context] = contexts.add(context, self._parts[group], self._work[thread])
 
         others = [self._pool.submit(work, thread) for thread in range(1, len(self._work))]
-        work(0)
+        try:
+            work(0)
+        finally:
+            wait(others)  # also after an error: they write where the next step does
         for other in others:
             other.result()
-        return math.fsum(losses) / problem.count, self._kernel.gradient(self._parts[:groups])
+        total = math.fsum(losses) if np.isfinite(losses).all() else float(losses.sum())  # fsum refuses inf - inf
+        return total / contexts.labels, self._kernel.gradient(self._parts[:groups])
 
     def _inputs(self, batch: TrainingBatch) -> Inputs:
         """A batch as the kernel takes it: with the queries of each context in the order of their prefixes."""
         features, actions = self._features.observations, self._features.actions
-        one = np.ones((*batch.rewards.shape, 1), np.float32)
         columns = features(batch.observations), actions(batch.actions), features(batch.next_observations)
-        tokens = np.concatenate([*columns, batch.rewards[..., None], one], axis=-1)
+        tokens = _with_one(np.concatenate([*columns, batch.rewards[..., None]], axis=-1))
         order = np.argsort(batch.prefix, axis=1, kind="stable")
         queries = _with_one(features(np.take_along_axis(batch.queries, order[..., None], 1)))
         labels = np.take_along_axis(batch.labels, order[..., None], 1)
@@ -132,18 +139,15 @@ class KernelFit(NotCopied):
             )
             states = features(states)
             # Each state, and the previous state of the window with its action and reward; the first has no previous one.
-            before = _with_one(np.concatenate([states, actions(taken), rewards[..., None]], axis=-1, dtype=np.float32))[
-                ..., :-1, :
-            ]
-            before = np.pad(before, ((0, 0), (0, 0), (1, 0), (0, 0)))
+            before = np.concatenate([states, actions(taken), rewards[..., None]], axis=-1, dtype=np.float32)
+            before = np.pad(_with_one(before)[..., :-1, :], ((0, 0), (0, 0), (1, 0), (0, 0)))
             rows, length = len(order), states.shape[2]
             windows = np.concatenate([_with_one(states), before], axis=-1).reshape(rows, -1, queries.shape[2] + before.shape[3])
             queries = np.pad(queries, ((0, 0), (0, 0), (0, before.shape[3])))
             queries = np.concatenate([queries, windows], axis=1)
             labels = np.concatenate([labels, window_labels.reshape(rows, -1, labels.shape[2])], axis=1)
-            prefix = np.concatenate(
-                [prefix, np.repeat(np.take_along_axis(batch.window_prefix, order, 1), length, axis=1)], axis=1
-            )
+            window_prefix = np.repeat(np.take_along_axis(batch.window_prefix, order, 1), length, axis=1)
+            prefix = np.concatenate([prefix, window_prefix], axis=1)
             own = np.concatenate([own, np.tile(np.arange(1, length + 1, dtype=np.int32), states.shape[1])])
         return Inputs(tokens, queries, labels, prefix.max(axis=1).astype(np.int32), prefix.astype(np.int32), own)
 
@@ -183,13 +187,9 @@ class KernelFit(NotCopied):
 
     def load(self, stored: Mapping[str, np.ndarray]) -> None:
         """The inverse of ``state``.  Raises ValueError for the state of another optimizer."""
-        steps = {int(value) for key, value in stored.items() if key.endswith("/step")}
-        places = {tuple(key.split("/")[:2]) for key in stored}
-        own = {
-            (str(part), str(index)) for part, names in enumerate((self._others, self._matrices)) for index in range(len(names))
-        }
-        if stored and (places != own or len(steps) != 1):
-            raise ValueError(f"it holds the state of {len(places)} parameters, not of these {len(own)}")
+        steps = steps_of(stored, *([self._shapes[name] for name in names] for names in (self._others, self._matrices)))
+        if len(steps) > 1:
+            raise ValueError(f"its parameters took {min(steps)} to {max(steps)} steps, not the same number")
         self._steps = steps.pop() if steps else 0
         self._first[:], self._second[:] = 0, 0
         first, second = self._views(self._first), self._views(self._second)
@@ -200,7 +200,7 @@ class KernelFit(NotCopied):
 
 
 def _with_one(x: Float32[np.ndarray, "*N I"]) -> Float32[np.ndarray, "*N J"]:
-    """The rows with a 1 at their ends, which bias is multiplied by."""
+    """The rows with a 1 at their ends, by which the bias is multiplied."""
     return np.concatenate([x, np.ones((*x.shape[:-1], 1), np.float32)], axis=-1)
 
 

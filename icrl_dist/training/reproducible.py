@@ -8,16 +8,14 @@ from pathlib import Path
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.config.sections import Reproducible
-from icrl_dist.models.compiled import Unusable, library
+from icrl_dist.models.compiled import WIDEST, Unusable, library
 
-WIDEST = 128
-"""The widest model that is fitted through the kernel: up to there it is faster than torch (docs/results/engine.md)."""
 _GPU_FILES = ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")
 """Files of which one is present wherever torch can use a GPU."""
 
 
 def best_fit(run: Run) -> Reproducible:
-    """What ``learner.reproducible = "auto"`` means for a run that begins here with this decoder."""
+    """What ``learner.reproducible = "auto"`` means for a run that begins here with its ``context.decoder``."""
     return "this-machine" if _objection(run) else "any-machine"
 
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from icrl_dist import Adversary, Task, Variation, load_agent, make
-from icrl_dist.agent import trained_model
+from icrl_dist.agent import in_context_agent, trained_model
 from icrl_dist.agent.in_context_agent import InContextAgent
 from icrl_dist.config.run import ConfigError
 from icrl_dist.models import kernel
-from icrl_dist.models.compiled import Unusable
+from icrl_dist.models.compiled import Unusable, kinds
 from icrl_dist.models.kernel_transformer import KernelTransformer
 from icrl_dist.models.stored import StoredTransformer
 from icrl_dist.telemetry import processes
 
-compiled = pytest.mark.skipif(not kernel.kinds(), reason="the decoder kernel was not built, or does not support this processor")
+compiled = pytest.mark.skipif(not kinds(), reason="the decoder kernel was not built, or does not support this processor")
 
 USE = """
 import os, pickle, sys
@@ -128,7 +128,8 @@ def test_an_agents_model_is_built_when_it_is_asked_for_and_later_contexts_use_it
 
 def test_without_a_kernel_torch_decides_and_the_kernel_is_refused(monkeypatch):
     monkeypatch.setattr(kernel, "kinds", lambda: ())
-    monkeypatch.setattr(kernel, "library", lambda name: Unusable("not compiled", "install a C compiler"))
+    for module in (kernel, in_context_agent):
+        monkeypatch.setattr(module, "library", lambda name: Unusable("not compiled", "install a C compiler"))
     agent, right = load_agent("darkroom", seed=0), load_agent("darkroom", seed=0, decoder="torch")
     assert not isinstance(agent._policy._deployed, KernelTransformer)
     assert played(agent)[0] == played(right)[0]
@@ -140,5 +141,5 @@ def test_a_wide_model_is_decided_by_torch_unless_the_kernel_is_asked_for(monkeyp
     monkeypatch.setattr(kernel, "WIDEST", 8)
     agent = load_agent("darkroom", seed=0)
     assert isinstance(agent, InContextAgent) and not isinstance(agent._policy._deployed, KernelTransformer)
-    if kernel.kinds():
+    if kinds():
         assert isinstance(load_agent("darkroom", decoder="kernel")._policy._deployed, KernelTransformer)

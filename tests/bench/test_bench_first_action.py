@@ -7,7 +7,6 @@ import json
 import pytest
 
 from icrl_dist.bench import first_action
-from icrl_dist.models import kernel
 
 BUSY = "import time\nend = time.process_time() + {}\nwhile time.process_time() < end: pass"
 
@@ -30,7 +29,7 @@ def test_it_measures_new_processes_and_holds_the_ratio_to_its_bound(monkeypatch:
 def test_without_a_kernel_there_is_no_ratio_and_a_process_that_fails_is_an_error(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(kernel, "kinds", lambda: ())
+    monkeypatch.setattr(first_action, "kinds", lambda: ())
     assert list(first_action.sides()) == ["numpy", "torch"]
     monkeypatch.setattr(first_action, "sides", lambda: {"numpy": "pass", "torch": "pass"})
     result = first_action.run(rounds=1)

@@ -12,7 +12,7 @@ import pytest
 from icrl_dist.bench import incontext
 from icrl_dist.bench import incontext_decoder as decoder
 from icrl_dist.cli import main
-from icrl_dist.models.kernel import kinds
+from icrl_dist.models.compiled import kinds
 
 needs_kernel = pytest.mark.skipif(not kinds(), reason="the kernel was not built here")
 SMALL = (decoder.Shape(1, 3, 2), decoder.Shape(2, 130, 4))

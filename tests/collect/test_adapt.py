@@ -11,8 +11,8 @@ from icrl_dist.collect.adapt import Rollouts, rollouts
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import Decoder
 from icrl_dist.methods import registry as methods
+from icrl_dist.models.compiled import kinds
 from icrl_dist.models.dpt import DeployedTransformer
-from icrl_dist.models.kernel import kinds
 from icrl_dist.models.kernel_transformer import KernelTransformer
 from icrl_dist.problems import registry as problems
 

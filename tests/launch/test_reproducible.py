@@ -12,7 +12,7 @@ import torch
 from icrl_dist.config.resuming import differences
 from icrl_dist.config.run import ConfigError, Run, dumps, parse_written
 from icrl_dist.config.sections import Reproducible
-from icrl_dist.launch import train
+from icrl_dist.launch import auto, train
 from icrl_dist.models import kernel
 from icrl_dist.models.compiled import Unusable, kinds
 from icrl_dist.storage import held
@@ -36,7 +36,7 @@ def asked(run: Run, value: Reproducible, **sections: dict[str, Any]) -> Run:
 
 
 def test_auto_is_any_machine_where_that_is_possible(small_run: Run, tmp_path: Path) -> None:
-    found = train.without_auto(small_run, tmp_path, resume=False)
+    found = auto.without_auto(small_run, tmp_path, resume=False)
     assert (found.learner.reproducible, found.context.decoder) == ("any-machine", "kernel")
 
 
@@ -53,13 +53,13 @@ def test_what_the_kernel_cannot_fit_is_refused_and_fitted_by_torch_with_auto(
     small_run: Run, tmp_path: Path, sections: dict[str, dict[str, Any]], words: list[str]
 ) -> None:
     refused(asked(small_run, "any-machine", **sections), tmp_path, words)
-    found = train.without_auto(asked(small_run, "auto", **sections), tmp_path, resume=False)
+    found = auto.without_auto(asked(small_run, "auto", **sections), tmp_path, resume=False)
     assert found.learner.reproducible == "this-machine"
 
 
 def refused(run: Run, folder: Path, words: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
-        train.without_auto(run, folder, resume=False)
+        auto.without_auto(run, folder, resume=False)
     text = str(caught.value)
     assert "\n" not in text and all(word in text for word in (*words, "learner.reproducible = 'any-machine'", "'this-machine'"))
 
@@ -73,7 +73,7 @@ def test_a_gpu_a_missing_kernel_and_another_loss_are_refused(
         patch.setattr(torch.cuda, "is_available", lambda: True)
         refused(run, tmp_path, ["learner.device = 'auto' means a GPU", "set learner.device = 'cpu'"])
         on_cpu = asked(run, "any-machine", learner={"device": "cpu"})
-        assert train.without_auto(on_cpu, tmp_path, resume=False).learner.reproducible == "any-machine"
+        assert auto.without_auto(on_cpu, tmp_path, resume=False).learner.reproducible == "any-machine"
     with monkeypatch.context() as patch:
         patch.setattr(reproducible, "library", lambda name: Unusable("not compiled", "install a C compiler"))
         refused(run, tmp_path, ["cannot be used: not compiled: install a C compiler"])
@@ -85,7 +85,7 @@ def test_a_run_keeps_what_it_began_with(small_run: Run, tmp_path: Path) -> None:
     begun = asked(small_run, "this-machine", context={"decoder": "kernel"})
     folder = tmp_path / "run"
     train.prepare(begun, folder, resume=False, overwrite=False)
-    again = train.without_auto(small_run, folder, resume=True)
+    again = auto.without_auto(small_run, folder, resume=True)
     assert again == begun
     assert not differences(begun, small_run), "auto is what the run began with"
     assert [d.name for d in differences(begun, asked(begun, "any-machine"))] == ["learner.reproducible"]
@@ -108,7 +108,7 @@ def test_a_resume_with_other_settings_names_them(
     train.prepare(asked(small_run, there, context={"decoder": "kernel"}), folder, resume=False, overwrite=False)
     changed = asked(small_run, "auto") if section != "learner" else small_run
     changed = replace(changed, **{section: replace(getattr(changed, section), **change)})
-    named = train.without_auto(changed, folder, resume=True)
+    named = auto.without_auto(changed, folder, resume=True)
     with pytest.raises(ConfigError, match=rf"has other settings.*{section}\.{next(iter(change))}"):
         train.prepare(named, folder, resume=True, overwrite=False)
 
@@ -120,9 +120,9 @@ def test_a_refused_run_is_not_announced(small_run: Run, tmp_path: Path, monkeypa
     monkeypatch.setattr(reproducible, "library", lambda name: missing)
     notes: list[str] = []
     with pytest.raises(ConfigError, match="training kernel cannot be used"):
-        train.without_auto(asked(small_run, "any-machine"), tmp_path, False, notes.append)
+        auto.without_auto(asked(small_run, "any-machine"), tmp_path, False, notes.append)
     assert not notes, "a note that the run uses torch contradicts the refusal"
-    train.without_auto(small_run, tmp_path, False, notes.append)
+    auto.without_auto(small_run, tmp_path, False, notes.append)
     assert len(notes) == 1 and "equal only on machines of one kind" in notes[0]
 
 

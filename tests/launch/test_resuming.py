@@ -17,6 +17,7 @@ import icrl_dist
 from icrl_dist.cli import main as cli
 from icrl_dist.config.resuming import FREE
 from icrl_dist.config.run import ConfigError, dumps, load, load_folder, override
+from icrl_dist.launch import auto
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.storage.checkpoint import partial_file
@@ -33,7 +34,7 @@ __all__ = ["no_tensorboard"]
 @pytest.fixture(scope="module")
 def module_run(module_run, tmp_path_factory):
     """With its decoder and its way to fit named, as `train` names them."""
-    return launch.without_auto(module_run, tmp_path_factory.mktemp("none"), resume=False)
+    return auto.without_auto(module_run, tmp_path_factory.mktemp("none"), resume=False)
 
 
 @pytest.fixture(scope="module")

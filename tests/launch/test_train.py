@@ -12,7 +12,7 @@ import pytest
 
 from actors import fleet
 from icrl_dist.config.run import ConfigError, dumps, load, override
-from icrl_dist.launch import learner_process, train
+from icrl_dist.launch import auto, learner_process, train
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.models import kernel
 from icrl_dist.models.compiled import Unusable
@@ -76,7 +76,7 @@ def test_a_run_resumes_with_another_endpoint_but_not_with_another_seed(small_run
 def test_a_run_keeps_its_decoder_and_is_refused_where_the_kernel_that_it_needs_is_missing(small_run, tmp_path, monkeypatch):
     def decoder(there, asked, resume=True):
         (tmp_path / "run.toml").write_text(dumps(by(there)))
-        return train.without_auto(by(asked), tmp_path, resume, notes.append).context.decoder
+        return auto.without_auto(by(asked), tmp_path, resume, notes.append).context.decoder
 
     notes: list[str] = []
     by = lambda decoder: replace(small_run, context=replace(small_run.context, decoder=decoder))  # noqa: E731

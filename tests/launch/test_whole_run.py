@@ -26,7 +26,7 @@ from actors.session import SessionFailed
 from icrl_dist.cli import main
 from icrl_dist.config.run import ConfigError, dumps
 from icrl_dist.console.signals import SIGNALS, interruptible
-from icrl_dist.launch import learner_process, resuming, whole_run
+from icrl_dist.launch import auto, learner_process, resuming, whole_run
 from icrl_dist.launch import train as launch
 from icrl_dist.results import heldout, reports
 from icrl_dist.storage.checkpoint import partial_file
@@ -290,7 +290,7 @@ def test_quarantined_variations_are_in_the_result_and_give_exit_code_1(module_ru
 
 
 def test_load_run_takes_names_files_and_folders(made, module_run, tmp_path):
-    begun = launch.without_auto(module_run, tmp_path, resume=False)
+    begun = auto.without_auto(module_run, tmp_path, resume=False)
     assert icrl_dist.load_run(made.result.folder) == icrl_dist.load_run(str(made.result.folder)) == begun
     (tmp_path / "small.toml").write_text(dumps(module_run))
     for what in (tmp_path / "small.toml", str(tmp_path / "small.toml")):

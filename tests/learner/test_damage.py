@@ -129,13 +129,32 @@ def stopped(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return partial_file(folder)
 
 
-@pytest.mark.parametrize("damage", ["a flipped bit", "no bytes", "other weights", "another seed", "no step"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "a flipped bit",
+        "no bytes",
+        "other weights",
+        "another seed",
+        "no step",
+        "step -5",
+        "step 1000000",
+        "no moments",
+        "no state",
+    ],
+)
 def test_an_unfinished_fit_that_is_damaged_starts_at_its_beginning(parent, tmp_path, monkeypatch, damage):
     partial = stopped(parent[2], tmp_path / "run", monkeypatch)
     if damage == "another seed":
         changed(partial, run=dumps(dataclasses.replace(parent[2], seed=1)))
     elif damage == "no step":
         changed(partial, step="four")
+    elif damage.startswith("step"):
+        changed(partial, step=int(damage.split()[1]))
+    elif damage in ("no moments", "no state"):
+        whole, end = load_checkpoint(partial), "/0/exp_avg" if damage == "no moments" else ""
+        kept = {n: array for n, array in whole.arrays.items() if not n.startswith("optimizer/") or not n.endswith(end)}
+        save_checkpoint(partial, Checkpoint(kept, whole.manifest))
     else:
         DAMAGE[damage](partial)
     result, texts = resumed(tmp_path / "run", parent[2])

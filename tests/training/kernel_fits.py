@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from icrl_dist.config.sections import ModelConfig, OptimConfig
+from icrl_dist.methods.dpt_loss import batch_loss
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
 from icrl_dist.training.batches import LabelledWindows, TrainingBatch
@@ -92,9 +93,7 @@ class Case(NamedTuple):
 
 
 def by_torch(model: PretrainedTransformer, batch: TrainingBatch) -> tuple[float, dict[str, Tensor]]:
-    """The loss of torch and its gradients, in double precision."""
-    from icrl_dist.methods.dpt_loss import batch_loss
-
+    """The loss of torch and its gradients."""
     model.zero_grad()
     loss = batch_loss(model, batch)
     loss.backward()

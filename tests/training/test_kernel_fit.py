@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
+import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +16,9 @@ import torch
 from icrl_dist.config.sections import OptimConfig
 from icrl_dist.models.compiled import kinds
 from icrl_dist.models.features import sine_and_cosine
+from icrl_dist.models.training_kernel import Contexts
 from icrl_dist.models.weights import weights_of
-from icrl_dist.training.fit import Optimizer
+from icrl_dist.training.fit import Optimizer, take_steps
 from icrl_dist.training.kernel_fit import KernelFit, _power, cosine
 from tests.training.kernel_fits import Case, by_torch
 
@@ -128,8 +132,71 @@ def test_the_state_of_another_optimizer_is_refused() -> None:
     case = Case()
     fit = case.fit(case.model())
     fit.step(case.batch(), 1e-3)
-    with pytest.raises(ValueError, match="of these"):
+    count = len(fit.weights)
+    with pytest.raises(ValueError, match=f"AdamW and Muon train {count} and 0 parameters there, {count - 8} and 8 here"):
         case.fit(case.model(), muon=1.0).load(fit.state())
+
+
+def lacks(state: dict[str, np.ndarray]) -> None:
+    del state["0/1/exp_avg_sq"]
+
+
+def broadcast(state: dict[str, np.ndarray]) -> None:
+    state["0/1/exp_avg"] = np.array(1, np.float32)
+
+
+def texts(state: dict[str, np.ndarray]) -> None:
+    state["0/1/exp_avg"] = state["0/1/exp_avg"].astype("U8")
+
+
+def unknown(state: dict[str, np.ndarray]) -> None:
+    state["0/1/max_exp_avg_sq"] = state["0/1/exp_avg_sq"]
+
+
+def taking(count: float) -> Callable[[dict[str, np.ndarray]], None]:
+    return lambda state: state.update({name: np.array(count, np.float32) for name in state if name.endswith("/step")})
+
+
+DAMAGE = {
+    "it lacks 0/1/exp_avg_sq": lacks,
+    r"0/1/exp_avg has the shape \(\)": broadcast,
+    "0/1/exp_avg has .* the type <U8": texts,
+    "0/1/max_exp_avg_sq, which is unknown": unknown,
+    "took -3 steps": taking(-3),
+    "took 2.5 steps": taking(2.5),
+    "took inf steps": taking(math.inf),
+    "took nan steps": taking(math.nan),
+}
+
+
+@pytest.mark.parametrize("way", ["kernel", "torch"])
+@pytest.mark.parametrize(("message", "damage"), DAMAGE.items(), ids=DAMAGE)
+def test_a_damaged_state_is_refused_and_changes_nothing(
+    way: str, message: str, damage: Callable[[dict[str, np.ndarray]], None]
+) -> None:
+    case = Case()
+    fit = case.fit(case.model())
+    fit.step(case.batch(), 1e-3)
+    optimizer = fit if way == "kernel" else Optimizer(case.model(), OptimConfig())
+    optimizer.load(fit.state())
+    state = fit.state()
+    damage(state)
+    before = optimizer.state()
+    with pytest.raises(ValueError, match=message):
+        optimizer.load(state)
+    for name, value in optimizer.state().items():
+        np.testing.assert_array_equal(value, before[name])
+
+
+def test_a_state_whose_parameters_took_other_numbers_of_steps_is_refused_by_the_kernel() -> None:
+    """Torch's parameters may differ in it: those that a loss leaves out take no step."""
+    case = Case()
+    fit = case.fit(case.model())
+    fit.step(case.batch(), 1e-3)
+    state = fit.state() | {"0/1/step": np.array(7, np.float32)}
+    with pytest.raises(ValueError, match="took 1 to 7 steps"):
+        fit.load(state)
+    Optimizer(case.model(), OptimConfig()).load(state)
 
 
 def test_a_prefix_decides_what_is_computed_but_padding_does_not_matter() -> None:
@@ -166,6 +233,36 @@ def test_a_prefix_beyond_the_context_is_refused() -> None:
             case.fit(case.model()).gradient(replace(batch, prefix=np.full_like(batch.prefix, wrong)))
 
 
+def test_windows_longer_than_the_models_and_labels_of_another_model_are_refused() -> None:
+    """The kernel would write beyond its memory."""
+    case = Case(windows=2, window=3)
+    fit = case.fit(case.model())
+    with pytest.raises(ValueError, match=r"^windows of up to 40 states: model\.window = 3$"):
+        fit.gradient(case._replace(window=40).batch())
+    with pytest.raises(ValueError, match=r"^arrays of the shapes .*: not those of a batch of this model$"):
+        fit.gradient(case._replace(actions=3).batch())
+
+
+def test_no_thread_writes_to_gradients_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next step would use the same memory."""
+    done: list[int] = []
+
+    def add(contexts: Contexts, context: int, *arrays: np.ndarray) -> float:
+        if threading.current_thread() is threading.main_thread():
+            raise MemoryError
+        time.sleep(0.02)
+        done.append(context)
+        return 0.0
+
+    monkeypatch.setattr(Contexts, "add", add)
+    case = Case(contexts=4)
+    with pytest.raises(MemoryError):
+        case.fit(case.model(), threads=2).gradient(case.batch())
+    before = len(done)
+    time.sleep(0.1)
+    assert len(done) == before >= 3
+
+
 RECORDED = "8e97486e932da77253dfaa90474489189389cd0477ea2144153992390418687f"
 """SHA-256 of the weights below, recorded on an AMD EPYC with AVX-512."""
 
@@ -185,9 +282,32 @@ def test_weights_have_the_recorded_digest() -> None:
     assert whole.hexdigest() == RECORDED
 
 
-def test_a_number_that_is_none_reaches_the_loss() -> None:
-    case = Case()
-    for name in ("embed_transition.weight", "trunk.blocks.0.qkv.weight", "trunk.blocks.1.feed.0.bias", "head.weight"):
-        fit = case.fit(case.model())
-        fit.weights[name].flat[0] = np.nan
-        assert math.isnan(fit.gradient(case.batch())[0]), name
+@pytest.mark.parametrize("discrete", [True, False])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_weight_that_is_no_finite_number_reaches_the_loss(discrete: bool, value: float) -> None:
+    case = Case(discrete=discrete)
+    names = "embed_transition.weight", "trunk.blocks.0.qkv.weight", "trunk.blocks.1.feed.0.bias", "head.weight", "head.bias"
+    for name in names if math.isnan(value) else names[-1:]:
+        for place in (0, -1):
+            fit = case.fit(case.model())
+            fit.weights[name].flat[place] = value
+            assert not math.isfinite(fit.gradient(case.batch())[0]), (name, place)
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+@pytest.mark.parametrize("field", ["rewards", "observations", "queries", "labels"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
+def test_values_that_cannot_be_fitted_end_the_fit_as_they_end_torchs(discrete: bool, field: str, value: float) -> None:
+    """By the loss of this step or the next, without a warning.  Torch's loss is nan too where a variance overflows."""
+    case = Case(discrete=discrete)
+    batch = case.batch()
+    changed = getattr(batch, field).copy()
+    changed.flat[0] = value
+    batch = replace(batch, **{field: changed})
+    expected, _ = by_torch(case.model(), batch)
+    fit = case.fit(case.model())
+    if math.isfinite(expected):
+        assert math.isfinite(fit.step(batch, 1e-3))
+        return
+    with pytest.raises(FloatingPointError, match=r"at step [01]: lower the learning rate"):
+        take_steps(lambda step, rate: fit.step(batch, rate), OptimConfig(), 1e-3, 5)

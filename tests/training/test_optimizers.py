@@ -102,5 +102,5 @@ def test_a_checkpoint_of_the_other_optimizer_is_refused_in_one_line(small_run, m
     one.step(1e-3)
     spec = problems.of(small_run).spec
     checkpoints.save(tmp_path / "one.npz", checkpoints.weights(0, model), one, checkpoints.manifest(small_run, spec, 0, 1))
-    with pytest.raises(ConfigError, match=r"another optimizer .*: it has the run's optim.muon"):
+    with pytest.raises(ConfigError, match=r"another optimizer .*: use the optim.muon of its run"):
         checkpoints.restore(tmp_path / "one.npz", spec, model, other)
