@@ -12,6 +12,7 @@ import torch
 
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import ConfigError, Run
+from icrl_dist.config.sections import LearnerConfig
 from icrl_dist.interfaces import Draw, Method, Phase
 from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.weights import weights_of
@@ -33,8 +34,12 @@ class RunFailed(RuntimeError):  # noqa: N818
     """The run cannot continue; the message is one line for the user."""
 
 
-def device_of(name: str) -> torch.device:
-    """The device of ``learner.device``.  Raises RunFailed if it is ``cuda`` and torch finds no GPU."""
+def device_of(config: LearnerConfig) -> torch.device:
+    """The device of ``learner.device``: ``auto`` is the CPU for fits through the kernel, which runs there.
+
+    Raises RunFailed if it is ``cuda`` and torch finds no GPU.
+    """
+    name = "cpu" if config.reproducible == "any-machine" else config.device
     if name == "cuda" and not torch.cuda.is_available():
         raise RunFailed("learner.device = 'cuda': torch finds no GPU; use auto or cpu")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

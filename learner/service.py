@@ -65,7 +65,7 @@ class Service:
         self._spec = registry.of(run).spec
         lineage = Lineage.of(folder, run)
         self._threads = run.learner.threads or len(os.sched_getaffinity(0))
-        self._device = device_of(run.learner.device)
+        self._device = device_of(run.learner)
         self._method = methods.of(run)
         notes = list[str]()
         self._plan = PhasePlan(run, lineage, self._method)

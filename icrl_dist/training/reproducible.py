@@ -15,8 +15,11 @@ _GPU_FILES = ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")
 
 
 def best_fit(run: Run) -> Reproducible:
-    """What ``learner.reproducible = "auto"`` means for a run that begins here with its ``context.decoder``."""
-    return "this-machine" if _objection(run) else "any-machine"
+    """What ``learner.reproducible = "auto"`` means for a run that begins here with its ``context.decoder``.
+
+    With ``learner.device = "auto"`` a GPU is used if there is one.
+    """
+    return "this-machine" if _objection(run) or (run.learner.device == "auto" and _gpu()) else "any-machine"
 
 
 def require_kernel_fit(run: Run) -> None:
@@ -38,10 +41,8 @@ def _objection(run: Run) -> str:
         return f"on {platform.node()} the training kernel cannot be used: {why}"
     if run.context.decoder == "torch":
         return "context.decoder = 'torch', whose decisions depend on the processor: set context.decoder = 'kernel'"
-    if run.learner.device == "cuda" or (run.learner.device == "auto" and _gpu()):
-        return (
-            f"learner.device = {run.learner.device!r} means a GPU, and the kernel runs on the CPU: set learner.device = 'cpu'"
-        )
+    if run.learner.device == "cuda":
+        return "learner.device = 'cuda', and the kernel runs on the CPU: set learner.device = 'auto' or 'cpu'"
     return ""
 
 

@@ -46,7 +46,7 @@ def test_auto_is_any_machine_where_that_is_possible(small_run: Run, tmp_path: Pa
         ({"model": {"width": 144}}, ["model.width = 144", "at most 128"]),
         ({"model": {"dropout": 0.1}}, ["model.dropout = 0.1", "use 0"]),
         ({"context": {"decoder": "torch"}}, ["context.decoder = 'torch'", "set context.decoder = 'kernel'"]),
-        ({"learner": {"device": "cuda"}}, ["learner.device = 'cuda'", "set learner.device = 'cpu'"]),
+        ({"learner": {"device": "cuda"}}, ["learner.device = 'cuda'", "set learner.device = 'auto' or 'cpu'"]),
     ],
 )
 def test_what_the_kernel_cannot_fit_is_refused_and_fitted_by_torch_with_auto(
@@ -71,9 +71,16 @@ def test_a_gpu_a_missing_kernel_and_another_loss_are_refused(
     with monkeypatch.context() as patch:
         patch.setattr(reproducible, "_GPU_FILES", (str(tmp_path),))
         patch.setattr(torch.cuda, "is_available", lambda: True)
-        refused(run, tmp_path, ["learner.device = 'auto' means a GPU", "set learner.device = 'cpu'"])
-        on_cpu = asked(run, "any-machine", learner={"device": "cpu"})
-        assert auto.without_auto(on_cpu, tmp_path, resume=False).learner.reproducible == "any-machine"
+        refused(asked(run, "any-machine", learner={"device": "cuda"}), tmp_path, ["learner.device = 'cuda'", "'auto' or 'cpu'"])
+        cases: list[tuple[str, Reproducible, Reproducible]] = [
+            ("auto", "auto", "this-machine"),
+            ("cpu", "auto", "any-machine"),
+            ("auto", "any-machine", "any-machine"),
+        ]
+        for device, wanted, found in cases:
+            there = auto.without_auto(asked(run, wanted, learner={"device": device}), tmp_path, resume=False).learner
+            assert there.reproducible == found
+            assert fitting.device_of(there).type == ("cuda" if found == "this-machine" else "cpu")
     with monkeypatch.context() as patch:
         patch.setattr(reproducible, "library", lambda name: Unusable("not compiled", "install a C compiler"))
         refused(run, tmp_path, ["cannot be used: not compiled: install a C compiler"])
