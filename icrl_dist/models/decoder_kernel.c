@@ -100,15 +100,15 @@ INLINE void scores(V weight[][BLOCKS], const float *const *q, const float *chunk
 }
 
 /* Add the tokens of these blocks, times their weights, to `mixed` (count, width, LANES), which is multiplied
-   by correction[g] first if this is given. */
+   by correction[g] first if this is given, or taken as zeros if `begins`. */
 #define mix NAMED(mix, KIND)
 INLINE void mix(float *mixed, V weight[][BLOCKS], const V *correction, const float *chunk, Ahead *ahead, int width, int count,
-                int k0, int n) {
+                int k0, int n, int begins) {
     for (int d = 0; d < width; d++) {
         if (ahead) bring(ahead, n / 2);
         UNROLL for (int g = 0; g < count; g++) {
             float *place = mixed + (g * width + d) * LANES;
-            V part = load(place);
+            V part = begins ? all(0.0f) : load(place);
             if (correction) part = mul(part, correction[g]);
             UNROLL for (int k = 0; k < n; k++)
                 part = fma(load(chunk + ((k0 + k) * width + d) * LANES), weight[g][k0 + k], part);
@@ -121,7 +121,7 @@ INLINE void mix(float *mixed, V weight[][BLOCKS], const V *correction, const flo
    tokens.  mixed, highest and total: the sums so far, by lane. */
 #define attend_chunk NAMED(attend_chunk, KIND)
 INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const *q, const float *chunk, Ahead *ahead,
-                         const int *limit, int width, int count, int live) {
+                         const int *limit, int width, int count, int live, int begins) {
     V weight[QUERIES][BLOCKS], correction[QUERIES];
     int head = live < TOGETHER ? live : TOGETHER;
     scores(weight, q, chunk, ahead, width, count, 0, head);
@@ -138,8 +138,11 @@ INLINE void attend_chunk(float *mixed, V *highest, V *total, const float *const 
             total[g] = add(total[g], weight[g][k]);
         }
     }
-    mix(mixed, weight, correction, chunk, ahead, width, count, 0, head);
-    if (live > head) mix(mixed, weight, 0, chunk, ahead, width, count, head, live - head);
+    if (begins)
+        mix(mixed, weight, 0, chunk, ahead, width, count, 0, head, 1);
+    else
+        mix(mixed, weight, correction, chunk, ahead, width, count, 0, head, 0);
+    if (live > head) mix(mixed, weight, 0, chunk, ahead, width, count, head, live - head, 0);
 }
 
 /* Attention of up to QUERIES queries of context b in layer l, query g over its first visible[g] tokens.
@@ -154,7 +157,6 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
         highest[g] = all(-__FLT_MAX__), total[g] = all(0.0f);
         if (visible[g] > most) most = visible[g];
     }
-    for (int i = 0; i < count * width; i++) store(mixed + i * LANES, all(0.0f));
     for (long c = 0; c * CHUNK < most; c++) {
         int limit[QUERIES] = {0};
         for (int g = 0; g < count; g++) {
@@ -166,17 +168,17 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
         if (count == QUERIES) {
             int blocks = (limit[QUERIES - 1] + LANES - 1) / LANES; /* the last one sees the most */
             if (blocks <= BLOCKS / 4)
-                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 4);
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 4, !c);
             else if (blocks <= BLOCKS / 2)
-                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 2);
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS / 2, !c);
             else
-                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS);
+                attend_chunk(mixed, highest, total, q, chunk, ahead, limit, width, QUERIES, BLOCKS, !c);
         } else
             for (int g = 0; g < count; g++)
                 switch ((limit[g] + LANES - 1) / LANES) {
 #define LIVE(n)                                                                                                                \
     case n:                                                                                                                    \
-        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n);  \
+        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n, !c); \
         break;
                     LIVE(1) LIVE(2) LIVE(3) LIVE(4) LIVE(5) LIVE(6) LIVE(7) LIVE(8)
                 }
