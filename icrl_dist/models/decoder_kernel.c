@@ -178,7 +178,8 @@ INLINE void attend(const Decoder *m, int l, long b, const float *const *q, float
                 switch ((limit[g] + LANES - 1) / LANES) {
 #define LIVE(n)                                                                                                                \
     case n:                                                                                                                    \
-        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n, !c); \
+        attend_chunk(mixed + g * width * LANES, highest + g, total + g, q + g, chunk, g ? 0 : ahead, limit + g, width, 1, n,   \
+                     !c);                                                                                                      \
         break;
                     LIVE(1) LIVE(2) LIVE(3) LIVE(4) LIVE(5) LIVE(6) LIVE(7) LIVE(8)
                 }
