@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-fast check format env kernel clean
 
-demo: env ## the main job on Dark Room: ICAA with two workers, about five minutes
+demo: env ## the main job on Dark Room: ICAA with two workers, one to five minutes
 	$(BIN)/icrl-dist train demo --overwrite
 
 test: env ## every test, file by file in three processes: many of them wait
