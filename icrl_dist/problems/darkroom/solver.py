@@ -101,6 +101,44 @@ def heuristic_labels(h: Hypotheses) -> Float32[np.ndarray, "M C A"]:
     return result
 
 
+def worst_case(policy: Float[np.ndarray, "C A"] | None, variation: Variation, p: float) -> float:
+    """Expected return of a Markov policy in the task, if the worst adversary overrides each action with probability p.
+
+    This adversary knows the policy, and chooses by cell and step.  V_H = 0, and for h = H - 1 down to 0
+    V_h(s) = (1 - p) sum_a pi(a | s) Q_h(s, a) + p min_b Q_h(s, b), where Q_h(s, a) = R(s_a) + V_{h+1}(s_a).
+
+    Under Algorithm 1 the context is frozen within an episode, so T_theta(. | s, D) is such a policy: the value is
+    a lower bound of the expected return of one episode with this context D, for all adversaries of strength p.
+    It says nothing about how an adversary that acts while the context is collected changes D.
+
+    ``policy``: pi(a | s) by cell number (x * size + y) and action, as ``InContextAgent.law`` gives it; None: the
+    policy that maximizes V against this adversary (the minimax oracle).  The adversary of the variation is not used.
+
+    Raises ValueError for a p outside [0, 1] and for a policy of another shape or with rows that are no distributions.
+    """
+    check(variation.task)
+    if not 0 <= p <= 1:
+        raise ValueError(f"p = {p}: a probability lies in [0, 1]")
+    size, horizon = int(variation.task.number("size")), int(variation.task.number("horizon"))
+    if policy is not None:
+        policy = np.asarray(policy, np.float64)
+        if policy.shape != (size**2, ACTIONS):
+            raise ValueError(f"policy of shape {policy.shape}: expected probabilities of shape ({size**2}, {ACTIONS})")
+        if not (policy >= 0).all() or not np.allclose(policy.sum(axis=1), 1, atol=1e-3):  # NaN fails the first comparison
+            raise ValueError("policy: the rows must be distributions over actions, with no negative number and the sum 1")
+        policy = policy / policy.sum(axis=1, keepdims=True)
+    goal = variation.task.vector("goal")
+    reward = np.zeros(size**2)
+    reward[int(goal[0]) * size + int(goal[1])] = 1.0
+    value, leads_to = np.zeros(size**2), next_cell(size)
+    for _ in range(horizon):
+        q = (reward + value)[leads_to]
+        own = q.max(axis=1) if policy is None else (policy * q).sum(axis=1)
+        value = (1 - p) * own + p * q.min(axis=1)
+    start = variation.task.get("start", "random")
+    return float(value.mean() if isinstance(start, (str, int, float)) else value[int(start[0]) * size + int(start[1])])
+
+
 def cell_numbers(observations: Float[np.ndarray, "*B 2"], size: int) -> Int[np.ndarray, "*B"]:
     """Number of the cell of each observation."""
     xy = np.rint(observations).astype(np.int64)
