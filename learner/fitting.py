@@ -15,7 +15,7 @@ from icrl_dist.config.run import ConfigError, Run
 from icrl_dist.config.sections import LearnerConfig
 from icrl_dist.interfaces import Draw, Method, Phase
 from icrl_dist.models.dpt import PretrainedTransformer
-from icrl_dist.models.weights import weights_of
+from icrl_dist.models.weights import share_weights, weights_of
 from icrl_dist.storage import checkpoint
 from icrl_dist.storage.checkpoint import partial_file
 from icrl_dist.training import fit, kernel_fit
@@ -88,8 +88,7 @@ class Fitting:
         assert isinstance(self._model, PretrainedTransformer), "another model is not fitted by the kernel"
         self._model.draw_weights(generator(self._run.seed, RandomKey.INITIAL_WEIGHTS))
         found = KernelFit(self._spec, self._run.model, self._run.optim, weights_of(self._model), self._threads)
-        for name, parameter in self._model.named_parameters():
-            parameter.data = torch.from_numpy(found.weights[name])
+        share_weights(self._model, found.weights)
         self._model.eval()
         return found
 

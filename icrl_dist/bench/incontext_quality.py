@@ -21,7 +21,7 @@ from icrl_dist.methods.dpt_loss import batch_loss
 from icrl_dist.models.compiled import kinds
 from icrl_dist.models.dpt import PretrainedTransformer, Transitions
 from icrl_dist.models.heads import Categorical
-from icrl_dist.models.weights import weights_of
+from icrl_dist.models.weights import share_weights, weights_of
 from icrl_dist.problems import registry
 from icrl_dist.problems.benchmarks import DrawnContexts, PretrainingData
 from icrl_dist.training import fit, kernel_fit
@@ -90,8 +90,7 @@ def kernel_of(model: PretrainedTransformer) -> kernel_fit.KernelFit | None:
     if not kinds("training"):
         return None
     found = kernel_fit.KernelFit(model.spec, MODEL, OPTIM, weights_of(model))
-    for name, parameter in model.named_parameters():
-        parameter.data = torch.from_numpy(found.weights[name])
+    share_weights(model, found.weights)
     return found
 
 

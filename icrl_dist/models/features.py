@@ -39,6 +39,13 @@ class Features:
             raise ValueError(f"action {actions[outside][0]}: expected one of 0..{self._spec.actions - 1}")
         return np.eye(self._spec.actions, dtype=np.float32)[actions]
 
+    def transitions(
+        self, observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray, rewards: np.ndarray
+    ) -> Float32[np.ndarray, "*B I"]:
+        """The inputs of ``embed_transition``: what ``PretrainedTransformer.tokens`` embeds."""
+        columns = self.observations(observations), self.actions(actions), self.observations(next_observations)
+        return np.concatenate([*columns, rewards[..., None]], axis=-1, dtype=np.float32)
+
 
 def sine_and_cosine(x: Float32[np.ndarray, "*N"]) -> tuple[Float32[np.ndarray, "*N"], Float32[np.ndarray, "*N"]]:
     """Sine and cosine to the last place, of numbers up to 1e6 in size.  Those of libraries differ between processors."""

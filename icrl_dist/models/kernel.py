@@ -100,7 +100,7 @@ def _kernel(kind: str) -> Kernel:
     """The kernel for this instruction set, or for one that this processor has: results are equal."""
     if not kinds():
         raise RuntimeError(
-            "a pickled agent of the compiled decoder cannot be read here: install a C compiler and run `make env`, "
+            "a pickled agent of the compiled decoder cannot be read here: install a C compiler and run `make kernel`, "
             "or pickle one of load_agent(..., decoder='torch')"
         )
     return Kernel(kind if kind in kinds() else None)

@@ -92,11 +92,4 @@ class KernelTransformer(CopiedWhole):
         return flat.reshape(*x.shape[:-1], flat.shape[1])[..., :outputs]
 
     def _tokens(self, transitions: Columns) -> Float32[np.ndarray, "B T D"]:
-        observations, actions, after, rewards = transitions
-        columns = [
-            self._features.observations(observations),
-            self._features.actions(actions),
-            self._features.observations(after),
-            rewards[..., None],
-        ]
-        return self._layer("embed_transition", np.concatenate(columns, axis=-1, dtype=np.float32))
+        return self._layer("embed_transition", self._features.transitions(*transitions))

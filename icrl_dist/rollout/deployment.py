@@ -151,15 +151,8 @@ class CommittedPolicy(InContextPolicy):
     because some training windows hold actions of another task's policy (``pretrain.decoy_fraction``).
     """
 
-    def __init__(
-        self,
-        model: PretrainedTransformer | StoredTransformer,
-        batch: int,
-        context: ContextConfig,
-        watch: Watch | None = None,
-    ) -> None:
-        super().__init__(model, batch, context, watch)
-        self._encoded = 0  # number of the transitions in self._pending that the decoder has encoded
+    _encoded = 0
+    """Number of the transitions in ``_pending`` that the decoder has encoded."""
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
         for step in self._pending[self._encoded : -1]:  # observed since the last decision; the newest follows below

@@ -78,7 +78,7 @@ class KernelFit(NotCopied):
 
     def step(self, batch: TrainingBatch, learning_rate: float) -> float:
         """Update the weights by the gradient of one batch; returns its loss before the update."""
-        with np.errstate(all="ignore"):  # as torch: the loss tells of a number that is infinite or none
+        with np.errstate(all="ignore"):  # as torch: the loss is not finite then
             return self._step(batch, learning_rate)
 
     def _step(self, batch: TrainingBatch, learning_rate: float) -> float:
@@ -125,8 +125,8 @@ class KernelFit(NotCopied):
     def _inputs(self, batch: TrainingBatch) -> Inputs:
         """A batch as the kernel takes it: with the queries of each context in the order of their prefixes."""
         features, actions = self._features.observations, self._features.actions
-        columns = features(batch.observations), actions(batch.actions), features(batch.next_observations)
-        tokens = _with_one(np.concatenate([*columns, batch.rewards[..., None]], axis=-1))
+        columns = batch.observations, batch.actions, batch.next_observations, batch.rewards
+        tokens = _with_one(self._features.transitions(*columns))
         order = np.argsort(batch.prefix, axis=1, kind="stable")
         queries = _with_one(features(np.take_along_axis(batch.queries, order[..., None], 1)))
         labels = np.take_along_axis(batch.labels, order[..., None], 1)
