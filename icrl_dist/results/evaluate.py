@@ -93,6 +93,9 @@ def of_run(run: Run, name: str) -> Block:
         "method": run.method,
         "problem": run.problem,
         "training_seed": run.seed,
+        "setting": "",
+        "variant": run.method,
+        "adversaries": run.adversary.count,
         "split_seed": split_seed if whole else None,  # a plugin may give the name another meaning
     }
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-FORMAT = 1
+FORMAT = 2
 """Number of the file format.  It changes whenever a column is added, removed, or gets another meaning."""
 _FORMAT_KEY = b"icrl_dist.results.format"
 
@@ -45,7 +45,7 @@ class Column(NamedTuple):
 
 
 COLUMNS: dict[str, Column] = {
-    "format": Column("int64", "number of the file format; this page describes format 1"),
+    "format": Column("int64", "number of the file format; this page describes format 2"),
     "evaluation": Column("string", "name of the file without its suffix: which evaluation wrote the row"),
     "written": Column("string", "when, in UTC"),
     "package_version": Column("string", "version of icrl-dist"),
@@ -62,6 +62,14 @@ COLUMNS: dict[str, Column] = {
     "problem": Column("string", "problem of the run, such as `darkroom`"),
     "training_seed": Column("int64", "`seed` of the run"),
     "split_seed": Column("int64", "`split_seed` of the run's problem; null if it has none that is a whole number", True),
+    "setting": Column("string", "name of the setting in a sweep; empty outside a sweep"),
+    "variant": Column("string", "name of the method in a sweep, such as `icag-k4`; outside a sweep the method"),
+    "adversaries": Column("int64", "K: disturbances per training task, without the null adversary"),
+    "label_source": Column("string", "what the labels of training come from, such as `optimal`; null if not known", True),
+    "training_episodes": Column("int64", "episodes that the training collected; null if not known", True),
+    "labelled_episodes": Column("int64", "those of them whose labels the fits used; null if not known", True),
+    "environment_steps": Column("int64", "environment steps of the training, of demonstrations too; null if not known", True),
+    "optimizer_steps": Column("int64", "optimizer steps of the training; null if not known", True),
     "suite": Column("string", "`online`, `offline`, `posterior`, `label_quality` or `experts`"),
     "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
     "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),
@@ -85,6 +93,12 @@ COLUMNS: dict[str, Column] = {
     "optimum": Column("double", "expected return of the optimal policy in this variation, where it is known", True),
     "diverged": Column("bool", "whether the simulation diverged in this episode"),
     "surprise": Column("double", "out-of-distribution score after the evaluation's last episode; null elsewhere", True),
+    "certified": Column(
+        "double",
+        "expected return of this episode, given its context, against the worst override adversary of strength p; exact; "
+        "null where it is not known",
+        True,
+    ),
     "agreement": Column(
         "double", "in suite `label_quality`: share of the variation's labels that are optimal; null if it gave none", True
     ),
