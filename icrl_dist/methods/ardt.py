@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -58,13 +59,13 @@ class ARDT(PromptDT):
         from icrl_dist.training.sequences import Histories
 
         config, problem = run.section("ardt"), registry.of(run)
-        settings = Settings(**{name: getattr(config, name) for name in ARDTConfig.__dataclass_fields__})
+        settings = Settings(**{of.name: getattr(config, of.name) for of in dataclasses.fields(config)})
         nets = ReturnNets(problem.spec, run.model.fourier, settings, problem.train_count, run.seed)
         observed = super()._histories(run, dataset)
         nets.fit(observed, [task for _, _, task, _ in dataset.variations("pretrain", 0)])
 
         def relabel(run: Run, trials: Sequence[Trajectory]) -> Histories:
             history = Histories.read(trials)
-            return Histories.read(trials, nets.relabelled(trials[0].identity.task, history))
+            return dataclasses.replace(history, to_go=nets.relabelled(trials[0].identity.task, history))
 
         return cached(run, dataset, relabel)

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from icrl_dist.config.sections import ModelConfig
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.features import Features
-from icrl_dist.models.gpt import GPT, KVCache
+from icrl_dist.models.gpt import GPT, Block, KVCache, causal_mask
 from icrl_dist.models.sampling import sample
 from icrl_dist.models.segments import PromptBatch, Segments
 from icrl_dist.types import Spec
@@ -26,11 +26,11 @@ TOKENS = 3
 """Tokens of a step: return-to-go, state, action."""
 
 
-class EncodedPrompt(NamedTuple):
-    """Keys and values of B prompts, and which of their tokens a window sees."""
+class Encoded(NamedTuple):
+    """Keys and values of T tokens of each of B rows, a prompt and the steps after it, and which of them later tokens see."""
 
     cache: KVCache
-    visible: Bool[Tensor, "B 1 T"]
+    visible: Bool[Tensor, "B T"]
 
 
 class StepEmbedding(nn.Module):
@@ -91,20 +91,34 @@ class DecisionTransformer(nn.Module):
     def _put(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.scale.device)
 
-    def encode(self, prompt: Segments) -> EncodedPrompt:
-        """Keys and values of prompts; a window sees those of valid steps only."""
-        visible = self._put(prompt.valid).repeat_interleave(TOKENS, dim=1)[:, None]
-        return EncodedPrompt(self.trunk.encode(self._tokens(self.embed_prompt, prompt)), visible)
+    def encode(self, prompt: Segments) -> Encoded:
+        """Prompts; later tokens see their valid steps only."""
+        visible = self._put(prompt.valid).repeat_interleave(TOKENS, dim=1)
+        return Encoded(self.trunk.encode(self._tokens(self.embed_prompt, prompt)), visible)
 
-    def forward(self, prompt: EncodedPrompt, window: Segments) -> Float[Tensor, "B L A"]:
+    def forward(self, prompt: Encoded, window: Segments) -> Float[Tensor, "B L A"]:
         """Outputs at every state of the windows; those at padding have no meaning.
 
         Padding is at the end of a window, so no valid token sees it.  No state sees its own action.
         """
         tokens = self._tokens(self.embed_window, window)[:, :-1]  # no state comes after the last action
-        states = self.trunk.query(tokens, prompt.cache, prompt.visible, tokens.shape[1])[:, 1::TOKENS]
-        outputs: Tensor = self.head(states)
-        return outputs
+        return self._extend(tokens, prompt, slice(1, None, TOKENS))[0]
+
+    def _extend(self, x: Float[Tensor, "B N D"], past: Encoded, wanted: slice) -> tuple[Float[Tensor, "B W A"], KVCache]:
+        """Outputs at the ``wanted`` of N tokens that follow others, and the keys and values of all T + N tokens."""
+        batch, new = x.shape[:2]
+        causal = causal_mask(new, x.device).expand(batch, -1, -1)
+        visible = torch.cat([past.visible[:, None].expand(-1, new, -1), causal], dim=-1)[:, None]
+        cache: KVCache = []
+        for block, (keys, values) in zip(self.trunk.blocks, past.cache, strict=True):
+            assert isinstance(block, Block)
+            q, k, v = block.attn_qkv(x)
+            cache.append((torch.cat([keys, k], dim=2), torch.cat([values, v], dim=2)))
+            if len(cache) == len(past.cache):  # what follows concerns each token alone
+                q, x, visible = q[:, :, wanted], x[:, wanted], visible[:, :, wanted]
+            x = block.attn_out_and_mlp(x, F.scaled_dot_product_attention(q, *cache[-1], attn_mask=visible))
+        outputs: Tensor = self.head(self.trunk.norm(x))
+        return outputs, cache
 
     def loss(self, batch: PromptBatch) -> Float[Tensor, ""]:
         """The mean over valid steps of -log P(action), or of the squared error of vectors; keeps ``target`` and ``scale``."""
@@ -117,15 +131,18 @@ class DecisionTransformer(nn.Module):
         return F.mse_loss(outputs[valid].tanh(), actions[valid])
 
     @torch.inference_mode()
-    def encode_frozen(self, prompt: Segments) -> EncodedPrompt:
+    def encode_frozen(self, prompt: Segments) -> Encoded:
         """``encode`` without gradients, for deployment."""
         return self.encode(prompt)
 
     @torch.inference_mode()
-    def decide(self, prompt: EncodedPrompt, window: Segments) -> Float32[np.ndarray, "B A"]:
-        """Outputs at the last state of windows without padding."""
-        outputs: np.ndarray = self(prompt, window)[:, -1].cpu().numpy()
-        return outputs
+    def decide(self, past: Encoded, steps: Segments) -> tuple[Float32[np.ndarray, "B A"], Encoded]:
+        """Outputs at the last state of steps without padding; and ``past`` followed by all of these steps but the last."""
+        tokens = self._tokens(self.embed_window, steps)[:, :-1]
+        outputs, cache = self._extend(tokens, past, slice(-1, None))
+        known = cache[0][0].shape[2] - 2  # without return-to-go and state of the last step
+        visible = F.pad(past.visible, (0, known - past.visible.shape[1]), value=True)
+        return outputs[:, 0].cpu().numpy(), Encoded([(k[:, :, :known], v[:, :, :known]) for k, v in cache], visible)
 
     def act(self, outputs: Float32[np.ndarray, "B A"], u: Float[np.ndarray, "B U"]) -> Actions:
         """The action of each row: discrete ones sampled by the uniform numbers, vectors as they are."""

@@ -16,7 +16,7 @@ from icrl_dist.interfaces import Actions
 from icrl_dist.models.segments import Segments, returns_to_go
 
 if TYPE_CHECKING:
-    from icrl_dist.models.dt import DecisionTransformer, EncodedPrompt
+    from icrl_dist.models.dt import DecisionTransformer, Encoded
 
 
 class PromptedPolicy(CopiedWhole):
@@ -43,7 +43,9 @@ class PromptedPolicy(CopiedWhole):
 
     def _start(self) -> None:
         """Begin an episode."""
-        self._encoded: EncodedPrompt | None = None
+        self._encoded: Encoded | None = None  # the prompt
+        self._known: Encoded | None = None  # the prompt and the first ``_count`` steps of this episode
+        self._count = 0
         self._steps: list[tuple[np.ndarray, ...]] = []  # return-to-go, observation and action of each step so far
         self._rewards: list[np.ndarray] = []
         self._to_go = np.full(len(self._best), self.model.target.item(), np.float32)
@@ -62,23 +64,31 @@ class PromptedPolicy(CopiedWhole):
         def of(column: np.ndarray) -> np.ndarray:
             return np.repeat(column[row : row + 1], len(states), axis=0)
 
-        steps = [tuple(map(of, step)) for step in (*self._seen(), self._now(states[:1].repeat(len(self._best), axis=0)))]
-        window = self._window(steps)._replace(observations=np.stack([*(step[1] for step in steps[:-1]), states], axis=1))
+        steps = [tuple(map(of, step)) for step in self._steps[self._first() :]]
+        to_go, _, nothing = map(of, self._now(states))
         encoded = self.model.encode_frozen(Segments(*map(of, self._prompt)))
-        return self.model.probabilities(self.model.decide(encoded, window))
+        return self.model.probabilities(self.model.decide(encoded, self._window([*steps, (to_go, states, nothing)]))[0])
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B A"]:
+        """Within the first window of an episode a decision costs the newest step; later the window loses its first step."""
         if self._encoded is None:
-            self._encoded = self.model.encode_frozen(self._prompt)
-        return self.model.decide(self._encoded, self._window([*self._seen(), self._now(observation)]))
+            self._encoded = self._known = self.model.encode_frozen(self._prompt)
+            self._count = 0
+        assert self._known is not None
+        now, first = self._now(observation), self._first()
+        if len(self._steps) < self.model.window:
+            outputs, self._known = self.model.decide(self._known, self._window([*self._steps[self._count :], now]))
+            self._count = len(self._steps)
+            return outputs
+        return self.model.decide(self._encoded, self._window([*self._steps[first:], now]))[0]
 
-    def _seen(self) -> list[tuple[np.ndarray, ...]]:
-        """The last steps of this episode, which belong to the window of the next decision."""
-        return self._steps[max(0, len(self._steps) + 1 - self.model.window) :]
+    def _first(self) -> int:
+        """Number of the first step in the window of the next decision."""
+        return max(0, len(self._steps) + 1 - self.model.window)
 
     def _now(self, observation: Float32[np.ndarray, "B S"]) -> tuple[np.ndarray, ...]:
         """The step whose action is to be decided; the zeros in place of its action are no input."""
-        shape, spec = (len(observation),), self.model.spec
+        shape, spec = self._best.shape, self.model.spec
         nothing = np.zeros(shape, np.int64) if spec.discrete else np.zeros((*shape, spec.actions), np.float32)
         return self._to_go, observation, nothing
 

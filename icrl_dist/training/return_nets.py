@@ -91,7 +91,8 @@ class ReturnNets:
         inputs = self._inputs(histories[0], slice(0, 1))
         sizes = inputs[0].shape[-1], sum(part.shape[-1] for part in inputs)
         rng = generator(self._seed, RandomKey.RETURN_NETS, 0)
-        self._q1, self._q2 = (_drawn(ReturnNet(self._tasks, size, self._settings.width), rng) for size in sizes)
+        with torch.random.fork_rng(()):  # torch's generator is that of the model
+            self._q1, self._q2 = (_drawn(ReturnNet(self._tasks, size, self._settings.width), rng) for size in sizes)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
@@ -103,19 +104,7 @@ class ReturnNets:
         of = self._settings
         optimizer = optimizers.Adam([*self._q1.parameters(), *self._q2.parameters()], lr=of.learning_rate)
         for step in range(of.steps):
-            rng = generator(self._seed, RandomKey.RETURN_NETS, 1, step)
-            chosen = rng.integers(0, len(histories), size=of.batch)
-            drawn = [histories[int(i)] for i in chosen]
-            rows = [int(rng.integers(0, len(one.rewards))) for one in drawn]
-            inputs = [self._inputs(one, slice(row, row + 1)) for one, row in zip(drawn, rows, strict=True)]
-            agent, adversary = (torch.from_numpy(np.concatenate(part)) for part in zip(*inputs, strict=True))
-            rewards, observed = (
-                torch.from_numpy(np.stack(part)) / self._scale
-                for part in zip(
-                    *((one.rewards[row], one.observed[row]) for one, row in zip(drawn, rows, strict=True)), strict=True
-                )
-            )
-            number = torch.from_numpy(tasks[chosen])[:, None].expand(rewards.shape)
+            number, agent, adversary, rewards, observed = self._drawn(histories, tasks, step)
             q1, q2 = self._q1(number, agent), self._q2(number, torch.cat([agent, adversary], dim=-1))
             if step < of.steps // 2:
                 loss = ((q1 - observed) ** 2).mean() + ((q2 - observed) ** 2).mean()
@@ -129,6 +118,19 @@ class ReturnNets:
                 raise FloatingPointError(
                     f"the loss of the return nets is {value} at step {step}: lower ardt.learning_rate ({rate})"
                 )
+
+    def _drawn(self, histories: Sequence[Histories], tasks: Int64[np.ndarray, " V"], step: int) -> list[Tensor]:
+        """Tasks, inputs of both kinds, rewards and observed returns-to-go of the episodes of a step; returns are scaled."""
+        rng = generator(self._seed, RandomKey.RETURN_NETS, 1, step)
+        rows = []
+        for number in rng.integers(0, len(histories), size=self._settings.batch):
+            one = histories[int(number)]
+            episode = int(rng.integers(0, len(one.rewards)))
+            agent, adversary = self._inputs(one, slice(episode, episode + 1))
+            task = np.full(one.rewards.shape[1], tasks[number])
+            scaled = (of[episode] / np.float32(self._scale) for of in (one.rewards, one.observed))
+            rows.append((task, agent[0], adversary[0], *scaled))
+        return [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
 
     @torch.inference_mode()
     def relabelled(self, task: int, history: Histories) -> Float32[np.ndarray, "E H"]:
@@ -149,7 +151,7 @@ class ReturnNets:
 
 
 def _drawn(net: ReturnNet, rng: np.random.Generator) -> ReturnNet:
-    """The net with initial weights drawn by this generator: torch's own is that of the model."""
+    """The net with initial weights drawn by this generator."""
     with torch.no_grad():
         for name, parameter in net.named_parameters():
             scale = 0.0 if name.endswith("bias") else 0.3 if name.startswith("task") else parameter.shape[1] ** -0.5

@@ -25,20 +25,29 @@ class Histories(Examples):
     """Returns-to-go of the rewards, which prompts hold: a deployed agent knows no others of its own episodes."""
 
     @classmethod
-    def read(cls, episodes: Sequence[Trajectory], to_go: Float32[np.ndarray, "E H"] | None = None) -> Self:
-        """The histories of these episodes.  ``to_go``: None for the observed returns-to-go."""
-        actions, observations, rewards = (np.stack([getattr(t, of) for t in episodes]) for of in _COLUMNS)
+    def read(cls, episodes: Sequence[Trajectory]) -> Self:
+        """The histories of these episodes, with observed returns-to-go in windows too."""
+        return cls.made(*(np.stack([getattr(t, of) for t in episodes]) for of in _COLUMNS))
+
+    @classmethod
+    def made(
+        cls,
+        actions: Int16[np.ndarray, "E H"] | Float32[np.ndarray, "E H A"],
+        observations: Float32[np.ndarray, "E H+1 S"],
+        rewards: Float32[np.ndarray, "E H"],
+        adversary: Int16[np.ndarray, "E H"] | Float32[np.ndarray, "E H F"],
+    ) -> Self:
+        """The histories of E episodes, given as arrays."""
         observed = returns_to_go(rewards)
-        none = np.zeros((0, 0), np.float32)
         return cls(
             actions=actions if actions.ndim == 3 else actions.astype(np.int64),
             observations=observations,
             rewards=rewards,
-            queries=none,
-            labels=none,
+            queries=np.zeros((0, observations.shape[-1]), np.float32),
+            labels=np.zeros((0, actions.shape[-1]), np.float32),
             history=False,
-            adversary=np.stack([t.adversary for t in episodes]),
-            to_go=observed if to_go is None else to_go,
+            adversary=adversary,
+            to_go=observed,
             observed=observed,
         )
 
@@ -64,7 +73,7 @@ class Histories(Examples):
         return Segments(column(to_go), column(self.observations), column(self.actions), steps, valid)
 
 
-_COLUMNS = ("actions", "observations", "rewards")
+_COLUMNS = ("actions", "observations", "rewards", "adversary")
 
 
 @dataclass(frozen=True)
