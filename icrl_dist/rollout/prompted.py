@@ -10,7 +10,6 @@ from jaxtyping import Float, Float32, Int64
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, Deployment
-from icrl_dist.config.toml import nearest
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
 from icrl_dist.models.segments import Segments, returns_to_go
@@ -154,7 +153,7 @@ def prompted(
     """The model deployed in B environments.  Raises ConfigError for another rule than ``paper``."""
     if deploy not in (None, "paper"):
         raise ConfigError(
-            f"deploy = {deploy!r}{nearest(str(deploy), ('paper', 'committed'))}: a decision transformer is deployed by 'paper' "
+            f"deploy = {deploy!r}: a decision transformer is deployed by 'paper' "
             "only: its prompt changes between episodes; leave deploy out"
         )
     return PromptedPolicy(model, batch, context)

@@ -13,7 +13,7 @@ from icrl_dist.training.return_nets import ReturnNets, Settings, expectile_loss,
 from icrl_dist.training.sequences import Histories
 from icrl_dist.types import Spec
 
-SETTINGS = Settings(alpha=0.01, leaf_weight=0.9, steps=1200, batch=16, width=32, learning_rate=3e-3)
+SETTINGS = Settings(alpha=0.01, leaf_weight=0.9, steps=1000, batch=8, width=32, learning_rate=1e-2)
 SPEC = Spec((0.0,), (1.0,), actions=2, horizon=2)
 
 
@@ -110,6 +110,7 @@ def table(one: Histories, alpha: float) -> np.ndarray:
     return found
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("alpha", [0.1, 0.5])
 def test_relabelled_returns_are_those_of_a_table(alpha: float) -> None:
     one = game()

@@ -53,9 +53,9 @@ def drawn(variations: list[Histories], dropout: float = 0.0, count: int = 400) -
 
 
 def test_every_step_is_in_equally_many_windows() -> None:
-    _, window = drawn([histories(4)], count=4000)
+    _, window = drawn([histories(4)], count=800)
     counts = np.bincount(window.steps[window.valid], minlength=H)
-    expected = 3 * 4000 * W / (H + W - 1)
+    expected = 3 * 800 * W / (H + W - 1)
     assert len(counts) == H and (abs(counts - expected) < 5 * np.sqrt(expected)).all(), counts
     assert 0 < window.actions[window.valid].mean() < 1, "action 0 is not padding"
 
@@ -77,9 +77,9 @@ def test_a_prompt_is_of_another_episode_of_the_same_variation_and_holds_observed
 
 
 def test_prompts_are_left_out_at_random_and_where_there_is_no_other_episode() -> None:
-    prompt, _ = drawn([histories(4)], dropout=0.25, count=2000)
+    prompt, _ = drawn([histories(4)], dropout=0.25, count=800)
     assert (prompt.valid.all(axis=1) == prompt.valid.any(axis=1)).all()
-    assert abs(prompt.valid[:, 0].mean() - 0.75) < 0.03
+    assert abs(prompt.valid[:, 0].mean() - 0.75) < 0.04
     alone, window = drawn([histories(1)])
     assert not alone.valid.any() and window.valid.any(axis=1).all()
 
