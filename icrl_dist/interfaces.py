@@ -264,7 +264,10 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
-        """K adversaries of one training task, phi_0 first (section 4.1)."""
+        """The K disturbances of one training task, without phi_0 (section 4.1): ``config.count`` of them, all different.
+
+        The first ones do not depend on K: with the same generator a larger K adds adversaries at the end.
+        """
 
     @abc.abstractmethod
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:

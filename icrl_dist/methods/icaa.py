@@ -26,7 +26,7 @@ class ICAA(DPT):
         self._gives_labels: dict[VariationKey, bool] = {}
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """K variations, with new adversaries in every round (line 11)."""
+        """All variations, with new adversaries in every round (line 11)."""
         return registry.training_variations(run, index, task, round)
 
     def phases(self, run: Run) -> tuple[Phase, ...]:

@@ -31,7 +31,7 @@ def pretraining_contexts(run: Run, phase: Phase, choose: Choose) -> tuple[Job, .
 
 
 def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], trials: int, payload: Payload) -> tuple[Job, ...]:
-    """Jobs of ``stream.job_tasks`` tasks each; ``chosen`` holds the K variations of every task."""
+    """Jobs of ``stream.job_tasks`` tasks each; ``chosen`` holds the variations of every task."""
     jobs = []
     for first in range(0, len(chosen), run.stream.job_tasks):
         group = chosen[first : first + run.stream.job_tasks]

@@ -39,7 +39,7 @@ def test_in_meta_world_labels_come_from_the_scripted_policy_at_the_true_states(s
         "metaworld-pick-place",
         method="icag",
         control=ControlConfig(train_tasks=2, test_tasks=1, horizon=30),
-        adversary=AdversaryConfig(count=2),
+        adversary=AdversaryConfig(count=1),
         sac=sac,
         pretrain=dataclasses.replace(small_run.pretrain, contexts=8, queries=5),
     )
