@@ -277,6 +277,11 @@ class Payload:
         found: LabelCounts | None = getattr(getattr(self, "labelling", None), "label_counts", None)
         return found
 
+    def env_steps(self, trials: int, horizon: int) -> int:
+        """Environment steps of a job in each variation: its trials, and the action windows of each."""
+        windows = self.labels.window_steps if self.labels else 0
+        return trials * (horizon + windows)
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Job:

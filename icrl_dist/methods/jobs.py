@@ -58,14 +58,14 @@ def rollouts(run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployme
     return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule, run.context.decoder))
 
 
-def dagger_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment]) -> tuple[Job, ...]:
+def labelled_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment], trials: int) -> tuple[Job, ...]:
     """Jobs that deploy T^j in every training variation and label query states as in D_pre.
 
     Episodes start as test episodes do.  Jobs take the deployment rules in turn, because each rule gives
     another kind of history.
     """
     payload = LabelledRollouts(run.context.max, rules[0], run.context.decoder, registry.of(run).labelling(run))
-    jobs = grouped(run, phase, _at_test_start(run, choose), run.dagger.trials, payload)
+    jobs = grouped(run, phase, _at_test_start(run, choose), trials, payload)
     return tuple(
         dataclasses.replace(job, payload=dataclasses.replace(payload, deploy=rules[(phase.round + number) % len(rules)]))
         for number, job in enumerate(jobs)

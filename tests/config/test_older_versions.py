@@ -122,5 +122,5 @@ def test_phi_0_was_one_of_the_counted_adversaries() -> None:
     variations = registry.training_variations(run, 0, registry.of(run).split.train[0])
     assert len(variations) == tomllib.loads(ICAG)["adversary"]["count"] and variations[0].adversary == NULL
     for wrong in ('count = "two"', "count = 0", "count = true"):
-        with pytest.raises(ConfigError, match="adversary.count"):
+        with pytest.raises(ConfigError, match=r"adversary\.count"):
             parse_written(f"[adversary]\n{wrong}", "x")

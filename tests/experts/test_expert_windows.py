@@ -10,7 +10,8 @@ from icrl_dist.config.run import ConfigError, validate
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import cache
-from icrl_dist.experts.cache import WINDOW_EPISODES, History
+from icrl_dist.experts.cache import History
+from icrl_dist.experts.payloads import WINDOW_EPISODES
 from icrl_dist.experts.sac import batched
 from icrl_dist.experts.train import ExpertPolicy, ScriptedPolicy
 from icrl_dist.methods import registry as methods
