@@ -109,9 +109,9 @@ def test_demonstrations_of_experts_count_with_their_training() -> None:
     scripted = load("metaworld-laptop")
     found, section = budget.of(scripted), scripted.section("control")
     variations = section.train_tasks * scripted.adversary.variations
-    windows = WINDOW_EPISODES * (1 + (scripted.pretrain.decoy_fraction > 0)) if scripted.pretrain.windows else 0
+    more = WINDOW_EPISODES * (1 + (scripted.pretrain.decoy_fraction > 0)) if scripted.pretrain.windows else 0
     assert section.histories == "scripted"
-    assert found.environment_steps == (found.training_episodes + variations * windows) * problems.of(scripted).horizon
+    assert found.environment_steps == (found.training_episodes + variations * more) * problems.of(scripted).horizon
 
 
 def test_result_rows_hold_the_budget(small_run: Run) -> None:

@@ -27,7 +27,7 @@ def run(small_run: Run) -> Run:
     return override(dataclasses.replace(small_run, method="mix_dpt"), ["mix_dpt.rounds=2", "mix_dpt.trials=2"], "x")
 
 
-@pytest.mark.parametrize("steps", [10, 11, 59, 2800])
+@pytest.mark.parametrize("steps", [14, 15, 59, 2800])
 @pytest.mark.parametrize("rounds", [1, 2, 3, 7])
 def test_the_early_phase_has_two_fifths_of_the_steps_and_the_rounds_divide_the_others(
     run: Run, steps: int, rounds: int

@@ -171,11 +171,8 @@ def test_without_phi_0_in_training_contexts_at_p_0_are_undisturbed_and_no_prior_
     run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Sequence[Variation]] = []
-    contexts = divergence.contexts
     monkeypatch.setattr(divergence, "CONTEXTS", 8)
-    monkeypatch.setattr(
-        divergence, "contexts", lambda kind, rows, act, rngs: made.append(rows) or contexts(kind, rows, act, rngs)
-    )
+    monkeypatch.setattr(divergence, "contexts", noting(made, lambda kind, rows, act, rngs: rows, divergence.contexts))
     run = dataclasses.replace(run, adversary=AdversaryConfig(count=2, null=False))
     assert {one.p for pair in measured(run, model, False) for one in pair} == {0.0, 0.2}
     assert [{v.adversary == NULL for v in rows} for rows in made] == [{True}] * len(KINDS) + [{False}] * len(KINDS)
