@@ -213,7 +213,7 @@ def test_a_missing_or_damaged_checkpoint_is_refused_in_one_line(tmp_path):
 
 def test_a_result_has_the_exact_optimum_of_its_variations(small_run):
     (result, *_) = evaluate.online(small_run, {Agent("random"): references(small_run)["random"]})
-    np.testing.assert_allclose(known(result.optimum), optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
+    np.testing.assert_allclose(known(result.optimum), optimal_returns(Hypotheses.of(result.variations[0])))
 
 
 @pytest.fixture
