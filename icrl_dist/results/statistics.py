@@ -222,11 +222,11 @@ def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1, d
     """
     if units((trainings, tasks, evaluations)) == 1:
         return "one training, one evaluation of one task: no intervals"
-    each = _count(evaluations, "evaluation") + " of each"
+    each = counted(evaluations, "evaluation") + " of each"
     if draws > 1:
-        over = f"{_count(tasks, 'task')}, {each} with an adversary draw of its own"
+        over = f"{counted(tasks, 'task')}, {each} with an adversary draw of its own"
     else:
-        over = f"{_count(tasks, 'task')} with {'its adversary' if tasks == 1 else 'their adversaries'}, {each}"
+        over = f"{counted(tasks, 'task')} with {'its adversary' if tasks == 1 else 'their adversaries'}, {each}"
     if episodes > 1:
         over += f", {episodes} episodes an evaluation"
     if trainings == 1:
@@ -234,5 +234,6 @@ def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1, d
     return f"95% interval over {trainings} training seeds, {over}"
 
 
-def _count(number: int, what: str) -> str:
+def counted(number: int, what: str) -> str:
+    """A number and its noun, such as ``2 tasks``."""
     return f"{number} {what}{'' if number == 1 else 's'}"
