@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,6 +48,11 @@ class ARDT(PromptDT):
     name = "ardt"
     section = "ardt"
     Config = ARDTConfig
+
+    def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        yield from super().objections(run)
+        if run.adversary.count == 0:
+            yield "adversary.count", 0, "ardt learns from the actions of adversaries: use at least 1, or the method prompt_dt"
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
         """The K variations of ICAG."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 from icrl_dist.config.ranges import Positive, Share, remedy
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import ContextConfig, Deployment
-from icrl_dist.interfaces import Draw, Method, Phase, TrajectoryDataset, Watch
+from icrl_dist.interfaces import Draw, Method, Phase, TrajectoryDataset, UsedLabels, Watch
 from icrl_dist.methods import jobs
 from icrl_dist.methods.dpt import pretrain_phase
 from icrl_dist.problems import registry
@@ -67,6 +67,10 @@ class PromptDT(Method):
 
     def ask(self, run: Run, phase: Phase) -> tuple[Job, ...]:
         return jobs.pretraining_contexts(run, phase, lambda index, task: self.training_variations(run, index, task, 0))
+
+    def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels:
+        """The actions of every episode take the place of labels."""
+        return UsedLabels("logged actions", job.trials)
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
         """Draws windows with prompts (``training.sequences.draw``); reads all of D_pre once for target and scale."""

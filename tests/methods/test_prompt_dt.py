@@ -11,7 +11,9 @@ import pytest
 
 import icrl_dist
 from icrl_dist.config.run import ConfigError, Run, validate
+from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.launch import train
+from icrl_dist.methods import budget
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.ardt import ARDT, ARDTConfig
 from icrl_dist.methods.prompt_dt import PromptDT, PromptDTConfig
@@ -88,6 +90,19 @@ def test_a_window_or_a_prompt_beyond_the_horizon_is_refused(small_run: Run) -> N
         run = dataclasses.replace(run, prompt_dt=PromptDTConfig(**{"window": 8, "prompt": 8, key: 9}))  # type: ignore[call-arg]
         with pytest.raises(ConfigError, match=rf"prompt_dt\.{key} = 9: use 1 to 8: at most the horizon, 8 steps"):
             validate(run, "test")
+
+
+def test_their_budgets_are_those_of_dpt_with_logged_actions_as_labels(small_run: Run) -> None:
+    of = {name: asked(small_run, name, adversary=AdversaryConfig(count=2)) for name in ("dpt", *NAMES)}
+    assert not budget.differences({name: [run] for name, run in of.items()})
+    assert [budget.of(of[name]).label_source for name in NAMES] == ["logged actions"] * 2
+
+
+def test_ardt_without_adversaries_is_refused(small_run: Run) -> None:
+    run = asked(small_run, "ardt", adversary=AdversaryConfig(count=0))
+    with pytest.raises(ConfigError, match=r"adversary\.count = 0: .* or the method prompt_dt"):
+        validate(run, "test")
+    validate(dataclasses.replace(run, method="prompt_dt"), "test")
 
 
 def test_they_are_not_fitted_by_the_kernel_and_have_no_rule_but_algorithm_1(small_run: Run) -> None:

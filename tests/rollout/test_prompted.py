@@ -140,7 +140,7 @@ def test_the_weights_are_those_of_the_start_and_a_copy_acts_like_the_original() 
     copied = copy.copy(policy)
     with torch.no_grad():
         one.head.weight.zero_()
-        policy.model.head.bias += torch.tensor([5.0, 0, 0])
+        policy.model.head.bias.add_(torch.tensor([5.0, 0, 0]))
     assert abs(policy.probabilities(states[:, 0]) - before).max() > 0.01
     np.testing.assert_array_equal(copied.probabilities(states[:, 0]), before)
 

@@ -36,7 +36,7 @@ def test_the_expectile_loss_and_its_minimizer_against_loops(alpha: float) -> Non
     def closure() -> torch.Tensor:
         optimizer.zero_grad()
         value = expectile_loss(torch.from_numpy(targets) - found, alpha)
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         return value
 
     for _ in range(20):
@@ -60,7 +60,7 @@ def test_the_loss_of_both_nets_against_a_loop_and_its_gradients() -> None:
     first = np.mean([weighted(b[n, h] - a[n, h], 0.2) for n in rows for h in range(3)])
     found = minimax_loss(q1, q2, rewards, 0.2, 0.9)
     assert found.item() == pytest.approx(0.1 * tree + 0.9 * leaf + first)
-    found.backward()  # type: ignore[no-untyped-call]
+    found.backward()
     # Each net learns from the other, and is not moved towards it.
     only = torch.autograd.grad(expectile_loss(q2.detach() - q1, 0.2), q1)[0]
     assert q1.grad is not None

@@ -18,8 +18,8 @@ def histories(episodes: int, seed: int = 0, vectors: bool = False) -> Histories:
     rng = np.random.default_rng(seed)
     places = np.stack(np.meshgrid(np.arange(episodes), np.arange(H + 1), indexing="ij"), axis=-1)
     rewards = rng.normal(size=(episodes, H)).astype(np.float32)
-    actions = rng.uniform(-1, 1, (episodes, H, 2)).astype(np.float32) if vectors else rng.integers(0, 2, (episodes, H))
-    actions = actions.astype(np.float32 if vectors else np.int16)
+    drawn = rng.uniform(-1, 1, (episodes, H, 2)) if vectors else rng.integers(0, 2, (episodes, H))
+    actions = drawn.astype(np.float32 if vectors else np.int16)
     made = Histories.made(actions, places.astype(np.float32), rewards, np.full((episodes, H), -1, np.int16))
     return replace(made, to_go=100 + made.observed)
 
