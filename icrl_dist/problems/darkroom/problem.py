@@ -77,7 +77,7 @@ class ExactRoom:
         return make
 
     def _any_goal(self, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
-        """One hypothesis per goal under this adversary, with their labels; cached for the latest 256 adversaries, as many as an evaluation has."""
+        """One hypothesis per goal under this adversary, with their labels; cached for the latest 256 adversaries."""
         if adversary not in self._by_adversary:
             size, horizon = self._config.size, self._config.horizon
             goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
