@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from jaxtyping import Float64
 
@@ -17,6 +19,7 @@ _PARAMETERS = {"null": (), "uniform": ("p",), "dirichlet": ("p", "alpha")}
 """The families of adversaries, and their parameters."""
 
 
+@functools.lru_cache(maxsize=4096)
 def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     """q_b = P(argmax of x ~ Dirichlet(alpha) is b), to about 1e-9.
 
@@ -33,7 +36,9 @@ def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     cdf = gammainc(a, t)
     others = np.stack([np.prod(np.delete(cdf, b, axis=0), axis=0) for b in range(len(alpha))])
     q = np.trapezoid(np.exp(log_density) * others, y[0], axis=1)
-    return q / q.sum()
+    q /= q.sum()
+    q.flags.writeable = False  # later callers get the same array
+    return q
 
 
 def override_distribution(adversary: Adversary, actions: int) -> tuple[float, Float64[np.ndarray, " A"]]:

@@ -77,13 +77,13 @@ class ExactRoom:
         return make
 
     def _any_goal(self, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
-        """One hypothesis per goal under this adversary, with their labels; cached for the latest 64 adversaries."""
+        """One hypothesis per goal under this adversary, with their labels; cached for the latest 256 adversaries."""
         if adversary not in self._by_adversary:
             size, horizon = self._config.size, self._config.horizon
             goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
             hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
             self._by_adversary[adversary] = hypotheses, soft_labels(hypotheses, self._config.gamma, self._config.label_slack)
-            if len(self._by_adversary) > 64:
+            if len(self._by_adversary) > 256:
                 del self._by_adversary[next(iter(self._by_adversary))]
         return self._by_adversary[adversary]
 
