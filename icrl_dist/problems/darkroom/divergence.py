@@ -17,14 +17,14 @@ from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Batch, MakePolicy
 from icrl_dist.problems import registry
-from icrl_dist.problems.darkroom.adversaries import adversary_set
+from icrl_dist.problems.darkroom.adversaries import adversary_set, grid
 from icrl_dist.problems.darkroom.behavior_policies import Walks
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.labels import labels_of
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior, posterior_action
 from icrl_dist.rollout.episode import deploy_online, episode
-from icrl_dist.types import Variation
+from icrl_dist.types import NULL, Variation
 
 Decide = Callable[[Sequence[np.ndarray], Float32[np.ndarray, "B N S"], Int64[np.ndarray, "B N"]], Float64[np.ndarray, "B N A"]]
 """A model's distributions at query states, each given its own prefix of the transitions (``Method.distributions``)."""
@@ -42,6 +42,8 @@ CONTEXTS, EPISODES = 160, 2
 """Contexts of each kind and p, and episodes per context."""
 _ADVERSARIES = 16
 """Approximate number of adversaries of the second prior: a multiple of K that is not smaller."""
+_LEVELS = 4
+"""Strengths of the winds, or of the permuted controls, of the second prior."""
 _CHUNK = 32
 """Contexts per call of the model."""
 
@@ -91,11 +93,19 @@ def levels(run: Run) -> tuple[float, ...]:
 
 
 def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
-    """The equally likely variations of each of ``PRIORS``: those of training goals; for held-out contexts of all goals."""
+    """The equally likely variations of each of ``PRIORS``: those of training goals; for held-out contexts of all goals.
+
+    In the second, winds and permuted controls are a grid: a few random ones may lack the direction of a context, whose
+    probability would then be 0 under every variation.
+    """
     groups = training_variations(run, False) + (training_variations(run, True) if heldout else [])
     rng = generator(run.seed, RandomKey.POSTERIOR_SUITE)
     sets = range(-(-_ADVERSARIES // _count(run)) if _count(run) > 1 else 1)
     several = [a for _ in sets for a in adversary_set(rng, _count(run), ACTIONS, run.adversary.p_max)]
+    kind = registry.of(run).config.disturbance
+    if kind != "override" and _count(run) > 1:
+        others = grid(kind, ACTIONS, run.adversary.p_max, _LEVELS)
+        several = [*[NULL] * max(1, round(len(others) / (_count(run) - 1))), *others]  # phi_0 has its share, 1/K
     own = [v for group in groups for v in group]
     return Hypotheses.of(own), Hypotheses.of([Variation(group[0].task, a) for group in groups for a in several])
 

@@ -102,6 +102,14 @@ def optimal_values(h: Hypotheses) -> Float64[np.ndarray, "M C"]:
     return value
 
 
+def policy_values(h: Hypotheses, policy: Float[np.ndarray, "M C A"]) -> Float64[np.ndarray, "M C"]:
+    """Expected undiscounted return from every cell of a Markov policy for each hypothesis."""
+    value = np.zeros((len(h.goal), h.size**2))
+    for _ in range(h.horizon):
+        value = (policy * _backup(h, value, 1.0)).sum(axis=2)
+    return value
+
+
 def optimal_returns(h: Hypotheses, start: Sequence[int] = (0, 0)) -> Float64[np.ndarray, " M"]:
     """Expected undiscounted return of the optimal policy from ``start``, which no agent can exceed."""
     best: np.ndarray = optimal_values(h)[:, int(start[0]) * h.size + int(start[1])]
