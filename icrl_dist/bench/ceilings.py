@@ -87,6 +87,6 @@ def describe(result: dict[str, Any]) -> str:
             shares = ", ".join(f"{100 * row['kept']:.0f}% at p = {row['p']:g}" for row in kept)
             lines.append(f"  {disturbance}, {size}x{size}, {horizon} steps: {shares}")
     goals = 10 * result["splits"]
-    size = f"{goals} goals, {result['seeds']} evaluations of each"
-    lines.append(f"returns: 7x7, last {LAST} of 20 episodes, {size}; +- standard error over goals and their adversaries")
+    counts = f"{goals} goals, {result['seeds']} evaluations of each"
+    lines.append(f"returns: 7x7, last {LAST} of 20 episodes, {counts}; +- standard error over goals and their adversaries")
     return "\n".join(lines)

@@ -37,7 +37,7 @@ class EvaluateArguments:
     seeds: int | None = None
     """Evaluations per task.  Default: the run's number (posterior: 2)."""
     p: tuple[float, ...] = ()
-    """Override probabilities to test.  Default: the run's (posterior: 0 0.2 0.4 0.6)."""
+    """Probabilities p of a disturbed step to test.  Default: the run's (posterior: 0 0.2 0.4 0.6)."""
     prior: Literal["uniform", "unseen"] | None = None
     """Distribution of the test adversaries.  Default: the run's (posterior: uniform)."""
     json: bool = False
