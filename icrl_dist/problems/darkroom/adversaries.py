@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int
 
 from icrl_dist.config.toml import nearest
 from icrl_dist.problems.checks import check_parameters
-from icrl_dist.types import NULL, Adversary
+from icrl_dist.types import Adversary
 
 ALPHA_RANGE = (0.05, 2.0)
 """Range of each Dirichlet parameter's uniform prior; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
@@ -147,8 +147,8 @@ def sample(rng: np.random.Generator, disturbance: Disturbance, actions: int, p_m
 def adversary_set(
     rng: np.random.Generator, count: int, actions: int, p_max: float, disturbance: Disturbance = "override"
 ) -> tuple[Adversary, ...]:
-    """K adversaries of one task; the first is always phi_0 (section 4.1)."""
-    return (NULL, *(sample(rng, disturbance, actions, p_max) for _ in range(count - 1)))
+    """The K disturbances of one task (section 4.1)."""
+    return tuple(sample(rng, disturbance, actions, p_max) for _ in range(count))
 
 
 def grid(disturbance: Disturbance, actions: int, p_max: float, levels: int) -> tuple[Adversary, ...]:

@@ -13,10 +13,10 @@ from icrl_dist.problems.darkroom.adversaries import SYMMETRIES, sample_dirichlet
 from icrl_dist.problems.darkroom.room import cells, next_cell
 from icrl_dist.problems.darkroom.solver import (
     Hypotheses,
+    expected_returns,
     heuristic_labels,
     log_likelihood,
     optimal_returns,
-    policy_values,
     posterior,
     posterior_action,
     soft_labels,
@@ -47,11 +47,11 @@ def kept(disturbance: str, size: int, horizon: int, p: float) -> float:
         "wind": [Adversary.of("wind", p=p, direction=direction) for direction in range(4)],
         "permuted": [Adversary.of("permuted", p=p, permutation=one) for one in SYMMETRIES],
     }[disturbance]
-    goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
+    goals = [room.task(divmod(cell, size), size, horizon, (0, 0)) for cell in range(size**2)]
     policy = soft_labels(Hypotheses.of([Variation(goal) for goal in goals]), 0.99, 1e-9)
-    disturbed = [Hypotheses.of([Variation(goal, adversary) for goal in goals]) for adversary in adversaries]
-    earned = sum(policy_values(h, policy)[:, 0].sum() for h in disturbed)
-    return float(earned / sum(optimal_returns(h).sum() for h in disturbed))
+    disturbed = [[Variation(goal, adversary) for goal in goals] for adversary in adversaries]
+    earned = sum(expected_returns(policy, variations).sum() for variations in disturbed)
+    return float(earned / sum(optimal_returns(Hypotheses.of(variations)).sum() for variations in disturbed))
 
 
 @dataclass(frozen=True, eq=False)

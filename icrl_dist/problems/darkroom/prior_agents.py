@@ -61,12 +61,11 @@ def dpt_prior(room: DarkRoomConfig) -> Prior:
 
 def icag_prior(room: DarkRoomConfig, adversary: AdversaryConfig, levels: int | None = None) -> Prior:
     """The adversaries of training: phi_0 with its share, else ``adversaries.grid`` with ``levels``; None: ``LEVELS``."""
-    others = grid(room.disturbance, ACTIONS, adversary.p_max, levels or LEVELS[room.disturbance])
-    null = 1.0 / adversary.count
-    weights = {NULL: null} if null else {}
-    if null < 1:
-        for one in others:  # equal ones, which a p_max of 0 makes, add up
-            weights[one] = weights.get(one, 0.0) + (1 - null) / len(others)
+    others = grid(room.disturbance, ACTIONS, adversary.p_max, levels or LEVELS[room.disturbance]) if adversary.count else ()
+    weights = {NULL: 1.0 / adversary.variations} if adversary.null else {}
+    share = adversary.count / adversary.variations
+    for one in others:  # equal ones, which a p_max of 0 makes, add up
+        weights[one] = weights.get(one, 0.0) + share / len(others)
     return Prior.of(room, weights)
 
 
@@ -93,15 +92,28 @@ class PriorAgent(DiscretePolicy):
 
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
         cell, labels = cell_numbers(observation, self._prior.size), self._prior.labels
-        belief = (self._goal[:, :, None] * self._adversary[:, None]).reshape(len(cell), -1)
         if self._rule == "committed":
-            mixed: np.ndarray = (labels.reshape(*labels.shape[:2], -1)[cell] @ belief[:, :, None])[..., 0]
+            mixed: np.ndarray = (labels.reshape(*labels.shape[:2], -1)[cell] @ self._belief()[:, :, None])[..., 0]
             return mixed
-        if self._table is None:
-            policies = labels.reshape(-1, belief.shape[1])
-            self._table = (belief @ policies.T).reshape(len(cell), *labels.shape[:2])
-        result: np.ndarray = self._table[np.arange(len(cell)), cell]
+        result: np.ndarray = self._frozen()[np.arange(len(cell)), cell]
         return result
+
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> Float64[np.ndarray, "B Q A"] | None:
+        """The distributions at any states in the next episode; None for a rule that changes them within an episode."""
+        if self._rule != "paper":
+            return None
+        result: np.ndarray = self._frozen()[:, cell_numbers(states, self._prior.size)]
+        return result
+
+    def _frozen(self) -> Float64[np.ndarray, "B C A"]:
+        if self._table is None:
+            belief, labels = self._belief(), self._prior.labels
+            self._table = (belief @ labels.reshape(-1, belief.shape[1]).T).reshape(len(belief), *labels.shape[:2])
+        return self._table
+
+    def _belief(self) -> Float64[np.ndarray, "B M"]:
+        """The probability of each pair of goal and adversary."""
+        return (self._goal[:, :, None] * self._adversary[:, None]).reshape(len(self._goal), -1)
 
     def observe(
         self,

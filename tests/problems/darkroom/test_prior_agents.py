@@ -60,6 +60,10 @@ def test_the_distribution_is_that_of_drawn_goals_and_adversaries(rule: PriorRule
         begun = [len(history) for history in histories]
         for _ in range(HORIZON):
             found, slow = agent.probabilities(observation), np.zeros((3, ACTIONS))
+            frozen = agent.frozen(observation)
+            assert (frozen is None) == (rule == "committed")
+            if frozen is not None:
+                np.testing.assert_allclose(frozen[range(3), range(3)], found)
             cells = solver.cell_numbers(observation, SIZE)
             for row, history in enumerate(histories):
                 goal, adversary = beliefs(history[: begun[row]] if rule == "paper" else history)
@@ -106,7 +110,7 @@ def test_no_transition_makes_an_agent_fail(rule: PriorRule, kind: Disturbance) -
 
 def test_dpts_agent_learns_the_goal_from_rewards_alone() -> None:
     """A blown agent that found the goal goes there by the undisturbed optimum; ICAG's presses against the wind."""
-    agents = [PriorAgent(prior, 1, "paper") for prior in (dpt_prior(room()), icag_prior(room(), AdversaryConfig(8, 1.0)))]
+    agents = [PriorAgent(prior, 1, "paper") for prior in (dpt_prior(room()), icag_prior(room(), AdversaryConfig(8, p_max=1.0)))]
     at = [np.array([[x, 1.0]], np.float32) for x in range(3)]
     for agent in agents:  # the agent stays, a wind in direction +x moves it; the goal is (1, 1)
         data = [(at[0], 1.0, at[1]), (at[1], 0.0, at[2]), *[(at[2], 0.0, at[2])] * 3] * 4
@@ -118,10 +122,12 @@ def test_dpts_agent_learns_the_goal_from_rewards_alone() -> None:
 
 
 def test_phi_0_has_its_share_of_the_prior() -> None:
-    for count, p_max, adversaries in ((4, 0.6, 33), (1, 0.6, 1), (4, 0.0, 5)):
+    for count, p_max, adversaries in ((4, 0.6, 33), (0, 0.6, 1), (4, 0.0, 5)):
         prior = icag_prior(room(), AdversaryConfig(count=count, p_max=p_max))
         assert len(prior.log_weight) == adversaries and np.exp(prior.log_weight).sum() == pytest.approx(1)
-        assert np.exp(prior.log_weight[0]) == pytest.approx(1 / count)
+        assert np.exp(prior.log_weight[0]) == pytest.approx(1 / (count + 1))
+    without = icag_prior(room(), AdversaryConfig(count=4, null=False, p_max=0.6))
+    np.testing.assert_allclose(np.exp(without.log_weight), 1 / 32)
     assert len(grid("permuted", ACTIONS, 1.0, 5)) == 35 and len(grid("override", ACTIONS, 1.0, 8)) == 32
     assert grid("override", ACTIONS, 1.0, 8) == grid("override", ACTIONS, 1.0, 8)
 
