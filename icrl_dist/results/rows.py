@@ -173,7 +173,8 @@ def _made_by(block: Block) -> dict[str, Any]:
     return {name: found[name] for name in _MADE_BY} | {"libraries": json.dumps({**found["libraries"], **found["plugins"]})}
 
 
-def _schema() -> pa.Schema:
+def table_schema() -> pa.Schema:
+    """Names and types of the columns, with the number of the format."""
     import pyarrow as pa
 
     types = {"string": pa.string(), "int64": pa.int64(), "double": pa.float64(), "bool": pa.bool_()}
@@ -184,7 +185,7 @@ def _schema() -> pa.Schema:
 def _table(block: Block) -> pa.Table:
     import pyarrow as pa
 
-    schema, rows = _schema(), len(block["return"])
+    schema, rows = table_schema(), len(block["return"])
     if unknown := block.keys() - COLUMNS.keys():
         raise KeyError(f"no columns of result rows: {', '.join(sorted(unknown))}")
     if wrong := int((~np.isfinite(block["return"])).sum()):
@@ -210,13 +211,13 @@ def read(files: Iterable[Path]) -> pd.DataFrame:
 
     Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
     """
-    return _frame([_read(path) for path in files])
+    return _frame([read_table(path) for path in files])
 
 
 def _frame(tables: Sequence[pa.Table]) -> pd.DataFrame:
     import pyarrow as pa
 
-    frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
+    frame = pa.concat_tables(tables or [table_schema().empty_table()]).to_pandas()
     frame["split_seed"] = frame["split_seed"].astype("Int64")
     return frame
 
@@ -230,7 +231,8 @@ def _newest(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[order == last].reset_index(drop=True)
 
 
-def _read(path: Path) -> pa.Table:
+def read_table(path: Path) -> pa.Table:
+    """The rows of one file as a table of ``table_schema``.  Raises StoreError as ``read`` does."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -246,7 +248,7 @@ def _read(path: Path) -> pa.Table:
             f"{path}: result rows of format {found}, and this version reads format {FORMAT}: read them with the version that "
             "wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
         )
-    schema = _schema()
+    schema = table_schema()
     if wrong := sorted({(field.name, str(field.type)) for field in table.schema} ^ {(f.name, str(f.type)) for f in schema}):
         columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
         raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
