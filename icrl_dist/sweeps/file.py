@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -94,8 +95,8 @@ class SweepFile:
     """``[settings.NAME]``: keys of the run file that this setting changes."""
     methods: dict[str, Any]
     """``[methods.NAME]``: ``method`` and further keys of the run file; ``method = "exact"`` trains nothing."""
-    evaluations: dict[str, Evaluation]
-    """``[evaluations.NAME]``."""
+    evaluations: dict[str, Any]
+    """``[evaluations.NAME]``: what is evaluated in every run; each an ``Evaluation``."""
     split_seed: str | int | None = None
     """``"seed"``: the split into training and test tasks has the training seed; or a number.  Left out: the run's."""
     equal: Equal = field(default_factory=Equal)
@@ -114,6 +115,9 @@ def read(file: str | Path) -> SweepFile:
     found = build(SweepFile, tables, str(path))
     assert isinstance(found, SweepFile)
     _check(found, str(path))
+    evaluations = {name: build(Evaluation, one, f"{path}: [evaluations.{name}]") for name, one in found.evaluations.items()}
+    found = dataclasses.replace(found, evaluations=evaluations)
+    _check_names(found, str(path))
     return found
 
 
@@ -129,8 +133,11 @@ def _check(sweep: SweepFile, source: str) -> None:
                 raise ConfigError(
                     f"{source}: [{kind}.{show(name)}]: use letters, digits and . _ - in a name, at most 60, the first no sign"
                 )
-            if kind != "evaluations" and not isinstance(value, dict):
+            if not isinstance(value, dict):
                 raise ConfigError(f"{source}: {kind}.{name} = {show(value)}: expected a table, as in [{kind}.{name}]")
+
+
+def _check_names(sweep: SweepFile, source: str) -> None:
     if TRAINING in sweep.evaluations:
         raise ConfigError(f"{source}: [evaluations.{TRAINING}]: rows of the training have this name; choose another")
     for name, one in sweep.evaluations.items():
