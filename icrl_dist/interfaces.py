@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
-    from icrl_dist.problems.parts import MakeGame, PosteriorSuite
+    from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -270,7 +270,8 @@ class Problem(abc.ABC):
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
         """An adversary for tests, not among those of training.
 
-        ``strength``: a number above 0 from ``evaluate.p``; ``prior``: ``evaluate.prior``.
+        ``strength``: a number above 0 from ``evaluate.p``; ``prior``: ``evaluate.prior``.  It is called once for every
+        evaluation of a task, each time with a generator of its own.
         """
 
     @abc.abstractmethod
@@ -333,6 +334,11 @@ class Problem(abc.ABC):
     @property
     def posterior(self) -> PosteriorSuite | None:
         """Comparison of a model with the exact posterior (``icrl-dist evaluate --suite posterior``)."""
+        return None
+
+    @property
+    def certify(self) -> Certificate | None:
+        """Exact returns of policies that are fixed within an episode, also against the worst adversary of a strength p."""
         return None
 
     @property

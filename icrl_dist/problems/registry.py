@@ -91,8 +91,13 @@ def training_variations(run: Run, index: int, task: Task, round: int = 0) -> tup
     return tuple(Variation(task, one) for one in of(run).training_adversaries(rng, run.adversary))
 
 
-def test_adversary(run: Run, index: int, p: float, prior: str) -> Adversary:
-    """The adversary of test task number ``index`` with strength ``p``; it is not one of training."""
+def test_adversary(run: Run, index: int, p: float, prior: str, draw: int = 0) -> Adversary:
+    """An adversary of test task number ``index`` with strength ``p``; it is not one of training.
+
+    ``draw``: number of the adversary draw; every evaluation of a task has its own.  A prior with a single adversary
+    gives the same for each.
+    """
     if p == 0:
         return NULL
-    return of(run).test_adversary(generator(run.seed, RandomKey.TEST_ADVERSARIES, index), p, prior)
+    key = (index, draw) if draw else (index,)  # draw 0 has the key that a task's only adversary had in older versions
+    return of(run).test_adversary(generator(run.seed, RandomKey.TEST_ADVERSARIES, *key), p, prior)

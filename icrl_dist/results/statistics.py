@@ -1,8 +1,8 @@
 """Statistics of returns: pure functions on arrays, for summaries of rows and for tables.
 
 Scores are arrays of shape (..., trainings, cells, evaluations): a *training* is one training seed, a *cell* is one
-task with its adversary, an *evaluation* is one deployment of the agent in a cell from an empty context, and its score
-is a return, or the mean return over some of its episodes.
+task, an *evaluation* is one deployment of the agent in a cell from an empty context, under an adversary draw of its own,
+and its score is a return, or the mean return over some of its episodes.
 
 References: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021 (IQM,
 probability of improvement; the estimators are those of its library rliable).  Efron and Tibshirani, "An Introduction
@@ -81,7 +81,7 @@ def iqm(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
 
 
 def minimum(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
-    """Worst case: the smallest score of each training over its cells (tasks with their adversaries), averaged over trainings.
+    """Worst case: the smallest score of each training over its cells (tasks), averaged over trainings.
 
     The minimum of noisy means lies below the smallest true mean, so compare only minima over equal numbers of cells
     and evaluations.
@@ -153,7 +153,7 @@ def bootstrap(
 ) -> Float64[np.ndarray, "R K"]:
     """Paired hierarchical bootstrap: K numbers of ``statistic`` for each of ``count`` resamples.
 
-    Resamples training seeds, then tasks with their adversaries, then evaluations (see ``resamples``).  Every resample
+    Resamples training seeds, then tasks, then evaluations with their adversary draws (see ``resamples``).  Every resample
     has the same indices for all A agents, so differences and ratios of agents are compared in pairs.
     """
     found = []
@@ -214,21 +214,26 @@ def bounds(
     return (np.clip(low, 0, 1), np.clip(high, 0, 1)) if probability else (low, high)
 
 
-def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1) -> str:
+def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1, draws: int = 1) -> str:
     """What an interval was resampled over, in words, for the caption of a table.
 
-    ``episodes``: consecutive episodes of one evaluation that a score is the mean of.
+    ``episodes``: consecutive episodes of one evaluation that a score is the mean of.  ``draws``: different adversaries
+    of one task; with one, as without disturbance or with a prior of a single adversary, all evaluations have the same.
     """
     if units((trainings, tasks, evaluations)) == 1:
         return "one training, one evaluation of one task: no intervals"
-    each = _count(evaluations, "evaluation") + " of each"
+    each = counted(evaluations, "evaluation") + " of each"
+    if draws > 1:
+        over = f"{counted(tasks, 'task')}, {each} with an adversary draw of its own"
+    else:
+        over = f"{counted(tasks, 'task')} with {'its adversary' if tasks == 1 else 'their adversaries'}, {each}"
     if episodes > 1:
-        each += f", {episodes} episodes an evaluation"
-    over = f"{_count(tasks, 'task')} with {'its adversary' if tasks == 1 else 'their adversaries'}, {each}"
+        over += f", {episodes} episodes an evaluation"
     if trainings == 1:
         return f"one training: 95% interval over {over}; it says nothing about other training seeds"
     return f"95% interval over {trainings} training seeds, {over}"
 
 
-def _count(number: int, what: str) -> str:
+def counted(number: int, what: str) -> str:
+    """A number and its noun, such as ``2 tasks``."""
     return f"{number} {what}{'' if number == 1 else 's'}"

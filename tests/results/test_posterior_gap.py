@@ -84,6 +84,7 @@ def test_a_gap_without_an_interval_is_shown_as_such() -> None:
     for exact in (np.ones((1, 1)), np.array([[1.0], [0.0], [0.0]])):
         found = gap(exact / 2, exact)
         assert (found["gap"], found["low"], found["high"]) == (-0.5, None, None) and json.dumps(found, allow_nan=False)
+        found["draws"] = 1
         report = {"paper_gap": {"0": found}, "paper_gap_train": {"0": found}}
         assert list(gap_table(report, "").columns[-1].cells) == ["not shown"] * 2
 
