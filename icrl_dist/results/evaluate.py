@@ -16,6 +16,7 @@ from icrl_dist.config.random_keys import strength_key
 from icrl_dist.config.run import ConfigError, Deployment, Run
 from icrl_dist.config.sections import ContextConfig
 from icrl_dist.interfaces import MakePolicy, Policy, Problem, Reference
+from icrl_dist.methods import budget
 from icrl_dist.problems import registry
 from icrl_dist.results.returns import LAST
 from icrl_dist.results.rows import Block
@@ -88,8 +89,6 @@ class Result:
 
 def of_run(run: Run, name: str) -> Block:
     """The columns of result rows that are equal in all rows of a run."""
-    split_seed = getattr(registry.of(run).config, "split_seed", None)
-    whole = isinstance(split_seed, int | np.integer) and not isinstance(split_seed, bool) and abs(int(split_seed)) < 2**63
     return {
         "run": name,
         "method": run.method,
@@ -98,7 +97,8 @@ def of_run(run: Run, name: str) -> Block:
         "setting": "",
         "variant": run.method,
         "adversaries": run.adversary.count,
-        "split_seed": split_seed if whole else None,  # a plugin may give the name another meaning
+        "split_seed": budget.split_seed(run),
+        **budget.columns(run),
     }
 
 

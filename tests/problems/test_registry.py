@@ -6,7 +6,9 @@ import dataclasses
 
 import pytest
 
+from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run, make_run
+from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.continuous.problem import ContinuousProblem
@@ -62,13 +64,26 @@ def test_variations_are_the_tasks_own_and_repeat(small_run: Run) -> None:
     train = split(small_run).train
     every = [registry.training_variations(small_run, i, t) for i, t in enumerate(train)]
     assert every == [registry.training_variations(small_run, i, t) for i, t in enumerate(train)]
-    assert all([v.task for v in vs] == [t] * small_run.adversary.count for vs, t in zip(every, train, strict=True))
+    assert all([v.task for v in vs] == [t] * small_run.adversary.variations for vs, t in zip(every, train, strict=True))
     assert all(vs[0].adversary == NULL for vs in every)
     drawn = [v.adversary for vs in every for v in vs[1:]]
     assert len(set(drawn)) == len(drawn), "two tasks share an adversary"
     other = registry.training_variations(dataclasses.replace(small_run, seed=1), 0, train[0])
     assert not {v.adversary for v in other[1:]} & set(drawn)
     assert max(a.number("p") for a in drawn) <= small_run.adversary.p_max
+
+
+@pytest.mark.parametrize("null", [True, False])
+def test_k_counts_disturbances_and_a_switch_adds_the_null_adversary(small_run: Run, null: bool) -> None:
+    task = split(small_run).train[0]
+    for count in (1, 2, 8):
+        run = dataclasses.replace(small_run, adversary=AdversaryConfig(count=count, null=null))
+        found = [v.adversary for v in registry.training_variations(run, 0, task)]
+        assert len(set(found)) == len(found) == run.adversary.variations == count + null
+        assert [one == NULL for one in found] == [True] * null + [False] * count
+        assert tuple(found[null:]) == registry.of(run).training_adversaries(
+            generator(run.seed, RandomKey.TRAINING_ADVERSARIES, 0, 0), run.adversary
+        )
 
 
 @pytest.mark.parametrize("prior", ["unseen", "uniform"])
@@ -113,7 +128,7 @@ def test_a_continuous_run_trains_on_the_center_and_tests_elsewhere(small_run: Ru
     assert other.train == parts.train and set(other.test) != set(parts.test)
     assert problem.spec == registry.spec(parts.test[0]) and problem.disturbances == 2
     variations = registry.training_variations(run, 1, parts.train[1])
-    assert variations[0].adversary == NULL and len({v.adversary for v in variations}) == run.adversary.count
+    assert variations[0].adversary == NULL and len({v.adversary for v in variations}) == run.adversary.variations
     assert {v.adversary["strength"] for v in variations[1:]} == {2.0}
     assert variations != registry.training_variations(run, 1, parts.train[1], 1)
     assert variations == registry.training_variations(run, 1, parts.train[1])

@@ -24,7 +24,7 @@ from tests.results.row_blocks import frame
 @pytest.fixture
 def run(small_run: Run) -> Run:
     """ICAG with two adversaries a goal: 7 goals to train on, 2 held out."""
-    return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=2))
+    return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=1))
 
 
 def gap(model: np.ndarray, exact: np.ndarray, p: float = 0.0) -> dict[str, Any]:
