@@ -12,9 +12,10 @@ from typing import Annotated, Any, Literal
 from annotated_types import MinLen
 
 from icrl_dist.config.paths import path_of
-from icrl_dist.config.ranges import NotNegativeFloat, Seed
+from icrl_dist.config.ranges import NotNegativeFloat, Positive, Seed
 from icrl_dist.config.run import ConfigError, Deployment
 from icrl_dist.config.toml import build, nearest
+from icrl_dist.results.suite_numbers import DRAWS
 from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.schema import Remedy
 
@@ -53,26 +54,27 @@ class Evaluation:
     """``evaluate.p``."""
     prior: Literal["uniform", "unseen"] | None = None
     """``evaluate.prior``."""
+    draws: Positive = DRAWS
+    """Sampled adversaries of suite ``attack``."""
+    rounds: bool = False
+    """Whether the models between T^0 and the newest one are evaluated too."""
     only: Only = field(default_factory=Only)
     """Settings and methods that are evaluated so."""
 
     def overrides(self) -> dict[str, Any]:
-        """The keys of ``[evaluate]`` that it changes.  Suite ``posterior`` has numbers of its own."""
-        own = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 2} if self.suite == "posterior" else {}
+        """The keys of ``[evaluate]`` that it names."""
         named = {name: getattr(self, name) for name in ("episodes", "seeds", "p", "prior")}
-        return own | {name: value for name, value in named.items() if value is not None}
+        return {name: value for name, value in named.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class Equal:
     """``[equal]``: by how much budgets may differ between the methods of one setting, and what is not compared."""
 
-    training_episodes: NotNegativeFloat = 0.0
-    """Greatest difference of the episodes that trainings collect, as a share of the largest."""
-    labelled_episodes: NotNegativeFloat = 0.0
-    """The same of the episodes whose labels the fits use."""
     environment_steps: NotNegativeFloat = 0.0
-    """The same of environment steps."""
+    """Greatest difference of the environment steps of trainings, as a share of the largest."""
+    labelled_episodes: NotNegativeFloat = 0.0
+    """The same of the episodes whose labels the fits use; 1 allows any number."""
     optimizer_steps: NotNegativeFloat = 0.0
     """The same of optimizer steps."""
     seeds: bool = True

@@ -22,11 +22,12 @@ from icrl_dist.console.signals import interruptible
 from icrl_dist.launch import auto, run_folder
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.learner_process import TrainFailed
+from icrl_dist.methods import budget
 from icrl_dist.methods import registry as methods
 from icrl_dist.storage.files import StoreError, explained, hold, write_json
 from icrl_dist.stream import schema
 from icrl_dist.stream.excerpts import plain
-from icrl_dist.sweeps import budgets, rows, state
+from icrl_dist.sweeps import rows, state
 from icrl_dist.sweeps.file import Evaluation
 from icrl_dist.sweeps.plan import Member, digest
 from icrl_dist.sweeps.state import Meter, State
@@ -105,7 +106,7 @@ def _train(work: Work, folder: Path, found: State, meter: Meter) -> None:
 
     with launch.prepare(run, folder, resume=False, overwrite=False, resume_or_begin=True):
         found.run = dumps(run)
-        found.budget = budgets.of(run)
+        found.budget = budget.of(run)._asdict()
         record = provenance.record(run.problem, run.method, run.learner.threads)
         found.versions = {name: record[name] for name in ("package_version", "code_digest", "commit", "libraries")}
         meter.save()
@@ -127,15 +128,15 @@ def _evaluate(work: Work, folder: Path, found: State, meter: Meter, before: int)
     with hold(folder):
         for number, (name, evaluation) in enumerate(member.evaluations.items()):
             there = found.evaluations.get(name)
-            if there is not None and (folder / "results" / there["file"]).is_file():
+            if there is not None and all((folder / "results" / file).is_file() for file in there["files"]):
                 continue
             meter.begin("evaluate", f"evaluation {name}", before + number)
             run = parse_written(found.run, str(folder))
-            file = evaluations.do(run, folder, evaluation, member.exact, meter.event)
-            found.evaluations[name] = {"settings": wanted[name], "file": file}
+            files = evaluations.do(run, folder, evaluation, member.exact, meter.event)
+            found.evaluations[name] = {"settings": wanted[name], "files": files}
             meter.save()
-        files = {name: found.evaluations[name]["file"] for name in wanted}
-        table = rows.collect(member, folder / "results", files, rows.file_of(work.out, member))
+        collected = {name: found.evaluations[name]["files"] for name in wanted}
+        table = rows.collect(member, folder / "results", collected, rows.file_of(work.out, member))
     online = (name for name, one in member.evaluations.items() if one.suite == "online")
     found.returns = rows.returns(table, next(online, ""))
     found.collected, found.phase, found.share = list(wanted), "done", 1.0

@@ -15,10 +15,14 @@ import tomli_w
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load, override, packaged_runs, validate
 from icrl_dist.config.toml import build, nearest
+from icrl_dist.methods import budget
+from icrl_dist.results.suite_numbers import numbers
 from icrl_dist.stream.excerpts import show
 from icrl_dist.stream.schema import as_data
-from icrl_dist.sweeps import budgets
 from icrl_dist.sweeps.file import EXACT, Evaluation, Only, SweepFile, known
+
+QUANTITIES = ("environment_steps", "labelled_episodes", "optimizer_steps")
+"""The budgets that are compared; columns of result rows."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +54,17 @@ class Member:
 
 def digest(member: Member, evaluation: Evaluation) -> str:
     """SHA-256 of everything that an evaluation of a run depends on, beside the weights."""
-    numbers = as_data(evaluated(member.run, evaluation).evaluate)
-    key = {"suite": evaluation.suite, "deploy": evaluation.deploy, "exact": member.exact, "evaluate": numbers}
+    settings = as_data(evaluated(member.run, evaluation).evaluate)
+    key = {"suite": evaluation.suite, "deploy": evaluation.deploy, "exact": member.exact, "evaluate": settings}
+    key |= {"draws": evaluation.draws} if evaluation.suite == "attack" else {}
+    key |= {"rounds": True} if evaluation.rounds else {}
     return hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()
 
 
 def evaluated(run: Run, evaluation: Evaluation) -> Run:
     """The run with the numbers of an evaluation in ``[evaluate]``."""
-    return dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **evaluation.overrides()))
+    chosen = numbers(run, evaluation.suite, evaluation.overrides())
+    return dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **chosen))
 
 
 def members(sweep: SweepFile, source: Path) -> tuple[Member, ...]:
@@ -177,7 +184,7 @@ def _require_suite(run: Run, evaluation: Evaluation) -> None:
         import_torch()
         from icrl_dist.results import heldout
 
-        heldout.check_suite(run, evaluation.suite)
+        heldout.check_suite(evaluated(run, evaluation), evaluation.suite)
 
 
 def chosen(
@@ -221,23 +228,31 @@ def differences(every: Sequence[Member], sweep: SweepFile) -> Iterator[str]:
             here, there = ({one.seed for one in of[variant]} for variant in (first, other))
             if equal.seeds and here != there:
                 yield f"setting {setting}: training seeds {sorted(here)} of {first} and {sorted(there)} of {other} differ"
-        splits: dict[int, tuple[Member, Any]] = {}
+        splits: dict[int, tuple[Member, int | None]] = {}
         for one in ones:
-            split = _split(one.run)
+            split = budget.split_seed(one.run)
             before, known_split = splits.setdefault(one.seed, (one, split))
             if split != known_split:
                 pair = f"{before.name} ({known_split}) and {one.name} ({split})"
                 yield f"setting {setting}: split seeds of {pair} differ"
-        trained = {variant: budgets.of(found[0].run) for variant, found in of.items() if not found[0].exact}
-        for quantity in budgets.QUANTITIES:
-            known_ones = {variant: one[quantity] for variant, one in trained.items() if one.get(quantity) is not None}
-            if len(known_ones) > 1:
-                low, high = min(known_ones, key=known_ones.__getitem__), max(known_ones, key=known_ones.__getitem__)
-                least, most = known_ones[low], known_ones[high]
-                if most - least > getattr(equal, quantity) * most:
-                    share = f"a difference of {(most - least) / most:.3g}, and {getattr(equal, quantity):g} is allowed"
-                    yield f"setting {setting}: {quantity} are {least} of {low} and {most} of {high}, {share}"
+        trained = {variant: budget.of(found[0].run) for variant, found in of.items() if not found[0].exact}
+        for column in QUANTITIES:
+            values = {variant: getattr(one, column) for variant, one in trained.items()}
+            if line := _apart(column, values, getattr(equal, column)):
+                yield f"setting {setting}: {line}"
 
 
-def _split(run: Run) -> Any:
-    return getattr(run.section(plugins.find("problems", run.problem).section), "split_seed", None)
+def _apart(column: str, values: Mapping[str, int | None], allowed: float) -> str:
+    """By how much a budget differs between methods, if that is more than allowed; else an empty text."""
+    name, known_ones = budget.COMPARED[column], {variant: value for variant, value in values.items() if value is not None}
+    unknown = [variant for variant in values if variant not in known_ones]
+    if known_ones and unknown and allowed < 1:
+        return f"{name} of {', '.join(unknown)} are not known"
+    if not known_ones:
+        return ""
+    low, high = min(known_ones, key=known_ones.__getitem__), max(known_ones, key=known_ones.__getitem__)
+    least, most = known_ones[low], known_ones[high]
+    if most - least <= allowed * most:
+        return ""
+    share = f"a difference of {(most - least) / most:.3g}, and {column} = {allowed:g} is allowed"
+    return f"{name} differ: {least:,} of {low} and {most:,} of {high}, {share}"

@@ -20,10 +20,10 @@ def file_of(out: Path, member: Member) -> Path:
     return out / "rows" / f"{member.stem}.parquet"
 
 
-def collect(member: Member, results: Path, files: Mapping[str, str], to: Path) -> pa.Table:
+def collect(member: Member, results: Path, files: Mapping[str, Sequence[str]], to: Path) -> pa.Table:
     """Write the rows of a run to one file and return them.
 
-    ``results``: the folder of its files; ``files``: for each evaluation the name of its file, in the order of the rows.
+    ``results``: the folder of its files; ``files``: for each evaluation the names of its files, in the order of the rows.
     Before them come the rows that the training wrote.  Columns ``setting``, ``variant``, ``run`` and ``evaluation`` are of
     the sweep: so a repetition gives the same rows, apart from ``written``.
     """
@@ -31,7 +31,7 @@ def collect(member: Member, results: Path, files: Mapping[str, str], to: Path) -
     import pyarrow.parquet as pq
 
     tables = [_named(rows.read_table(results / name), member, TRAINING) for name in _of_training(results)]
-    tables += [_named(rows.read_table(results / name), member, evaluation) for evaluation, name in files.items()]
+    tables += [_named(rows.read_table(results / name), member, one) for one, names in files.items() for name in names]
     table = pa.concat_tables(tables or [rows.table_schema().empty_table()])
     atomic_write(to, lambda file: pq.write_table(table, file, compression="zstd"))
     return table

@@ -31,13 +31,13 @@ class State:
     exact: bool = False
     training: dict[str, Any] = field(default_factory=dict)
     """Of a finished training: digests of dataset and weights, version, trajectories."""
-    evaluations: dict[str, dict[str, str]] = field(default_factory=dict)
-    """For each finished evaluation the digest of its settings and the name of its file of rows."""
+    evaluations: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """For each finished evaluation the digest of its ``settings`` and the names of its ``files`` of rows."""
     collected: list[str] = field(default_factory=list)
     """Names of the evaluations whose rows are collected, when the run is done."""
     returns: dict[str, float] = field(default_factory=dict)
     """Mean return of the newest model in the last episode of the first online evaluation, by p."""
-    budget: dict[str, int] = field(default_factory=dict)
+    budget: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, Any] = field(default_factory=dict)
     kept: str = "all"
     seconds: float = 0.0

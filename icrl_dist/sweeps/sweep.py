@@ -19,9 +19,10 @@ from icrl_dist.console.signals import on_signals
 from icrl_dist.console.stage_rows import duration
 from icrl_dist.launch import run_folder
 from icrl_dist.launch.train import TrainInterrupted
+from icrl_dist.methods import budget
 from icrl_dist.storage.files import StoreError, hold, write_json
-from icrl_dist.sweeps import budgets, plan, rows, state
 from icrl_dist.sweeps import file as sweep_file
+from icrl_dist.sweeps import plan, rows, state
 from icrl_dist.sweeps.execute import Execution
 from icrl_dist.sweeps.file import SweepFile
 from icrl_dist.sweeps.one import Keep
@@ -255,5 +256,5 @@ def _like(made: Plan, one: Member, other: Member) -> bool:
 
 
 def _budget(member: Member) -> dict[str, int]:
-    found = budgets.of(member.run)
-    return {name: found[name] for name in budgets.QUANTITIES}
+    found = budget.of(member.run)._asdict()
+    return {name: found[name] for name in plan.QUANTITIES if found[name] is not None}

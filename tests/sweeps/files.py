@@ -15,7 +15,7 @@ adversary.p_max = 0.6
 method = "dpt"
 [methods.icag-k2]
 method = "icag"
-adversary.count = 2
+adversary.count = 1
 only = { settings = ["override"] }
 [methods.exact]
 method = "exact"

@@ -52,7 +52,7 @@ class _Process:
         self.code = code
         self.owner.running -= 1
         member, folder = self.work.member, self.work.member.place(self.work.out)
-        evaluations = {name: {"settings": plan.digest(member, one), "file": ""} for name, one in member.evaluations.items()}
+        evaluations = {name: {"settings": plan.digest(member, one), "files": []} for name, one in member.evaluations.items()}
         found = (
             State(evaluations=evaluations, collected=list(evaluations), returns={"0": 5.0}) if code == 0 else State(failed="no")
         )
@@ -104,7 +104,7 @@ def test_changed_settings_of_a_run_that_exists_are_refused(tmp_path, members):
     from icrl_dist.config.run import ConfigError, dumps, override
 
     one, folder = members[0], tmp_path / "0"
-    evaluations = {name: {"settings": plan.digest(one, of), "file": ""} for name, of in one.evaluations.items()}
+    evaluations = {name: {"settings": plan.digest(one, of), "files": []} for name, of in one.evaluations.items()}
     same = State(run=dumps(one.run), evaluations=evaluations, collected=list(evaluations))
     state.check(same, one, folder)
     assert same.done(one)
@@ -112,7 +112,7 @@ def test_changed_settings_of_a_run_that_exists_are_refused(tmp_path, members):
     with pytest.raises(ConfigError, match=r"pretrain.steps = 61 there and 60 here; use another --out, or delete .*/0"):
         state.check(other, one, folder)
     with pytest.raises(ConfigError, match="evaluation unseen there has other settings; give this one another name"):
-        state.check(State(evaluations=evaluations | {"unseen": {"settings": "", "file": ""}}), one, folder)
+        state.check(State(evaluations=evaluations | {"unseen": {"settings": "", "files": []}}), one, folder)
     with pytest.raises(ConfigError, match="'exact' there or here"):
         state.check(State(run=dumps(one.run), exact=True), one, folder)
     with pytest.raises(ConfigError, match="evaluation unseen is new, and --keep rows has deleted the weights"):

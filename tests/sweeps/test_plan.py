@@ -21,7 +21,7 @@ def test_every_method_runs_in_every_setting_with_every_seed(tmp_path):
     by_name = {one.name: one for one in found}
     strong = by_name["strong/dpt/1"].run
     assert (strong.method, strong.seed, strong.adversary.p_max, strong.section("darkroom").split_seed) == ("dpt", 1, 0.6, 1)
-    assert by_name["override/icag-k2/0"].run.adversary.count == 2 and strong.learner.threads == 1
+    assert by_name["override/icag-k2/0"].run.adversary.count == 1 and strong.learner.threads == 1
     assert by_name["override/exact/0"].exact and not by_name["override/dpt/0"].exact
     assert list(by_name["override/dpt/0"].evaluations) == ["online", "unseen"]
     assert list(by_name["strong/dpt/0"].evaluations) == ["online"]
@@ -48,9 +48,9 @@ def test_the_base_run_may_be_a_file_beside_the_sweep_file(tmp_path):
         ('method = "icag"', 'method = "icga"', "[methods.icag-k2]: method = 'icga'; did you mean 'icag'?"),
         ('method = "icag"', 'method = "experts"', "it trains no model"),
         ('method = "icag"', "", "[methods.icag-k2]: has no key method"),
-        ("adversary.count = 2", "adversary.cuont = 2", "[methods.icag-k2] in setting override: unknown key adversary.cuont"),
-        ("adversary.count = 2", "adversary.count = 0", "[methods.icag-k2] in setting override: adversary.count = 0"),
-        ("adversary.count = 2", "adversary = 2", "adversary = 2"),
+        ("adversary.count = 1", "adversary.cuont = 2", "[methods.icag-k2] in setting override: unknown key adversary.cuont"),
+        ("adversary.count = 1", "adversary.count = -1", "[methods.icag-k2] in setting override: adversary.count = -1"),
+        ("adversary.count = 1", "adversary = 2", "adversary = 2"),
         ("adversary.p_max = 0.6", "adversary.p_max = 6", "[settings.strong]: adversary.p_max = 6"),
         ('only = { settings = ["override"] }', 'only = { settings = ["overide"] }', "no 'overide'; did you mean 'override'?"),
         ('methods = ["dpt"]', 'methods = ["dtp"]', "[evaluations.unseen] only.methods: no 'dtp'; did you mean 'dpt'?"),
@@ -68,7 +68,7 @@ def test_the_base_run_may_be_a_file_beside_the_sweep_file(tmp_path):
         ("[evaluations.unseen]", "[evaluations.training]", "[evaluations.training]"),
         ("[settings.override]", "[settings]\noverride = 3", "expected a table"),
         ("[methods.icag-k2]", "[methods.dpt]", "not valid TOML"),
-        ("adversary.count = 2", "pretrain.contexts = 140", "training_episodes"),
+        ("adversary.count = 1", "pretrain.contexts = 140", "environment steps differ"),
         ('method = "dpt"', 'method = "dpt"\nonly = { seeds = [0] }', "training seeds [0] of dpt and [0, 1] of icag-k2 differ"),
         ("[settings.override]", '[equal]\nmethods = ["dpt"]\n[settings.override]', "say in reason why"),
     ],
@@ -90,7 +90,7 @@ def test_a_file_that_does_not_exist_and_a_folder_with_other_things_are_refused(t
     with pytest.raises(ConfigError, match="holds other files and no sweep"):
         sweep.make_plan(written(tmp_path), tmp_path / "out")
     (tmp_path / "out" / "sweep.json").write_text('{"name": "other", "run": "demo"}')
-    with pytest.raises(ConfigError, match=r"holds another sweep .the sweep other of run demo\."):
+    with pytest.raises(ConfigError, match=r"holds another sweep .the sweep other of run demo\)"):
         sweep.make_plan(written(tmp_path), tmp_path / "out")
 
 
@@ -98,13 +98,13 @@ def test_a_file_that_does_not_exist_and_a_folder_with_other_things_are_refused(t
     ("equal", "refused"),
     [
         ("", True),
-        ("training_episodes = 0.1\nenvironment_steps = 0.1", False),
-        ("training_episodes = 0.1\nenvironment_steps = 0.01", True),
+        ("labelled_episodes = 0.6\nenvironment_steps = 0.6", False),
+        ("labelled_episodes = 0.6\nenvironment_steps = 0.01", True),
         ('methods = ["icag-k2"]\nreason = "it is a trial"', False),
     ],
 )
 def test_budgets_may_differ_only_as_the_file_says(tmp_path, equal, refused):
-    text = TEXT.replace("adversary.count = 2", "pretrain.contexts = 300")
+    text = TEXT.replace("adversary.count = 1", "pretrain.contexts = 140")
     found = file.read(path := written(tmp_path, text=text, new=f"[equal]\n{equal}\n"))
     lines = list(plan.differences(plan.members(found, path), found))
     assert bool(lines) == refused, lines
@@ -114,7 +114,7 @@ def test_budgets_may_differ_only_as_the_file_says(tmp_path, equal, refused):
 
 def test_splits_that_differ_are_refused(tmp_path):
     found = file.read(
-        path := written(tmp_path, "adversary.count = 2", "darkroom.split_seed = 3", TEXT.replace('split_seed = "seed"', ""))
+        path := written(tmp_path, "adversary.count = 1", "darkroom.split_seed = 3", TEXT.replace('split_seed = "seed"', ""))
     )
     assert any(
         "split seeds of override/dpt/0 (0) and override/icag-k2/0 (3) differ" in line
@@ -135,5 +135,5 @@ def test_parts_of_a_sweep_are_chosen_by_name(tmp_path):
 
 def test_a_dry_run_lists_runs_and_budgets_and_writes_nothing(tmp_path):
     lines = sweep.describe(sweep.make_plan(written(tmp_path), tmp_path / "out"))
-    assert "override/dpt/0  missing  280 training episodes, 2520 environment steps, 60 optimizer steps" in lines[0]
+    assert "override/dpt/0  missing  2520 environment steps, 280 labelled episodes, 60 optimizer steps" in lines[0]
     assert "10 runs, 10 of them missing" in lines[-1] and not (tmp_path / "out").exists()

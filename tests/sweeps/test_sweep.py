@@ -27,6 +27,12 @@ method = "exact"
 [evaluations.online]
 episodes = 2
 seeds = 1
+rounds = true
+[evaluations.attack]
+suite = "attack"
+episodes = 1
+seeds = 1
+draws = 2
 [evaluations.offline]
 suite = "offline"
 seeds = 1
@@ -79,7 +85,7 @@ def test_killed_interrupted_and_resumed_a_sweep_ends_with_the_same_weights_and_r
         {"run": "override/icaa/0", "cause": "its process was ended by SIGKILL", "log": str(folder.with_name("0.log"))}
     ]
     assert summary["done"] == 1 and "failed: override/icaa/0: its process was ended by SIGKILL" in printed.err
-    assert not state.load(folder).training and state.load(every[1].place(out)).collected == ["online", "offline"]
+    assert not state.load(folder).training and state.load(every[1].place(out)).collected == ["online", "attack", "offline"]
 
     stopper = when(lambda: bool(children()), lambda: os.kill(os.getpid(), signal.SIGTERM))
     assert main.main(command) == 130
@@ -100,9 +106,16 @@ def test_killed_interrupted_and_resumed_a_sweep_ends_with_the_same_weights_and_r
     frame = table(out / "rows.parquet").to_pandas()
     assert set(frame["setting"]) == {"override"} and set(frame["run"]) == {"override/icaa/0", "override/exact/0"}
     models, exact = frame[frame["variant"] == "icaa"], frame[frame["variant"] == "exact"]
-    assert set(models["agent"]) == {"t0", "t1", "t2"} and set(models["evaluation"]) == {"training", "online", "offline"}
+    assert set(models["agent"]) == {"t0", "t1", "t2"} and set(models["evaluation"]) == {
+        "training",
+        "online",
+        "attack",
+        "offline",
+    }
     assert {"oracle", "random"} <= set(exact["agent"]) and set(exact["method"]) == {"exact"}
-    assert set(exact["evaluation"]) == {"online", "offline"}
+    assert set(exact["evaluation"]) == {"online", "attack", "offline"}
+    online = models[models["evaluation"] == "online"]
+    assert set(online["policy_version"]) == {0, 1, 2} and not online.duplicated(["agent", "p", "task_index", "episode"]).any()
 
     # Done again, nothing happens.
     before = (out / "rows.parquet").read_bytes()
