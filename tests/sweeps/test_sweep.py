@@ -106,7 +106,7 @@ def test_killed_interrupted_and_resumed_a_sweep_ends_with_the_same_weights_and_r
     frame = table(out / "rows.parquet").to_pandas()
     assert set(frame["setting"]) == {"override"} and set(frame["run"]) == {"override/icaa/0", "override/exact/0"}
     models, exact = frame[frame["variant"] == "icaa"], frame[frame["variant"] == "exact"]
-    assert set(models["agent"]) == {"t0", "t1", "t2"} and set(models["evaluation"]) == {
+    assert set(models["agent"]) == {"t0", "t1", "t2", "minimax"} and set(models["evaluation"]) == {
         "training",
         "online",
         "attack",
