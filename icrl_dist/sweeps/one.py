@@ -104,12 +104,11 @@ def _train(work: Work, folder: Path, found: State, meter: Meter) -> None:
         if text := event.get("text"):
             print(text, flush=True)
 
+    found.run, found.budget = dumps(run), budget.of(run)._asdict()
+    record = provenance.record(run.problem, run.method, run.learner.threads)
+    found.versions = {name: record[name] for name in ("package_version", "code_digest", "commit", "libraries")}
+    meter.save()  # before the folder has a run: one that no state describes is refused
     with launch.prepare(run, folder, resume=False, overwrite=False, resume_or_begin=True):
-        found.run = dumps(run)
-        found.budget = budget.of(run)._asdict()
-        record = provenance.record(run.problem, run.method, run.learner.threads)
-        found.versions = {name: record[name] for name in ("package_version", "code_digest", "commit", "libraries")}
-        meter.save()
         result = launch.train_inline(run, folder, report)
     if result["quarantined"]:
         causes = "; ".join(f"{one['variation']}: {one['cause']}" for one in result["quarantined"])

@@ -156,12 +156,13 @@ def _check_folder(folder: Path, name: str, run: str) -> None:
     mark = _mark(folder)
     if mark is None:
         raise ConfigError(f"--out {folder}: holds other files and no sweep; use another --out")
-    if mark != {"name": name, "run": run}:
+    if mark and mark != {"name": name, "run": run}:
         there = f"the sweep {mark.get('name')} of run {mark.get('run')}"
         raise ConfigError(f"--out {folder}: holds another sweep ({there}); use another --out")
 
 
 def _mark(folder: Path) -> dict[str, Any] | None:
+    """What the folder says of its sweep: nothing if it was killed before it began; None for a folder without a sweep."""
     try:
         found: dict[str, Any] = json.loads((folder / MARK).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -232,6 +233,8 @@ def describe(made: Plan) -> list[str]:
     """The list of runs with their budgets, what is done, and the time of the rest where other runs have shown it."""
     lines, known = [], [found for found in made.states.values() if found.collected]
     every = [sum(found.cpu.values()) for found in known]
+    alone = {(one.setting, one.variant): one for one in made.chosen}  # a budget does not depend on the seed
+    costs = {key: "no training" if one.exact else _budget(one) for key, one in alone.items()}
     seconds, unknown = 0.0, 0
     for one in made.chosen:
         found = made.states[one.name]
@@ -242,8 +245,8 @@ def describe(made: Plan) -> list[str]:
             alike = [sum(made.states[other.name].cpu.values()) for other in made.every if _like(made, one, other)]
             unknown += not (alike or every)
             seconds += (1 - found.share) * sum(alike or every) / max(len(alike or every), 1)
-        cost = "no training" if one.exact else ", ".join(f"{value} {name}" for name, value in _budget(one).items())
-        lines.append(f"{one.name}  {what}  {cost.replace('_', ' ')}; evaluations: {', '.join(one.evaluations) or 'none'}")
+        cost = costs[one.setting, one.variant]
+        lines.append(f"{one.name}  {what}  {cost}; evaluations: {', '.join(one.evaluations) or 'none'}")
     missing = sum(not _finished(made, one) for one in made.chosen)
     text = f"{len(made.chosen)} runs, {missing} of them missing, in {made.out}"
     if missing and not unknown:
@@ -255,6 +258,6 @@ def _like(made: Plan, one: Member, other: Member) -> bool:
     return (one.setting, one.variant) == (other.setting, other.variant) and _finished(made, other)
 
 
-def _budget(member: Member) -> dict[str, int]:
+def _budget(member: Member) -> str:
     found = budget.of(member.run)._asdict()
-    return {name: found[name] for name in plan.QUANTITIES if found[name] is not None}
+    return ", ".join(f"{found[name]} {budget.COMPARED[name]}" for name in plan.QUANTITIES if found[name] is not None)

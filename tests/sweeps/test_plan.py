@@ -1,5 +1,8 @@
 """The list of runs of a sweep file, and what is refused before anything is written."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from icrl_dist.config.run import ConfigError
@@ -131,6 +134,26 @@ def test_parts_of_a_sweep_are_chosen_by_name(tmp_path):
             plan.chosen(every, **wrong)
     with pytest.raises(ConfigError, match="leave no run"):
         plan.chosen(every, ["icag-k2"], ["strong"])
+
+
+def test_the_example_of_the_page_is_a_sweep(tmp_path):
+    (example,) = re.findall(r"```toml\n(.*?)```", Path("docs/sweeps.md").read_text(), re.DOTALL)
+    made = sweep.make_plan(written(tmp_path, text=example), tmp_path / "out")
+    assert len(made.every) == 15 and {one.variant for one in made.every} == {"dpt", "icag-k4", "exact"}
+
+
+def test_a_folder_whose_sweep_was_killed_before_it_began_is_free(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".lock").touch()
+    assert len(sweep.make_plan(written(tmp_path), tmp_path / "out").every) == 10
+
+
+def test_a_run_that_no_sweep_began_is_refused(tmp_path):
+    (tmp_path / "out" / "override" / "dpt" / "0").mkdir(parents=True)
+    (tmp_path / "out" / "override" / "dpt" / "0" / "run.toml").touch()
+    (tmp_path / "out" / "sweep.json").write_text('{"name": "tiny", "run": "smoke"}')
+    with pytest.raises(ConfigError, match="override/dpt/0: holds a run that no sweep began"):
+        sweep.make_plan(written(tmp_path), tmp_path / "out")
 
 
 def test_a_dry_run_lists_runs_and_budgets_and_writes_nothing(tmp_path):
