@@ -188,7 +188,8 @@ class EvaluateConfig:
     """Distribution of the test adversary's actions: ``uniform``, or drawn from a Dirichlet prior that no
     training adversary uses (``unseen``)."""
     seeds: Positive = 10
-    """Independent evaluations of every task (the paper's 10 random seeds)."""
+    """Independent evaluations of every task (the paper's 10 random seeds), each under a test adversary of its own; use
+    at least 4, because how much a return depends on the adversary is seen in no other way."""
 
 
 @dataclass(frozen=True)

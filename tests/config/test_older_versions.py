@@ -13,11 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from icrl_dist.agent import shipped as agent_files
 from icrl_dist.config import former_names
 from icrl_dist.config.run import ConfigError, Run, dumps, load, load_folder, parse, parse_written
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import calibrated_strength
+from icrl_dist.storage.checkpoint import load_checkpoint
 from icrl_dist.storage.fork import Lineage
 from icrl_dist.types import NULL
 
@@ -121,6 +123,9 @@ def test_phi_0_was_one_of_the_counted_adversaries() -> None:
     run = parse_written(ICAG, "x")
     variations = registry.training_variations(run, 0, registry.of(run).split.train[0])
     assert len(variations) == tomllib.loads(ICAG)["adversary"]["count"] and variations[0].adversary == NULL
+    shipped = load_checkpoint(Path(agent_files.__path__[0]) / "darkroom.npz").manifest["run"]
+    former = tomllib.loads(shipped)["adversary"]["count"]
+    assert parse_written(shipped, "x").adversary == AdversaryConfig(count=former - 1, null=True)
     for wrong in ('count = "two"', "count = 0", "count = true"):
         with pytest.raises(ConfigError, match=r"adversary\.count"):
             parse_written(f"[adversary]\n{wrong}", "x")

@@ -108,6 +108,16 @@ def test_test_adversaries_repeat_and_keep_their_distribution_as_p_grows(small_ru
     assert registry.test_adversary(small_run, 3, 0.0, "unseen") == NULL
 
 
+def test_each_draw_of_a_task_is_another_adversary_and_draw_0_is_that_of_older_versions(small_run: Run) -> None:
+    drawn = [registry.test_adversary(small_run, i, 0.2, "unseen", draw) for i in range(5) for draw in range(8)]
+    assert len(set(drawn)) == 40 and {a.number("p") for a in drawn} == {0.2}
+    before = registry.of(small_run).test_adversary(
+        np.random.default_rng(np.random.SeedSequence(0, spawn_key=(103, 3))), 0.2, "unseen"
+    )
+    assert registry.test_adversary(small_run, 3, 0.2, "unseen") == before == drawn[24]
+    assert len({registry.test_adversary(small_run, 3, 0.2, "uniform", draw) for draw in range(8)}) == 1
+
+
 def continuous(run: Run, problem: str, control: ControlConfig) -> tuple[Run, ContinuousProblem]:
     made = make_run(problem, control=control, adversary=run.adversary)
     owner = registry.of(made)

@@ -95,6 +95,22 @@ def test_held_out_variations_start_in_the_origin(small_run):
     assert all(v.task.vector("start") == (0, 0) and v.adversary.number("p") == 0.2 for v in chosen)
 
 
+def test_each_evaluation_of_a_task_is_under_its_own_adversary_and_the_first_repeats_old_numbers(small_run):
+    def of(seeds):
+        run = dataclasses.replace(small_run, evaluate=dataclasses.replace(small_run.evaluate, seeds=seeds, p=(0.4,)))
+        agents = {Agent("random"): references(run)["random"], Agent(ORACLE): references(run)[ORACLE]}
+        return evaluate.online(run, agents)
+
+    alone, several = of(1), of(3)
+    for one, many in zip(alone, several, strict=True):
+        np.testing.assert_array_equal(one.returns[:, 0], many.returns[:, 0])
+        assert [of_task[0] for of_task in many.variations] == list(evaluate.variations(small_run, 0.4))
+        assert all(
+            len({v.adversary for v in of_task}) == 3 and len({v.task for v in of_task}) == 1 for of_task in many.variations
+        )
+        assert known(many.optimum).shape == (2, 3) and len(np.unique(known(many.optimum)[0])) == 3
+
+
 def test_numbers_of_result_json_are_means_over_tasks_and_seeds():
     returns = np.arange(12.0).reshape(2, 2, 3)
     (row,) = summaries.result_rows(frame(block(returns, p=0.2, optimum=[10.0, 12.0])))

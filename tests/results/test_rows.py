@@ -183,6 +183,49 @@ def test_a_file_of_another_format_or_without_seeds_is_refused_in_one_line(folder
     assert str(folder) in str(refused.value) and "\n" not in str(refused.value)
 
 
+def as_format_1(table):
+    """What version 0.2.0 wrote: without the columns that format 2 added, and ``adversary_index`` is the task."""
+    index = table.schema.get_field_index("adversary_index")
+    table = table.set_column(index, table.schema.field(index), table.column("task_index"))
+    added = ["setting", "variant", "adversaries", "label_source", "training_episodes", "labelled_episodes"]
+    table = table.drop_columns([*added, "environment_steps", "optimizer_steps", "certified"])
+    return table.replace_schema_metadata({b"icrl_dist.results.format": b"1"})
+
+
+def test_rows_of_format_1_are_read_with_the_new_columns(folder):
+    present = read_results(folder)
+    rewritten(folder, as_format_1)
+    former = read_results(folder)
+    assert tuple(former.columns) == tuple(columns.COLUMNS)
+    assert set(former.setting) == {""} and (former.variant == former.method).all()
+    unknown = ["adversaries", "label_source", "training_episodes", "labelled_episodes", "environment_steps"]
+    assert former[[*unknown, "optimizer_steps", "certified"]].isna().all(axis=None)
+    assert (former.adversary_index == 0).all(), "every evaluation of a task had the adversary of draw 0"
+    kept = [name for name in columns.COLUMNS if name not in ("adversary_index", "evaluation")]
+    assert (
+        former[kept]
+        .astype(object)
+        .where(former[kept].notna(), None)
+        .equals(present[kept].astype(object).where(present[kept].notna(), None))
+    )
+    assert len(returns(former)) == 2
+    (file,) = (folder / "results").iterdir()
+    rows.append(folder / "results", "online", {"p": 9}, [block(RETURNS, "t0", p=0.3)])
+    assert len(read_results(folder)) == 24 + 12 and file.exists(), "files of both formats in one folder"
+
+
+def test_training_rows_of_format_1_keep_the_number_of_their_variation(tmp_path):
+    rows.append(tmp_path / "results", "experts", {}, [block(RETURNS, "expert", p=None)])
+    rewritten(tmp_path, as_format_1)
+    assert read_results(tmp_path).adversary_index.tolist() == read_results(tmp_path).task_index.tolist()
+
+
+def test_a_file_of_format_1_with_other_columns_is_refused(folder):
+    rewritten(folder, lambda table: as_format_1(table).append_column("certified", pa.nulls(24, pa.float64())))
+    with pytest.raises(StoreError, match=r"wrong columns \(certified\)"):
+        read_results(folder)
+
+
 @pytest.mark.parametrize("content", [b"", b"garbage", None])
 def test_a_damaged_file_is_refused_in_one_line(folder, content):
     (file,) = (folder / "results").iterdir()
