@@ -55,7 +55,7 @@ class Member:
 def digest(member: Member, evaluation: Evaluation) -> str:
     """SHA-256 of everything that an evaluation of a run depends on, beside the weights."""
     settings = as_data(evaluated(member.run, evaluation).evaluate)
-    key = {"suite": evaluation.suite, "deploy": evaluation.deploy, "exact": member.exact, "evaluate": settings}
+    key: dict[str, Any] = {"suite": evaluation.suite, "deploy": evaluation.deploy, "exact": member.exact, "evaluate": settings}
     key |= {"draws": evaluation.draws} if evaluation.suite == "attack" else {}
     key |= {"rounds": True} if evaluation.rounds else {}
     return hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()

@@ -3,6 +3,7 @@
 import json
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -65,7 +66,8 @@ def members(tmp_path):
 
 
 def test_at_most_so_many_runs_at_a_time_and_one_that_fails_is_listed_with_its_cause(tmp_path, members):
-    start, events = Pretended({"dpt": 1, "icag-k2": -9}), []
+    start = Pretended({"dpt": 1, "icag-k2": -9})
+    events: list[dict[str, Any]] = []
     execution = Execution(members, 0, tmp_path, "weights", 3, start)
     assert execution.run(events.append, lambda: False)
     assert start.most == 3 and start.running == 0 and not start.stopped
