@@ -137,6 +137,18 @@ class Contexts:
 
 
 @dataclass(frozen=True)
+class LearningHistories:
+    """How a problem records histories of a learning agent: the episodes of a variation, in the order in which it learned."""
+
+    payload: Payload
+    """Payload of the recording jobs."""
+    episodes: int
+    """Episodes of one history."""
+    count: int = 1
+    """Histories of each variation, one after another; each begins with an agent that knows nothing."""
+
+
+@dataclass(frozen=True)
 class Reference:
     """An agent that tables compare the models with."""
 
@@ -299,6 +311,10 @@ class Problem(abc.ABC):
     @property
     def labeller(self) -> Callable[[Job, Any], Labeller] | None:
         """``labeller(job, labelling)``: a labeller for new trajectories of the job's variations."""
+        return None
+
+    def learning_histories(self, run: Run, trials: int) -> LearningHistories | None:
+        """Histories of a learning agent, of at most ``trials`` episodes in each variation, for Algorithm Distillation."""
         return None
 
     @property

@@ -17,7 +17,9 @@ from icrl_dist.interfaces import (
     Behaviors,
     BeliefReader,
     Contexts,
+    JobKind,
     Labeller,
+    LearningHistories,
     Limits,
     MakeDrawing,
     MakePolicy,
@@ -31,6 +33,7 @@ from icrl_dist.problems.darkroom.behavior_policies import KINDS, Walks
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.labels import RoomLabeller, RoomLabelling
+from icrl_dist.problems.darkroom.q_learning import QLearningHistories, q_learning
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import Adversary, Job, Spec, Split, Task, Variation
@@ -94,6 +97,7 @@ class DarkRoomProblem(Problem):
     Config = DarkRoomConfig
     Labelling = RoomLabelling
     agent_names: ClassVar[Mapping[str, str]] = {KEYS[rule]: name for rule, name in RULES.items()}
+    job_kinds: ClassVar[Mapping[str, JobKind]] = {QLearningHistories.kind: JobKind(QLearningHistories, q_learning)}
     earns_in_contexts: ClassVar[bool] = False  # a random walk may miss the goal in every episode
     config: DarkRoomConfig
 
@@ -157,6 +161,12 @@ class DarkRoomProblem(Problem):
 
     def contexts(self, run: Run) -> Contexts:
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
+
+    def learning_histories(self, run: Run, trials: int) -> LearningHistories:
+        """Histories of tabular Q-learning, of ``ad.history_episodes`` episodes or a few more, so that none are left over."""
+        of = run.section("ad")
+        count = max(1, trials // of.history_episodes)
+        return LearningHistories(QLearningHistories(of.q_learning, count), trials // count, count)
 
     def references(self, run: Run) -> dict[str, Reference]:
         """A random policy, the exact agent of each rule, and the oracle, which is given goal and adversary."""
