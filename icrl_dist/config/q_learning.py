@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, fields
+from typing import Annotated, Self
 
 from annotated_types import Ge, Gt, Le, Lt
 
@@ -21,7 +21,7 @@ class QLearning:
     """Probability of a random action in the first episode."""
     epsilon_end: Probability = 0.0
     """The same in the last episode of a history."""
-    step: _Step = 0.5
+    step: _Step = 1.0
     """Share of the way that a value moves to its target, in the first episode: alpha."""
     step_end: _Step = 0.2
     """The same in the last episode of a history."""
@@ -30,3 +30,8 @@ class QLearning:
     optimism: NotNegativeFloat = 1.0
     """Value of every action in every cell before the first episode.  The value of staying on the goal is
     1 / (1 - discount)."""
+
+    @classmethod
+    def of(cls, section: QLearning) -> Self:
+        """These settings alone, from a section that has others too."""
+        return cls(**{item.name: getattr(section, item.name) for item in fields(cls)})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -25,8 +25,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ADConfig:
-    """Algorithm Distillation: histories of a learning agent, and windows of them."""
+class ADConfig(QLearning):
+    """Algorithm Distillation: histories of a learning agent, and windows of them.
+
+    The settings of ``QLearning`` decide how histories are made in a problem where tabular Q-learning makes them.
+    """
 
     variations: Literal["undisturbed", "icag"] = "undisturbed"
     """Variations in which the agent learns: ``undisturbed`` tasks, or those of ICAG."""
@@ -36,7 +39,6 @@ class ADConfig:
     """A window holds every so-many-th episode of a history, so that a short window shows much progress."""
     history_episodes: Positive = 60
     """Episodes of a history of Q-learning, at least; a variation with twice as many episodes or more has several."""
-    q_learning: QLearning = field(default_factory=QLearning)
 
 
 class AD(DPT):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from icrl_dist.collect.behavior import BehaviorContexts
+from icrl_dist.config.q_learning import QLearning
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.interfaces import (
@@ -166,7 +167,7 @@ class DarkRoomProblem(Problem):
         """Histories of tabular Q-learning, of ``ad.history_episodes`` episodes or a few more, so that none are left over."""
         of = run.section("ad")
         count = max(1, trials // of.history_episodes)
-        return LearningHistories(QLearningHistories(of.q_learning, count), trials // count, count)
+        return LearningHistories(QLearningHistories(QLearning.of(of), count), trials // count, count)
 
     def references(self, run: Run) -> dict[str, Reference]:
         """A random policy, the exact agent of each rule, and the oracle, which is given goal and adversary."""
