@@ -142,10 +142,13 @@ class LearningHistories:
 
     payload: Payload
     """Payload of the recording jobs."""
-    episodes: int
-    """Episodes of one history."""
+    trials: int
+    """Episodes of each variation."""
     count: int = 1
-    """Histories of each variation, one after another; each begins with an agent that knows nothing."""
+    """Histories of each variation, one after another; each begins with an agent that knows nothing.
+
+    History h holds the trials from ``trials * h // count`` to before ``trials * (h + 1) // count``.
+    """
 
 
 @dataclass(frozen=True)
@@ -531,7 +534,8 @@ class UsedLabels(NamedTuple):
     """The labels of a job that a method learns from."""
 
     source: str
-    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions``; ``none`` without labels."""
+    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions`` of the model, ``learner's actions``
+    of a learning agent; ``none`` without labels."""
     trials: int
     """Trials of each variation whose labels are used; at most so many where it depends on returns."""
 

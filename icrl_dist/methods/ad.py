@@ -13,7 +13,7 @@ from icrl_dist.config.q_learning import QLearning
 from icrl_dist.config.ranges import Positive
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import Deployment, ModelConfig
-from icrl_dist.interfaces import Draw, LearningHistories, Phase, TrajectoryDataset
+from icrl_dist.interfaces import Draw, LearningHistories, Phase, TrajectoryDataset, UsedLabels
 from icrl_dist.methods import jobs
 from icrl_dist.methods.dpt import DPT, pretrain_phase
 from icrl_dist.problems import registry
@@ -35,7 +35,7 @@ class ADConfig(QLearning):
     """Variations in which the agent learns: ``undisturbed`` tasks, or those of ICAG."""
     window_episodes: Positive = 8
     """Episodes in a training context, in the order in which the agent learned."""
-    skip: Positive = 4
+    skip: Positive = 8
     """A window holds every so-many-th episode of a history, so that a short window shows much progress."""
     history_episodes: Positive = 60
     """Episodes of a history of Q-learning, at least; a variation with twice as many episodes or more has several."""
@@ -54,10 +54,9 @@ class AD(DPT):
         found, of = self._histories(run), run.section(self.section)
         if found is None:
             yield "method", run.method, f"{run.problem} records no histories of a learning agent: use dpt, icag or icaa"
-        elif found.episodes < self._windows(run, found).span:
-            span = self._windows(run, found).span
+        elif (shortest := found.trials // found.count) < (span := self._windows(run, found).span):
             text = f"every {of.skip}th of {span} episodes" if of.skip > 1 else f"{span} episodes"
-            advice = f"a window takes {text}, and a history has {found.episodes}; use fewer, a smaller ad.skip or"
+            advice = f"a window takes {text}, and a history has {shortest}; use fewer, a smaller ad.skip or"
             yield "ad.window_episodes", of.window_episodes, f"{advice} more pretrain.contexts"
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
@@ -74,7 +73,7 @@ class AD(DPT):
         """Jobs of histories in every variation; episodes start as test episodes do."""
         found = self._histories(run)
         assert found is not None, "objections refuses a problem without histories"
-        return jobs.grouped(run, phase, self._chosen(run), found.episodes * found.count, found.payload)
+        return jobs.grouped(run, phase, self._chosen(run), found.trials, found.payload)
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
         """Draws windows of the histories."""
@@ -101,6 +100,10 @@ class AD(DPT):
     def rule(self, model: ModelConfig) -> Deployment:
         return "growing"
 
+    def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels:
+        """The actions of all episodes."""
+        return UsedLabels("learner's actions", job.trials)
+
     def _chosen(self, run: Run) -> list[tuple[Variation, ...]]:
         problem = registry.of(run)
         tasks = map(problem.at_test_start, problem.split.train)
@@ -116,7 +119,7 @@ class AD(DPT):
         from icrl_dist.training.history_windows import HistoryWindows
 
         of = run.section(self.section)
-        return HistoryWindows(histories.episodes, of.window_episodes, of.skip)
+        return HistoryWindows(histories.count, of.window_episodes, of.skip)
 
 
 def _imitated(run: Run, trials: Sequence[Trajectory]) -> Examples:

@@ -14,8 +14,8 @@ from icrl_dist.training.batches import Examples, ExamplesSequence, TrainingBatch
 class HistoryWindows:
     """Which episodes of a variation form a window."""
 
-    history: int
-    """Episodes of one history; a variation has one or more histories, one after another."""
+    count: int
+    """Histories of a variation: see ``LearningHistories.count``."""
     episodes: int
     """Episodes of a window."""
     skip: int
@@ -28,9 +28,9 @@ class HistoryWindows:
 
     def draw(self, rng: np.random.Generator, total: int) -> Int64[np.ndarray, " W"]:
         """The episodes of a random window of a variation with ``total`` episodes; all are of one history."""
-        history = int(rng.integers(total // self.history))
-        first = int(rng.integers(self.history - self.span + 1))
-        found: np.ndarray = self.history * history + first + self.skip * np.arange(self.episodes)
+        history = int(rng.integers(self.count))
+        begin, end = (total * number // self.count for number in (history, history + 1))
+        found: np.ndarray = int(rng.integers(begin, end - self.span + 1)) + self.skip * np.arange(self.episodes)
         return found
 
 

@@ -12,6 +12,7 @@ import torch
 
 import icrl_dist
 from icrl_dist.config.run import ConfigError, Run, override, validate
+from icrl_dist.methods import budget
 from icrl_dist.methods import registry as methods
 from icrl_dist.methods.ad import AD
 from icrl_dist.models.dpt import Transitions
@@ -30,7 +31,7 @@ SETTINGS = ["pretrain.contexts=105", "ad.history_episodes=7", "ad.window_episode
 
 @pytest.fixture
 def ad_run(small_run: Run) -> Run:
-    """Seven tasks with 15 episodes each, so two histories of 7; windows of episodes i, i + 2 and i + 4."""
+    """Seven tasks with 15 episodes each, so histories of 7 and 8; windows of episodes i, i + 2 and i + 4."""
     return override(dataclasses.replace(small_run, method="ad"), SETTINGS, "--set")
 
 
@@ -53,14 +54,16 @@ def drawn(run: Run, made: list[Trajectory], seed: int = 0) -> TrainingBatch:
     return batch
 
 
-def test_all_histories_together_have_at_most_the_episodes_of_d_pre(ad_run: Run) -> None:
-    """Every variation has the same whole number of histories, of as many episodes as there are."""
-    for contexts, histories, trials in ((7 * 15, 2, 14), (7 * 13, 1, 13), (7 * 5, 1, 5), (7 * 21 + 6, 3, 21)):
-        jobs = jobs_of(override(ad_run, [f"pretrain.contexts={contexts}"], "--set"))
-        payloads = [job.payload for job in jobs]
+def test_its_histories_have_the_episodes_of_d_pre(ad_run: Run) -> None:
+    """So its environment steps are those of DPT; a variation has as many histories as fit into its episodes."""
+    for contexts, histories, trials in ((7 * 15, 2, 15), (7 * 13, 1, 13), (7 * 5, 1, 5), (7 * 21 + 6, 3, 21)):
+        run = override(ad_run, [f"pretrain.contexts={contexts}"], "--set")
+        payloads = [job.payload for job in jobs_of(run)]
         assert all(isinstance(payload, QLearningHistories) and payload.count == histories for payload in payloads)
-        assert {job.trials for job in jobs} == {trials}
-        assert sum(len(job.variations) * job.trials for job in jobs) <= contexts
+        assert {job.trials for job in jobs_of(run)} == {trials}
+        costs = [budget.of(dataclasses.replace(run, method=name)) for name in ("ad", "dpt")]
+        assert costs[0].environment_steps == costs[1].environment_steps == 7 * trials * 8
+        assert costs[0] == costs[1]._replace(label_source="learner's actions")
 
 
 def test_the_agent_learns_without_disturbance_or_in_the_variations_of_icag(ad_run: Run) -> None:
@@ -79,13 +82,13 @@ def test_a_batch_holds_windows_of_histories_as_a_slow_loop_cuts_them(ad_run: Run
     possible = {}
     for key in dataset.variations("pretrain", 0):
         trials = dataset.trials(key)
-        assert [t.identity.trial for t in trials] == list(range(14))
-        for history in (0, 7):
-            for first in range(history, history + 3):
+        assert [t.identity.trial for t in trials] == list(range(15))
+        for begin, end in ((0, 7), (7, 15)):
+            for first in range(begin, end - 4):
                 window = [trials[first], trials[first + 2], trials[first + 4]]
                 possible[key_of(*(np.concatenate([c(t) for t in window]) for c in (states_of, actions_of)))] = window
     seen = set[tuple[object, ...]]()
-    for seed in range(12):
+    for seed in range(20):
         batch = drawn(ad_run, made, seed)
         assert batch.prefix.shape == (8, 11) and batch.windows is None
         for b in range(8):
@@ -101,7 +104,7 @@ def test_a_batch_holds_windows_of_histories_as_a_slow_loop_cuts_them(ad_run: Run
                 trial, h = steps[t]
                 np.testing.assert_array_equal(batch.queries[b, n], trial.observations[h])
                 assert batch.labels[b, n].tolist() == [float(a == trial.actions[h]) for a in range(5)]
-    assert {identity[4] for identity in seen} == {0, 1, 2, 7, 8, 9}, "no window crosses from one history into the next"
+    assert {identity[4] for identity in seen} == {0, 1, 2, 7, 8, 9, 10}, "no window crosses from one history into the next"
 
 
 def test_a_short_window_has_all_its_steps_as_queries_and_optim_transitions_bounds_a_batch(ad_run: Run) -> None:
@@ -113,10 +116,10 @@ def test_a_short_window_has_all_its_steps_as_queries_and_optim_transitions_bound
 
 
 def test_windows_begin_anywhere_in_a_history() -> None:
-    windows = HistoryWindows(history=6, episodes=3, skip=2)
+    windows = HistoryWindows(count=2, episodes=3, skip=2)
     rng = np.random.default_rng(0)
-    found = {tuple(windows.draw(rng, 12).tolist()) for _ in range(200)}
-    assert found == {(0, 2, 4), (1, 3, 5), (6, 8, 10), (7, 9, 11)}
+    found = {tuple(windows.draw(rng, 13).tolist()) for _ in range(200)}
+    assert found == {(0, 2, 4), (1, 3, 5), (6, 8, 10), (7, 9, 11), (8, 10, 12)}
 
 
 def test_the_loss_is_the_cross_entropy_of_each_action_given_what_came_before(ad_run: Run) -> None:
@@ -185,12 +188,11 @@ def test_sac_histories_are_windows_too(reacher_run: Run) -> None:
 def test_it_is_trained_evaluated_and_loaded_like_the_other_methods(ad_run: Run, tmp_path: Path) -> None:
     """Two inline runs have the same digests; rows name the rule; the agent's context grows with every transition."""
     first, second = (icrl_dist.train(ad_run, out=tmp_path / name, engine="inline").result for name in "ab")
-    assert first["trajectories"] == 7 * 14
+    assert first["trajectories"] == 7 * 15
     for digest in ("dataset_digest", "weights_digest"):
         assert first[digest] == second[digest]
     rows = icrl_dist.read_results(tmp_path / "a")
-    print(rows[rows.agent == "t0"].groupby(["suite", "deployment"]).size())
-    assert set(rows[rows.agent == "t0"].deployment) == {"growing"}
+    assert set(rows[rows.agent == "t0"].deployment) == {"growing", "paper"}, "tables show Algorithm 1 beside it"
     agent = icrl_dist.load_agent(tmp_path / "a", seed=0)
     assert agent.deploy == "growing"
     state = np.zeros((1, 2), np.float32)

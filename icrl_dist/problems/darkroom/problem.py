@@ -165,10 +165,10 @@ class DarkRoomProblem(Problem):
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
 
     def learning_histories(self, run: Run, trials: int) -> LearningHistories:
-        """Histories of tabular Q-learning, of ``ad.history_episodes`` episodes or a few more, so that none are left over."""
+        """Histories of tabular Q-learning, of ``ad.history_episodes`` episodes or more, so that no episode is left over."""
         of = run.section("ad")
         count = max(1, trials // of.history_episodes)
-        return LearningHistories(QLearningHistories(QLearning.of(of), count), trials // count, count)
+        return LearningHistories(QLearningHistories(QLearning.of(of), count), trials, count)
 
     def references(self, run: Run) -> dict[str, Reference]:
         """A random policy, the exact agent of each rule, and the oracle, which is given goal and adversary."""

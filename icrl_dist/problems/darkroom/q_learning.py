@@ -30,7 +30,7 @@ class QLearningHistories(Payload):
     kind: ClassVar[str] = "q_learning"
     learner: QLearning = field(default_factory=QLearning)
     count: Positive = 1
-    """Histories of each variation, of ``Job.trials / count`` episodes each, one after another."""
+    """Histories of each variation, one after another: see ``LearningHistories.count``."""
 
     @property
     def labels(self) -> LabelCounts:
@@ -78,13 +78,13 @@ def q_learning(job: Job, problem: Problem, worker: str, progress: Progress) -> I
     payload = job.payload
     assert isinstance(payload, QLearningHistories)
     env = problem.batch(job.variations)
-    size, episodes = round(env.spec.high[0]) + 1, job.trials // payload.count
-    for trial in range(job.trials):
-        number = trial % episodes
-        if number == 0:
-            learner = QLearner(env.batch, size, env.spec.actions, payload.learner)
-        learner.begin(number / max(1, episodes - 1))
-        row = [Identity(job.stage, job.round, i, k, trial) for i, k in job.rows()]
-        ran = episode(env, learner, [identity.rng(job.seed) for identity in row])
-        for b, identity in enumerate(row):
-            yield trajectory(job, identity, ran, b, worker, "", unlabelled(env.spec))
+    size = round(env.spec.high[0]) + 1
+    for history in range(payload.count):
+        begin, end = (job.trials * number // payload.count for number in (history, history + 1))
+        learner = QLearner(env.batch, size, env.spec.actions, payload.learner)
+        for trial in range(begin, end):
+            learner.begin((trial - begin) / max(1, end - begin - 1))
+            row = [Identity(job.stage, job.round, i, k, trial) for i, k in job.rows()]
+            ran = episode(env, learner, [identity.rng(job.seed) for identity in row])
+            for b, identity in enumerate(row):
+                yield trajectory(job, identity, ran, b, worker, "", unlabelled(env.spec))

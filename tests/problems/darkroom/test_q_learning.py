@@ -37,15 +37,15 @@ def cell(observation: np.ndarray, size: int) -> int:
 
 
 def test_every_action_follows_from_the_table_of_a_scalar_loop(ad_run: Run) -> None:
-    """With restarts: the probabilities, the draws and the updates of two histories of three episodes."""
-    job = dataclasses.replace(jobs_of(ad_run)[0], trials=6, payload=QLearningHistories(RATES, 2))
+    """With a restart: the probabilities, the draws and the updates of histories of three and four episodes."""
+    job = dataclasses.replace(jobs_of(ad_run)[0], trials=7, payload=QLearningHistories(RATES, 2))
     made = do(ad_run, job)
-    assert len(made) == 6 * len(job.variations)
+    assert len(made) == 7 * len(job.variations)
     for row in range(len(job.variations)):
         for n, t in enumerate(variation(job, made, row)):
-            progress = n % 3 / 2
+            progress = n / 2 if n < 3 else (n - 3) / 3
             epsilon, step = 0.4 - 0.3 * progress, 0.9 - 0.6 * progress
-            if n % 3 == 0:
+            if n in (0, 3):
                 table = [[0.7] * 5 for _ in range(25)]
             rng = t.identity.rng(job.seed)
             rng.random(1 + 20)  # the environment's
