@@ -240,16 +240,8 @@ def _read(path: Path) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{path}: not a file of result rows ({reason}): move it away, and evaluate again") from None
-    found = (table.schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
-    if found != str(FORMAT):
-        raise StoreError(
-            f"{path}: result rows of format {found}, and this version reads format {FORMAT}: read them with the version that "
-            "wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
-        )
+    check_schema(path, table.schema)
     schema = _schema()
-    if wrong := sorted({(field.name, str(field.type)) for field in table.schema} ^ {(f.name, str(f.type)) for f in schema}):
-        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
-        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
     for field in schema:
         if not field.nullable and (missing := table.column(field.name).null_count):
             raise StoreError(
@@ -263,6 +255,20 @@ def _read(path: Path) -> pa.Table:
                 f"{path}: {name} is no finite number in {unknown} of {len(table)} rows: move the file away, and evaluate again"
             )
     return table.select(schema.names).cast(schema)
+
+
+def check_schema(path: Path, found: pa.Schema) -> None:
+    """Raises StoreError, in one line with the remedy, unless the file has this format and its columns."""
+    written = (found.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
+    if written != str(FORMAT):
+        raise StoreError(
+            f"{path}: result rows of format {written}, and this version reads format {FORMAT}: read them with the version that "
+            "wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
+        )
+    here, there = ({(field.name, str(field.type)) for field in schema} for schema in (found, _schema()))
+    if wrong := sorted(here ^ there):
+        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
+        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
 
 
 def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = False, all: bool = False) -> pd.DataFrame:
