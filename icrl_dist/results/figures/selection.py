@@ -174,15 +174,18 @@ class Study:
 
     def _equal(self, what: str, name: str, one: Arm, two: Arm, of: Callable[[Arm], object], hidden: bool) -> None:
         if of(one) != of(two):
-            values = "differ between" if hidden else f"are {of(one)} and {of(two)} of"
-            raise ConfigError(f"{what}: {name} {values} {_who(one)} and {_who(two)}: evaluate both alike (`icrl-dist sweep`)")
+            found = "differ between" if hidden else f"are {of(one)} of"
+            other = "" if hidden else f"{of(two)} of "
+            raise ConfigError(
+                f"{what}: {name} {found} {_who(one)} and {other}{_who(two)}: evaluate both alike (`icrl-dist sweep`)"
+            )
 
     def _check_budgets(self, arms: Sequence[Arm], what: str) -> None:
         models = [arm for arm in arms if AgentKey(arm.key.agent).is_model]
         for column, one, two in () if self.rules.unequal_budgets else unequal(models):
             raise ConfigError(
-                f"{what}: {column} is {of_budget(one, column)} of {_who(one)} and {of_budget(two, column)} of {_who(two)}: "
-                "train both with equal budgets, or compare them all the same with --unequal-budgets"
+                f"{what}: {column} is {of_budget(one, column):.12g} of {_who(one)} and {of_budget(two, column):.12g} of "
+                f"{_who(two)}: train both with equal budgets, or compare them all the same with --unequal-budgets"
             )
 
 

@@ -44,7 +44,8 @@ STYLES = {
 }
 """By method, and by key of a reference agent."""
 _OTHER = Style("", "#1f6feb", "x", "-", "||")
-_MARKERS = "o^sDvP*X"
+_MARKERS = "so*XPDv"
+"""Of the second series of one method and of those after it."""
 
 
 def style_of(name: str) -> Style:
@@ -86,7 +87,7 @@ def _lines(axis: Axes, panel: Panel) -> None:
     for series in panel.series:
         style, x = style_of(series.style), [float(point.x) for point in series.points]
         y = [point.value.value for point in series.points]
-        marker = style.marker if series.rank == 0 else _MARKERS[series.rank % len(_MARKERS)]
+        marker = style.marker if series.rank == 0 else _MARKERS[(series.rank - 1) % len(_MARKERS)]
         reference = is_reference(series.style)
         axis.plot(
             x,
@@ -101,7 +102,7 @@ def _lines(axis: Axes, panel: Panel) -> None:
             zorder=2 if reference else 3,
         )
         low, high = ([getattr(point.value, side) for point in series.points] for side in ("low", "high"))
-        axis.fill_between(x, low, high, color=_shade(style.color, series.rank), alpha=0.12, linewidth=0)
+        axis.fill_between(x, low, high, color=_shade(style.color, series.rank), alpha=0.06 if reference else 0.12, linewidth=0)
 
 
 def _shade(color: str, rank: int) -> Any:
@@ -153,7 +154,7 @@ def _lost(axis: Axes, panel: Panel) -> None:
     places = range(len(panel.series))
     after = [one.points[1].value.value for one in panel.series]
     loss = [one.points[2].value.value for one in panel.series]
-    axis.bar(places, after, 0.7, color=[style_of(one.style).color for one in panel.series], label="kept under the disturbance")
+    axis.bar(places, after, 0.7, color=[style_of(one.style).color for one in panel.series])
     axis.bar(
         places,
         loss,
@@ -165,7 +166,7 @@ def _lost(axis: Axes, panel: Panel) -> None:
         edgecolor="black",
         hatch="///",
         linewidth=0.8,
-        label="lost",
+        label="lost, with its 95% interval",
     )
     axis.set_xticks(list(places), [one.name for one in panel.series], rotation=30, ha="right")
 
