@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
-    from icrl_dist.problems.parts import MakeGame, PosteriorSuite
+    from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -227,7 +227,10 @@ class Problem(abc.ABC):
     Config: ClassVar[type]
     """Frozen dataclass of that section; every field has a default."""
     Labelling: ClassVar[type]
-    """Frozen dataclass of the settings by which a job labels query states; see ``labelling``."""
+    """Frozen dataclass of the settings by which a job labels query states; see ``labelling``.
+
+    With a field ``undisturbed: bool = False`` the method ``dr`` can be used: if it is true, the labels of every variation
+    are those of its task under the null adversary."""
     template: ClassVar[str] = ""
     """Packaged run file that problems of this class share, if any: ``dmc`` for ``dmc.toml`` and ``dmc-laptop.toml``."""
     free_in_forks: ClassVar[tuple[str, ...]] = ()
@@ -264,13 +267,17 @@ class Problem(abc.ABC):
 
     @abc.abstractmethod
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
-        """K adversaries of one training task, phi_0 first (section 4.1)."""
+        """The K disturbances of one training task, without phi_0 (section 4.1): ``config.count`` of them, all different.
+
+        The first ones do not depend on K: with the same generator a larger K adds adversaries at the end.
+        """
 
     @abc.abstractmethod
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
         """An adversary for tests, not among those of training.
 
-        ``strength``: a number above 0 from ``evaluate.p``; ``prior``: ``evaluate.prior``.
+        ``strength``: a number above 0 from ``evaluate.p``; ``prior``: ``evaluate.prior``.  It is called once for every
+        evaluation of a task, each time with a generator of its own.
         """
 
     @abc.abstractmethod
@@ -333,6 +340,11 @@ class Problem(abc.ABC):
     @property
     def posterior(self) -> PosteriorSuite | None:
         """Comparison of a model with the exact posterior (``icrl-dist evaluate --suite posterior``)."""
+        return None
+
+    @property
+    def certify(self) -> Certificate | None:
+        """Exact returns of policies that are fixed within an episode, also against the worst adversary of a strength p."""
         return None
 
     @property
@@ -499,6 +511,15 @@ class LabelQuality:
     """Mean optimal return of the variations."""
 
 
+class UsedLabels(NamedTuple):
+    """The labels of a job that a method learns from."""
+
+    source: str
+    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions``; ``none`` without labels."""
+    trials: int
+    """Trials of each variation whose labels are used; at most so many where it depends on returns."""
+
+
 class Method(abc.ABC):
     """An in-context method: its phases and jobs, its training batches, model, loss and deployed policy.
 
@@ -585,6 +606,14 @@ class Method(abc.ABC):
         does not support such queries.
         """
         return None
+
+    def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels | None:
+        """The labels of a job that the fits use; by default those that its payload asks for, None if it does not say.
+
+        A method that makes labels itself, or uses only some, overrides this; ``methods.budget`` counts with it.
+        """
+        counts = job.payload.labels
+        return counts and UsedLabels(counts.origin, job.trials if counts.queries else 0)
 
     def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Iterator[RatedVariation]:
         """The variations that the model labelled itself in a phase; none if it labelled none or quality is unknown."""

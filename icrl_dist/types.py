@@ -92,7 +92,7 @@ class Adversary(_Named):
 
 
 NULL = Adversary("null")
-"""phi_0: the adversary that does nothing; it belongs to every adversary set (section 4.1)."""
+"""phi_0: the adversary that does nothing; whether training has it too is ``adversary.null`` (section 4.1)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -277,10 +277,15 @@ class Payload:
         found: LabelCounts | None = getattr(getattr(self, "labelling", None), "label_counts", None)
         return found
 
+    def env_steps(self, trials: int, horizon: int) -> int:
+        """Environment steps of a job in each variation: its trials, and the action windows of each."""
+        windows = self.labels.window_steps if self.labels else 0
+        return trials * (horizon + windows)
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Job:
-    """A fixed batch of work: all K variations of a few tasks, for a number of trials.
+    """A fixed batch of work: all variations of a few tasks, for a number of trials.
 
     The job fixes the batch of environments, so floating-point results do not depend on which
     worker does which job.
@@ -293,7 +298,7 @@ class Job:
     task: int
     """Number of the first task."""
     variations: tuple[Variation, ...]
-    """The K variations of the first task, then those of the next, and so on."""
+    """The variations of the first task, then those of the next, and so on."""
     trials: int
     """Episodes in each variation."""
     policy_version: int

@@ -160,7 +160,7 @@ def module_run() -> Run:
     return make_run(
         method="icaa",
         darkroom=DarkRoomConfig(size=3, horizon=8),
-        adversary=AdversaryConfig(count=3),
+        adversary=AdversaryConfig(count=2),
         pretrain=PretrainConfig(contexts=42, queries=4, steps=10),
         icaa=ICAAConfig(rounds=1, trials=4, context_trials=1, steps=5),
         model=ModelConfig(layers=2, width=16),
@@ -199,7 +199,7 @@ _TOY_RUN = """
 [corridor]
 cells = 5
 [adversary]
-count = 2
+count = 1
 [pretrain]
 contexts = 32
 steps = 5

@@ -25,7 +25,10 @@ def method(rng: np.random.Generator, trainings: int, tasks: np.ndarray, noise: f
     """Returns of one method; its true mean is 5."""
     levels = 5 + rng.normal(size=(trainings, 1, 1)) + tasks
     returns = levels + noise * rng.normal(size=(trainings, TASKS, EVALUATIONS))
-    cells = tuple(tuple((training if own else 0, task, "null", "{}") for task in range(TASKS)) for training in range(trainings))
+    cells = tuple(
+        tuple((training if own else 0, task, (("null", "{}"),) * EVALUATIONS) for task in range(TASKS))
+        for training in range(trainings)
+    )
     return Returns(
         AgentKey("t0"),
         "t0",
@@ -38,6 +41,7 @@ def method(rng: np.random.Generator, trainings: int, tasks: np.ndarray, noise: f
         cells,
         tuple(range(EVALUATIONS)),
         {},
+        np.full((*returns.shape, 1), np.nan),
     )
 
 

@@ -63,7 +63,7 @@ def calibrate(trained: TrainedModel, progress: Callable[[int], None] = lambda ep
 
 
 def _rows(trained: TrainedModel) -> Iterator[tuple[int, Variation]]:
-    """Two of the method's variations of every training task; phi_0 has the same share as in training."""
+    """Two of the method's variations of every training task; each has the same share as in training."""
     problem = problems.of(trained.run)
     for index, task in enumerate(problem.split.train):
         chosen = trained.method.training_variations(trained.run, index, problem.at_test_start(task), _UNUSED_ROUND)

@@ -22,7 +22,7 @@ from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.disturbance import DisturbanceExperts, Make, Report, Setting
 from icrl_dist.problems.continuous.network_adversary import networks
 from icrl_dist.rollout.episode import deploy_online
-from icrl_dist.types import Adversary, Task, Variation
+from icrl_dist.types import NULL, Adversary, Task, Variation
 
 WEAK = 0.02
 """Default adversaries are weak if the mean relative loss of return under them is below this."""
@@ -156,7 +156,7 @@ def variations(setting: Setting, sizes: DisturbanceSizes) -> tuple[list[Variatio
 def adversaries(setting: Setting, count: int, strength: float = 1.0) -> tuple[Adversary, ...]:
     """The null adversary and ``count`` networks, which are the same at every strength."""
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(_ADVERSARIES,)))
-    return networks(rng, count + 1, registry.spec(setting.task), setting.outputs, strength)
+    return (NULL, *networks(rng, count, registry.spec(setting.task), setting.outputs, strength))
 
 
 def lost(returns: Float[np.ndarray, "C R"]) -> dict[str, float | None]:

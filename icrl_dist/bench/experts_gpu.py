@@ -102,7 +102,7 @@ def updates(sizes: ExpertSizes, turns: int, device: torch.device) -> tuple[dict[
 
 
 def paper_env() -> tuple[Batch, SACConfig]:
-    """The paper's m = 16 tasks times K = 10 adversaries of one problem, and the settings of its SAC."""
+    """The paper's m = 16 tasks times 10 variations of one problem, and the settings of its SAC."""
     paper = load(PAPER)
     problem = registry.of(paper)
     rows = [row for index, task in enumerate(problem.split.train) for row in registry.training_variations(paper, index, task)]

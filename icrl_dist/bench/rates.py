@@ -96,7 +96,7 @@ def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
                 name=f"{phase.stage}/{phase.round}",
                 jobs=len(jobs_of_phase),
                 trajectories=count,
-                env_steps=sum(_env_steps(job, spec.horizon) for job in jobs_of_phase),
+                env_steps=sum(job.payload.env_steps(job.trials, spec.horizon) * len(job.variations) for job in jobs_of_phase),
                 labels=count * len(sample[0].labels),
                 job_s=job_s,
                 message_bytes=float(np.mean([len(wire.encode_trajectory(t)) for t in sample])),
@@ -119,11 +119,6 @@ def _measure(run: Run, name: str, report: Report, budget_s: float) -> Rates:
         start_s=_start(),
         evaluate_s=evaluation,
     )
-
-
-def _env_steps(job: Job, horizon: int) -> int:
-    steps = job.payload.sac.steps if isinstance(job.payload, ExpertHistories) else job.trials * horizon
-    return steps * len(job.variations)
 
 
 def _job(trained: TrainedModel, job: Job, budget_s: float) -> tuple[float, list[Trajectory]]:

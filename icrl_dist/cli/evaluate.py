@@ -23,10 +23,12 @@ class EvaluateArguments:
     pretrained: str | None = None
     """Instead, the name of an agent that is part of the package: ``darkroom``.  Its report is
     written to runs/NAME-pretrained."""
-    suite: Literal["online", "offline", "posterior"] = "online"
+    suite: Literal["online", "offline", "posterior", "attack"] = "online"
     """``online``: consecutive episodes from an empty context.  ``offline``: one episode, given the
     context of a random or an expert episode (Algorithm 1).  ``posterior``: KL divergence of its action
-    distribution from the exact posterior's, in nats, and the difference of its return to the exact agent's."""
+    distribution from the exact posterior's, in nats, and the difference of its return to the exact agent's.
+    ``attack``: the return of one episode, given its context, without adversary, under sampled ones and under the
+    worst one of strength p, which is exact for Algorithm 1 (Dark Room)."""
     deploy: Deployment | None = None
     """``paper``: Algorithm 1, the context is fixed within an episode.  ``committed``: every transition
     joins the context at once, and the agent's own recent actions are its action window.  Default:
@@ -35,11 +37,16 @@ class EvaluateArguments:
     episodes: int | None = None
     """Online episodes.  Default: the run's number (posterior: 40)."""
     seeds: int | None = None
-    """Evaluations per task.  Default: the run's number (posterior: 2)."""
+    """Evaluations per task.  Default: the run's number (posterior: 4).  Each evaluation of a task has a test
+    adversary of its own."""
     p: tuple[float, ...] = ()
-    """Override probabilities to test.  Default: the run's (posterior: 0 0.2 0.4 0.6)."""
+    """Override probabilities to test.  Default: the run's (posterior: 0 0.2 0.4 0.6; attack: those above 0)."""
     prior: Literal["uniform", "unseen"] | None = None
     """Distribution of the test adversaries.  Default: the run's (posterior: uniform)."""
+    draws: int = 8
+    """Suite ``attack``: adversaries that are sampled from the unseen prior."""
+    references: bool = True
+    """Also evaluate random policy, exact agents and oracle."""
     json: bool = False
     """Print one JSON object on the last line."""
 
@@ -55,7 +62,9 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
         raise ConfigError("evaluate: name a run folder or a checkpoint file, or with --pretrained an agent of the package")
     if arguments.pretrained is not None:
         shipped(arguments.pretrained)  # a name of the package only, never that of a folder
-    options = {name: getattr(arguments, name) for name in ("suite", "deploy", "episodes", "seeds", "prior")}
+    options = {
+        name: getattr(arguments, name) for name in ("suite", "deploy", "episodes", "seeds", "prior", "draws", "references")
+    }
     with Display(console) as display:
         found = suites.evaluate(what, **options, p=arguments.p or None, progress=display.report)
     console.print(found)

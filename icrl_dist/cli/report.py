@@ -41,7 +41,8 @@ class ReportArguments:
     common_seeds: bool = False
     """Compare only the training seeds that all compared agents have.  Default: different seeds are refused."""
     unequal_budgets: bool = False
-    """Compare methods although their budgets differ.  Default: different budgets are refused."""
+    """Compare methods although their budgets differ by more than 10%.  Default: they are refused; smaller differences are
+    named in captions."""
     partial: bool = False
     """Show a figure without the agents whose rows are missing.  Default: missing rows are refused, with the runs
     that make them."""

@@ -41,6 +41,14 @@ def check(tables: dict[str, Any], sections: Set[str], problem: object, source: s
             )
 
 
+def _disturbances_counted(tables: dict[str, Any]) -> dict[str, Any]:
+    """Files without ``adversary.null`` counted phi_0, which every task had, as one of ``adversary.count``."""
+    adversary = tables.get("adversary")
+    if not isinstance(adversary, dict) or "null" in adversary or type(adversary.get("count")) is not int:
+        return tables
+    return {**tables, "adversary": {**adversary, "count": adversary["count"] - 1, "null": True}}
+
+
 def _owners(section: str) -> str:
     owners = [name for name, owner in plugins.importable("problems").items() if owner.section == section]
     return owners[0] + (f" and {len(owners) - 1} other problems" if len(owners) > 1 else "")
@@ -57,7 +65,7 @@ def translated(tables: dict[str, Any], sections: Set[str], owner: Any) -> dict[s
         holder = found.get(section) if key else found
         if isinstance(holder, dict) and (key or section) in holder:
             holder[new.rpartition(".")[2]] = holder.pop(key or section)
-    found = owner.translated(found)
+    found = owner.translated(_disturbances_counted(found))
     unknown = found.keys() - sections
     foreign = unknown & plugins.sections(None).keys() if unknown else set()  # they take the import of every problem
     return {name: table for name, table in found.items() if name not in foreign}

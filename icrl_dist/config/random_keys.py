@@ -21,7 +21,7 @@ class RandomKey(enum.IntEnum):
     TRAINING_ADVERSARIES = 102
     """Adversaries of training tasks: (task, round)."""
     TEST_ADVERSARIES = 103
-    """Adversaries of test tasks: (task)."""
+    """Adversaries of test tasks: (task), and (task, draw) for each later draw from 1 on."""
     FIT = 104
     """Training batches: (policy version, step)."""
     OOD_CALIBRATION = 105

@@ -59,8 +59,9 @@ class Run:
     """The settings of one run."""
 
     method: str = "icag"
-    """Method of section 4 that pretrains the transformer: ``dpt``, ``icag`` or ``icaa``.  ``experts`` trains no
-    transformer: it only trains and stores the SAC experts of a continuous problem, for later runs."""
+    """Method that trains the transformer: ``icag`` or ``icaa`` of section 4, or a baseline (``dpt``; ``mix_dpt``, which goes
+    on with its own histories; ``dr``, domain randomisation).  ``experts`` trains no transformer: it only trains and stores
+    the SAC experts of a continuous problem, for later runs."""
     seed: Seed = 0
     """Seed of every random draw of the run."""
     problem: str = "darkroom"

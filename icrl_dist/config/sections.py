@@ -31,10 +31,17 @@ _AlertShare = Annotated[float, Interval(ge=0, le=1), Remedy("a share lies in [0,
 class AdversaryConfig:
     """The adversaries of training tasks (appendix C.1)."""
 
-    count: Annotated[int, Ge(1), Le(2**31 - 1), Remedy("at least 1, the null adversary, and below 2^31")] = 8
-    """K, adversaries per task including phi_0 (appendix D.1 chooses 8)."""
+    count: Annotated[int, Ge(0), Le(2**31 - 2), Remedy("0 or more disturbances, below 2^31 - 1")] = 8
+    """K, disturbances per task; phi_0 is not one of them (appendix D.1 chooses 8)."""
+    null: bool = True
+    """Whether the task without disturbance, phi_0, is among the variations: a task then has K + 1 of them."""
     p_max: Probability = 0.2
     """Dark Room: an adversary overrides an action with probability p ~ U(0, p_max)."""
+
+    @property
+    def variations(self) -> int:
+        """Variations per training task."""
+        return self.count + self.null
 
 
 @dataclass(frozen=True)
@@ -181,7 +188,8 @@ class EvaluateConfig:
     """Distribution of the test adversary's actions: ``uniform``, or drawn from a Dirichlet prior that no
     training adversary uses (``unseen``)."""
     seeds: Positive = 10
-    """Independent evaluations of every task (the paper's 10 random seeds)."""
+    """Independent evaluations of every task (the paper's 10 random seeds), each under a test adversary of its own; use
+    at least 4, because how much a return depends on the adversary is seen in no other way."""
 
 
 @dataclass(frozen=True)

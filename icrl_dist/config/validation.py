@@ -39,6 +39,8 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
         yield "problem", run.problem, "its split has no training tasks: change its section"
     if plugins.find("methods", run.method).trains and not problem.evaluated_count:
         yield "problem", run.problem, "it has no tasks to evaluate on: change its section"
+    if not run.adversary.variations:
+        yield "adversary.count", 0, "use at least 1, or adversary.null = true, which trains on the tasks without disturbance"
     icaa, horizon = run.icaa, problem.horizon
     if run.pretrain.contexts < train:
         yield "pretrain.contexts", run.pretrain.contexts, remedy(train, None, "at least one per training task")

@@ -20,6 +20,7 @@ from jaxtyping import Float32
 
 from icrl_dist.config import plugins
 from icrl_dist.config.sac import SACConfig
+from icrl_dist.experts.payloads import WINDOW_EPISODES
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.files import StoreError
 from icrl_dist.stream import wire
@@ -35,8 +36,6 @@ Histories of another version are not found in a cache and are trained again."""
 
 RECORDED_EPISODES = 200
 """Training episodes in a history, evenly spaced; all of them if there are fewer, or if a job needs more than this."""
-WINDOW_EPISODES = 8
-"""Episodes after training in which the expert acts, from which action windows are cut."""
 
 Trainer = Literal["lockstep", "stable-baselines3", "lockstep, cuda"]
 """The implementation that trains an expert, and its device: their roundoff differs, so their experts are not the same."""

@@ -9,6 +9,9 @@ from icrl_dist.config.ranges import NotNegative, Positive, Share
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.types import LabelCounts, Payload
 
+WINDOW_EPISODES = 8
+"""Episodes after training in which the expert acts, from which action windows are cut."""
+
 
 @dataclass(frozen=True)
 class ExpertLabelling:
@@ -28,6 +31,11 @@ class ExpertLabelling:
         """The labels of each trajectory."""
         return LabelCounts(self.queries + self.windows * self.window, self.windows * self.window, "expert")
 
+    @property
+    def window_episodes(self) -> int:
+        """Episodes per variation from which action windows are cut: the expert's own, and those of decoys."""
+        return WINDOW_EPISODES * (1 + (self.decoy_fraction > 0)) if self.windows else 0
+
 
 @dataclass(frozen=True)
 class ExpertHistories(Payload):
@@ -38,6 +46,14 @@ class ExpertHistories(Payload):
     sac: SACConfig
     labelling: ExpertLabelling
 
+    def env_steps(self, trials: int, horizon: int) -> int:
+        """The steps of an expert's training in whole episodes, which the trials are taken from, and of its window episodes.
+
+        An expert acts in ``WINDOW_EPISODES`` episodes also if no action windows are cut from them.
+        """
+        training = max(1, self.sac.steps // horizon)
+        return (training + max(WINDOW_EPISODES, self.labelling.window_episodes)) * horizon
+
 
 @dataclass(frozen=True)
 class ScriptedContexts(Payload):
@@ -45,3 +61,6 @@ class ScriptedContexts(Payload):
 
     kind: ClassVar[str] = "scripted_context"
     labelling: ExpertLabelling
+
+    def env_steps(self, trials: int, horizon: int) -> int:
+        return (trials + self.labelling.window_episodes) * horizon

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from icrl_dist.experts.cache import WINDOW_EPISODES, History, expert_seed
-from icrl_dist.experts.payloads import ExpertLabelling
+from icrl_dist.experts.cache import History, expert_seed
+from icrl_dist.experts.payloads import WINDOW_EPISODES, ExpertLabelling
 from icrl_dist.experts.sac import draws
 from icrl_dist.interfaces import Batch, Problem
 from icrl_dist.rollout.recorder import Recorder

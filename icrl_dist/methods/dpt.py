@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -28,6 +28,15 @@ if TYPE_CHECKING:
 def pretrain_phase(run: Run) -> Phase:
     """The fit to D_pre."""
     return Phase("pretrain", 0, run.pretrain.steps, run.optim.learning_rate)
+
+
+class Histories(NamedTuple):
+    """The labelled histories of T^j in the rounds after pretraining."""
+
+    trials: int
+    """Episodes per history."""
+    share: float
+    """Share of a round's training batches whose contexts are histories; the other batches come from D_pre."""
 
 
 class DPT(Method):
@@ -61,7 +70,11 @@ class DPT(Method):
         if phase.stage == "pretrain":
             return jobs.pretraining_contexts(run, phase, choose)
         rules: tuple[Deployment, ...] = ("paper", "committed", "paper") if run.model.window > 1 else ("paper",)
-        return jobs.dagger_rollouts(run, phase, choose, rules)
+        return jobs.labelled_rollouts(run, phase, choose, rules, self.histories(run).trials)
+
+    def histories(self, run: Run) -> Histories:
+        """The histories that the rounds after pretraining collect."""
+        return Histories(run.dagger.trials, run.dagger.new_fraction)
 
     def _choose(self, run: Run, index: int, task: Task) -> tuple[Variation, ...]:
         return self.training_variations(run, index, task, 0)
@@ -76,9 +89,9 @@ class DPT(Method):
         if phase.stage == "pretrain":
             return examples.draw(run, [pretrain])
         histories = [key for j in range(phase.round + 1) for key in dataset.variations("adapt", j)]
-        share = run.dagger.new_fraction
-        dagger = Pool(share, CachedExamples(cache, histories), run.dagger.trials)
-        return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), dagger])
+        trials, share = self.histories(run)
+        own = Pool(share, CachedExamples(cache, histories), trials)
+        return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), own])
 
     def build(self, spec: Spec, run: Run) -> PretrainedTransformer:
         from icrl_dist.models.dpt import PretrainedTransformer

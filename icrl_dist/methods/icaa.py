@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from icrl_dist.config.run import Run
-from icrl_dist.interfaces import Draw, Phase, RatedVariation, TrajectoryDataset, VariationKey
+from icrl_dist.interfaces import Draw, Phase, RatedVariation, TrajectoryDataset, UsedLabels, VariationKey
 from icrl_dist.methods import jobs
 from icrl_dist.methods.dpt import DPT, pretrain_phase
 from icrl_dist.problems import registry
@@ -26,7 +26,7 @@ class ICAA(DPT):
         self._gives_labels: dict[VariationKey, bool] = {}
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """K variations, with new adversaries in every round (line 11)."""
+        """All variations, with new adversaries in every round (line 11)."""
         return registry.training_variations(run, index, task, round)
 
     def phases(self, run: Run) -> tuple[Phase, ...]:
@@ -60,6 +60,13 @@ class ICAA(DPT):
         share = run.icaa.new_fraction
         self_labelled = Pool(share, CachedExamples(cache, labelling), episodes)
         return examples.draw(run, [Pool(1 - share, pretrain, episodes), self_labelled])
+
+    def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels | None:
+        """In a round the actions of the trials that ``icaa.label_trials`` selects; of ``improved`` ones at most all."""
+        if phase.stage == "pretrain":
+            return super().used_labels(run, phase, job)
+        later = run.icaa.trials - run.icaa.context_trials
+        return UsedLabels("own actions", (later + 1) // 2 if run.icaa.label_trials == "top_return" else later)
 
     def label_quality(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Iterator[RatedVariation]:
         """The variations that T^j labelled in a round, one at a time, compared with exact answers (Theorem E.5).

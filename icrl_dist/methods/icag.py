@@ -1,4 +1,4 @@
-"""ICAG (section 4.1, Algorithm 2): K variations of every task, labels from each variation's own optimal policy."""
+"""ICAG (section 4.1, Algorithm 2): all variations of every task, labels from each variation's own optimal policy."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ class ICAG(DPT):
     name = "icag"
 
     def training_variations(self, run: Run, index: int, task: Task, round: int) -> tuple[Variation, ...]:
-        """K variations, phi_0 first; DAgger rounds use those of D_pre."""
+        """All variations; DAgger rounds use those of D_pre."""
         return registry.training_variations(run, index, task, round)

@@ -31,7 +31,7 @@ def pretraining_contexts(run: Run, phase: Phase, choose: Choose) -> tuple[Job, .
 
 
 def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], trials: int, payload: Payload) -> tuple[Job, ...]:
-    """Jobs of ``stream.job_tasks`` tasks each; ``chosen`` holds the K variations of every task."""
+    """Jobs of ``stream.job_tasks`` tasks each; ``chosen`` holds the variations of every task."""
     jobs = []
     for first in range(0, len(chosen), run.stream.job_tasks):
         group = chosen[first : first + run.stream.job_tasks]
@@ -58,14 +58,14 @@ def rollouts(run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployme
     return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule, run.context.decoder))
 
 
-def dagger_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment]) -> tuple[Job, ...]:
+def labelled_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment], trials: int) -> tuple[Job, ...]:
     """Jobs that deploy T^j in every training variation and label query states as in D_pre.
 
     Episodes start as test episodes do.  Jobs take the deployment rules in turn, because each rule gives
     another kind of history.
     """
     payload = LabelledRollouts(run.context.max, rules[0], run.context.decoder, registry.of(run).labelling(run))
-    jobs = grouped(run, phase, _at_test_start(run, choose), run.dagger.trials, payload)
+    jobs = grouped(run, phase, _at_test_start(run, choose), trials, payload)
     return tuple(
         dataclasses.replace(job, payload=dataclasses.replace(payload, deploy=rules[(phase.round + number) % len(rules)]))
         for number, job in enumerate(jobs)

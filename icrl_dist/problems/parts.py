@@ -1,4 +1,4 @@
-"""Optional parts of a problem that a single command uses: ``Problem.posterior`` and ``Problem.game``."""
+"""Optional parts of a problem with interfaces of their own: ``Problem.posterior``, ``Problem.game``, ``Problem.certify``."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float32, Float64
 
 from icrl_dist.interfaces import MakePolicy
+from icrl_dist.types import Variation
 
 if TYPE_CHECKING:
     from icrl_dist.agent.in_context_agent import InContextAgent
@@ -61,6 +62,30 @@ class PosteriorSuite(Protocol):
         ``by_prefix``: a map per comparison with ``kind``, ``p`` and ``kl``, a number of nats per prefix length;
         ``agreement``: lists of equal length, ``exact`` and ``model``: probabilities of actions, averaged in bins.
         """
+        ...
+
+
+class Certificate(Protocol):
+    """``Problem.certify``: exact expected returns of policies that are fixed within an episode (Markov policies).
+
+    Under Algorithm 1 the context is frozen within an episode, so an in-context agent is such a policy, given its context.
+    ``policies`` are probabilities at the C ``states``, P = B policies, one for each variation, or P = 1, one for all.  Returns
+    are undiscounted, of one test episode.
+    """
+
+    @property
+    def states(self) -> Float32[np.ndarray, "C S"]:
+        """All states of the problem, as observations."""
+        ...
+
+    def worst(
+        self, policies: Float[np.ndarray, "P C A"] | None, variations: Sequence[Variation], p: float
+    ) -> Float64[np.ndarray, " B"]:
+        """Against the worst adversary of strength p in each variation's task; None: the policy that is best against it."""
+        ...
+
+    def expected(self, policies: Float[np.ndarray, "P C A"], variations: Sequence[Variation]) -> Float64[np.ndarray, " B"]:
+        """Under the adversary of each variation."""
         ...
 
 

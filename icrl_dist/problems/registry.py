@@ -6,6 +6,8 @@ import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from icrl_dist import arrays
 from icrl_dist.config import plugins
 from icrl_dist.config.random_keys import RandomKey, generator
@@ -83,16 +85,26 @@ def make(variation: Variation, render_mode: str | None = None) -> VariationEnv:
 
 
 def training_variations(run: Run, index: int, task: Task, round: int = 0) -> tuple[Variation, ...]:
-    """The K training variations of task number ``index``, phi_0 first (Algorithm 2, line 7).
+    """The training variations of task number ``index`` (Algorithm 2, line 7): first phi_0 if ``adversary.null``, then K others.
 
     Each round of ICAA samples new adversaries (Algorithm 3, line 11).
     """
     rng = generator(run.seed, RandomKey.TRAINING_ADVERSARIES, index, round)
-    return tuple(Variation(task, one) for one in of(run).training_adversaries(rng, run.adversary))
+    return tuple(Variation(task, one) for one in adversaries(run, rng))
 
 
-def test_adversary(run: Run, index: int, p: float, prior: str) -> Adversary:
-    """The adversary of test task number ``index`` with strength ``p``; it is not one of training."""
+def adversaries(run: Run, rng: np.random.Generator) -> tuple[Adversary, ...]:
+    """The adversaries of one training task: first phi_0 if ``adversary.null``, then K disturbances drawn with ``rng``."""
+    return (NULL,) * run.adversary.null + of(run).training_adversaries(rng, run.adversary)
+
+
+def test_adversary(run: Run, index: int, p: float, prior: str, draw: int = 0) -> Adversary:
+    """An adversary of test task number ``index`` with strength ``p``; it is not one of training.
+
+    ``draw``: number of the adversary draw; every evaluation of a task has its own.  A prior with a single adversary
+    gives the same for each.
+    """
     if p == 0:
         return NULL
-    return of(run).test_adversary(generator(run.seed, RandomKey.TEST_ADVERSARIES, index), p, prior)
+    key = (index, draw) if draw else (index,)  # draw 0 has the key that a task's only adversary had in older versions
+    return of(run).test_adversary(generator(run.seed, RandomKey.TEST_ADVERSARIES, *key), p, prior)

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from icrl_dist.results import comparison, statistics, summaries
 from icrl_dist.results.returns import LAST, Returns, returns
+from icrl_dist.results.tables import CERTIFIED, any_certified, worst_case
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,20 +28,23 @@ def table(frame: pd.DataFrame, title: Callable[[int], str]) -> Table:
     episodes = min(LAST, found[0].returns.shape[-1])
     estimates, best = summaries.intervals(every, episodes), summaries.ceilings(every, episodes)
     trainings, tasks, evaluations, _ = found[0].returns.shape
+    certified = any_certified(found, episodes)
     shown = Table(
         title=f"{title(tasks)}, p = {found[0].p:g}: mean return of the last {episodes} episodes",
         title_justify="left",
-        caption=statistics.resampled(trainings, tasks, evaluations, episodes),
+        caption=statistics.resampled(trainings, tasks, evaluations, episodes, max(one.draws for one in found))
+        + (f".  {CERTIFIED}" if certified else ""),
         caption_justify="left",
     )
     of = next((best[one.p, one.agent].name for one in found if (one.p, one.agent) in best), "")
-    for name in ("agent", "return", "95%", *([f"of {of}"] if of else [])):
+    for name in ("agent", "return", "95%", *([f"of {of}"] if of else []), *(["certified"] if certified else [])):
         shown.add_column(name, justify="left" if name == "agent" else "right", overflow="fold")
     for one in found:
         value, share = estimates[one.p, one.agent]
         shares = [] if not of else ["-" if share is None or math.isnan(share.value) else f"{share.value:.0%}"]
         interval = "-" if math.isnan(value.low) else f"{value.low:.2f} .. {value.high:.2f}"
-        shown.add_row(one.name, f"{value.value:.2f}", interval, *shares)
+        worst = [worst_case(one, episodes)] if certified else []
+        shown.add_row(one.name, f"{value.value:.2f}", interval, *shares, *worst)
     return shown
 
 

@@ -6,19 +6,21 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 
 from icrl_dist.agent.trained_model import TrainedModel
 from icrl_dist.config.random_keys import strength_key
 from icrl_dist.config.run import ConfigError, Deployment, Run
 from icrl_dist.config.sections import ContextConfig
-from icrl_dist.interfaces import MakePolicy, Policy, Reference
+from icrl_dist.interfaces import MakePolicy, Policy, Problem, Reference
+from icrl_dist.methods import budget
 from icrl_dist.problems import registry
+from icrl_dist.results.returns import LAST
 from icrl_dist.results.rows import Block
-from icrl_dist.rollout.episode import Episodes, OfflinePolicy, deploy_offline, deploy_online, episode
+from icrl_dist.rollout.episode import Episodes, OfflinePolicy, append, episode
 from icrl_dist.types import Adversary, Identity, Task, Variation
 
 
@@ -39,10 +41,10 @@ class Result:
     agent: Agent
     p: float
     returns: Float[np.ndarray, "tasks seeds episodes"]
-    variations: tuple[Variation, ...]
-    """One per task."""
-    optimum: Float[np.ndarray, " tasks"] | None = None
-    """Expected return of the optimal policy in each task's variation; None for a problem without exact answers."""
+    variations: tuple[tuple[Variation, ...], ...]
+    """By task and seed: evaluation e of a task has the adversary of draw e."""
+    optimum: Float[np.ndarray, "tasks seeds"] | None = None
+    """Expected return of the optimal policy in each variation; None for a problem without exact answers."""
     ceiling: bool = False
     """The agent is given the task, so other returns are also shown as a share of its returns."""
     diverged: Bool[np.ndarray, "tasks seeds episodes"] | None = None
@@ -56,8 +58,9 @@ class Result:
         """The result as result rows.  ``name``: of the run; ``tasks``: which tasks these are."""
         shape = self.returns.shape
         task, seed, number = (index.ravel() for index in np.indices(shape))
-        adversaries = [one.adversary for one in self.variations]
-        optimum = np.full(shape[0], np.nan) if self.optimum is None else self.optimum
+        flat, row = _flat(self.variations), task * shape[1] + seed
+        adversaries = [one.adversary for one in flat]
+        optimum = np.full(shape[:2], np.nan) if self.optimum is None else self.optimum
         diverged = np.zeros(shape, bool) if self.diverged is None else self.diverged
         return {
             **of_run(run, name),
@@ -70,15 +73,15 @@ class Result:
             "data": self.data,
             "prior": run.evaluate.prior,
             "task_index": task,
-            "task": np.array([parameters(one.task) for one in self.variations], object)[task],
+            "task": np.array([parameters(one.task) for one in flat], object)[row],
             "p": self.p,
-            "adversary_family": np.array([adversary.kind for adversary in adversaries], object)[task],
-            "adversary_index": task,
-            "adversary": np.array([parameters(adversary) for adversary in adversaries], object)[task],
+            "adversary_family": np.array([adversary.kind for adversary in adversaries], object)[row],
+            "adversary_index": seed,
+            "adversary": np.array([parameters(adversary) for adversary in adversaries], object)[row],
             "evaluation_seed": seed,
             "episode": number,
             "return": self.returns.ravel(),
-            "optimum": optimum[task],
+            "optimum": optimum.ravel()[row],
             "diverged": diverged.ravel(),
             **{name: values.ravel() for name, values in self.extra.items()},
         }
@@ -86,8 +89,6 @@ class Result:
 
 def of_run(run: Run, name: str) -> Block:
     """The columns of result rows that are equal in all rows of a run."""
-    split_seed = getattr(registry.of(run).config, "split_seed", None)
-    whole = isinstance(split_seed, int | np.integer) and not isinstance(split_seed, bool) and abs(int(split_seed)) < 2**63
     return {
         "run": name,
         "method": run.method,
@@ -96,7 +97,8 @@ def of_run(run: Run, name: str) -> Block:
         "setting": "",
         "variant": run.method,
         "adversaries": run.adversary.count,
-        "split_seed": split_seed if whole else None,  # a plugin may give the name another meaning
+        "split_seed": budget.split_seed(run),
+        **budget.columns(run),
     }
 
 
@@ -105,14 +107,58 @@ def parameters(of: Task | Adversary) -> str:
     return json.dumps(dict(of.params), sort_keys=True)
 
 
-def variations(run: Run, p: float, tasks: Sequence[Task] | None = None) -> tuple[Variation, ...]:
-    """Every evaluated task (or each of ``tasks``) under its test adversary of strength p; starts are those of test episodes."""
+def variations(run: Run, p: float, tasks: Sequence[Task] | None = None, draw: int = 0) -> tuple[Variation, ...]:
+    """Every evaluated task (or each of ``tasks``) under its test adversary of strength p; starts are those of test episodes.
+
+    ``draw``: number of the adversary draw.
+    """
     problem = registry.of(run)
     chosen = problem.evaluated if tasks is None else tasks
     return tuple(
-        Variation(problem.at_test_start(task), registry.test_adversary(run, index, p, run.evaluate.prior))
+        Variation(problem.at_test_start(task), registry.test_adversary(run, index, p, run.evaluate.prior, draw))
         for index, task in enumerate(chosen)
     )
+
+
+class Rows(NamedTuple):
+    """What is evaluated at one p, for every task and, within it, every evaluation."""
+
+    variations: tuple[tuple[Variation, ...], ...]
+    """By task and evaluation."""
+    flat: list[Variation]
+    """The same, as the rows of one batch."""
+    ids: list[Identity]
+    """Identity of the first episode of each row."""
+    optimum: Float64[np.ndarray, "tasks seeds"] | None
+
+    @classmethod
+    def of(cls, run: Run, p: float, tasks: Sequence[Task] | None = None) -> Rows:
+        """Every task (None: every evaluated task) ``evaluate.seeds`` times, evaluation e with the adversary of draw e."""
+        seeds, exact = range(run.evaluate.seeds), registry.of(run).exact
+        chosen = tuple(zip(*(variations(run, p, tasks, seed) for seed in seeds), strict=True))
+        flat = _flat(chosen)
+        ids = [Identity("evaluate", strength_key(p), i, seed, 0) for i in range(len(chosen)) for seed in seeds]
+        optimum = None if exact is None else np.asarray(exact.optimum(flat)).reshape(len(chosen), len(seeds))
+        return cls(chosen, flat, ids, optimum)
+
+
+def _flat(chosen: Sequence[Sequence[Variation]]) -> list[Variation]:
+    return [one for of_task in chosen for one in of_task]
+
+
+def certified(problem: Problem, policy: Policy, rows: Sequence[Variation], p: float) -> Float64[np.ndarray, " B"] | None:
+    """Expected return of the next episode of each row, given its context, against the worst adversary of strength p.
+
+    None if the problem has no ``certify``, and for a policy that changes within an episode.
+    """
+    if problem.certify is None or (policies := frozen(policy, problem.certify.states)) is None:
+        return None
+    return problem.certify.worst(policies, rows, p)
+
+
+def frozen(policy: Any, states: Float[np.ndarray, "Q S"]) -> Float[np.ndarray, "P Q A"] | None:
+    """``FrozenPolicy.frozen`` of a policy; None if it has none."""
+    return policy.frozen(states) if hasattr(policy, "frozen") else None
 
 
 def in_context(trained: TrainedModel, context: ContextConfig, deploy: Deployment | None = None) -> MakePolicy:
@@ -131,55 +177,66 @@ def online(
 ) -> list[Result]:
     """Online deployment (Algorithm 1, lines 9 to 17) of every agent at every p, with the same draws for all agents.
 
+    The last ``LAST`` episodes have the column ``certified`` of agents that have such a value.
+
     ``tasks``: where to deploy; None: the evaluated tasks.
     """
     problem, results = registry.of(run), []
     for p in run.evaluate.p:
-        chosen = variations(run, p, tasks)
-        optimum = None if problem.exact is None else problem.exact.optimum(chosen)
-        rows, ids = _rows(run, chosen, p)
+        chosen, rows, ids, optimum = Rows.of(run, p, tasks)
         shape = (len(chosen), run.evaluate.seeds, run.evaluate.episodes)
         for name, agent in agents.items():
             env = problem.batch(rows)
-            trials = ([i._replace(trial=n).rng(run.seed) for i in ids] for n in range(run.evaluate.episodes))
-            returns, broken = [], []
+            returns, broken, worst = [], [], np.full((len(rows), run.evaluate.episodes), np.nan)
             made, ceiling = (agent.make, agent.ceiling) if isinstance(agent, Reference) else (agent, False)
-            for ran in deploy_online(env, made(rows, env), trials):
+            policy = made(rows, env)
+            for n in range(run.evaluate.episodes):
+                late = n >= run.evaluate.episodes - LAST
+                if late and (values := certified(problem, policy, rows, p)) is not None:
+                    worst[:, n] = values
+                ran = episode(env, policy, [i._replace(trial=n).rng(run.seed) for i in ids])
                 returns.append(_checked(ran, run, name.key, p))
                 broken.append(np.zeros(len(rows), bool) if ran.diverged is None else ran.diverged)
                 progress(name.key, p, len(returns))
-            values, diverged = (np.stack(of, axis=1).reshape(shape) for of in (returns, broken))
-            results.append(Result(name, p, values, chosen, optimum, ceiling, diverged))
+            total, diverged = (np.stack(of, axis=1).reshape(shape) for of in (returns, broken))
+            extra = {"certified": worst.reshape(shape)}
+            results.append(Result(name, p, total, chosen, optimum, ceiling, diverged, extra=extra))
     return results
 
 
-def offline(run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment | None = None) -> list[Result]:
+def offline(
+    run: Run, models: Mapping[Agent, TrainedModel], deploy: Deployment | None = None, with_references: bool = True
+) -> list[Result]:
     """Offline deployment (Algorithm 1, lines 3 to 7): one episode given a D_off of each of the ``sources``.
 
-    Deploys every model, and every reference that accepts data of other policies.
+    Deploys every model, and every reference that accepts data of other policies.  Without references, the results
+    also leave out the episodes that are the data.
     """
     problem, results = registry.of(run), []
     references = {Agent(key): reference for key, reference in problem.references(run).items()}
     for p in run.evaluate.p:
-        chosen = variations(run, p)
-        optimum = None if problem.exact is None else problem.exact.optimum(chosen)
-        rows, ids = _rows(run, chosen, p)
+        chosen, rows, ids, optimum = Rows.of(run, p)
         env = problem.batch(rows)
         shape = (len(chosen), run.evaluate.seeds, 1)
         for source, key in sources(run).items():
             behavior = Agent(key)
             data = episode(env, references[behavior].make(rows, env), [i.rng(run.seed) for i in ids])
             returns = _checked(data, run, key, p).reshape(shape)
-            results.append(Result(behavior, p, returns, chosen, optimum, diverged=_diverged(data, shape)))
+            if with_references:
+                results.append(Result(behavior, p, returns, chosen, optimum, diverged=_diverged(data, shape)))
             policies: dict[Agent, Policy] = {
                 name: in_context(one, run.context, deploy)(rows, env) for name, one in models.items()
             }
-            policies |= {name: one.make(rows, env) for name, one in references.items()}
+            if with_references:
+                policies |= {name: one.make(rows, env) for name, one in references.items()}
             for name, policy in policies.items():
                 if _accepts_data(policy):
-                    ran = deploy_offline(env, policy, [data], [i._replace(trial=1).rng(run.seed) for i in ids])
+                    append(env, policy, [data])
+                    worst = certified(problem, policy, rows, p)
+                    ran = episode(env, policy, [i._replace(trial=1).rng(run.seed) for i in ids])
                     found = Result(name, p, _checked(ran, run, name.key, p).reshape(shape), chosen, optimum, data=source)
-                    results.append(dataclasses.replace(found, diverged=_diverged(ran, shape)))
+                    extra = {} if worst is None else {"certified": worst.reshape(shape)}
+                    results.append(dataclasses.replace(found, diverged=_diverged(ran, shape), extra=extra))
     return results
 
 
@@ -207,9 +264,3 @@ def _diverged(ran: Episodes, shape: tuple[int, ...]) -> np.ndarray | None:
 
 def _accepts_data(policy: Policy) -> TypeGuard[OfflinePolicy]:
     return hasattr(policy, "append")
-
-
-def _rows(run: Run, chosen: Sequence[Variation], p: float) -> tuple[list[Variation], list[Identity]]:
-    """Every variation ``evaluate.seeds`` times, and the identity of each row's first episode."""
-    pairs = [(i, seed) for i in range(len(chosen)) for seed in range(run.evaluate.seeds)]
-    return [chosen[i] for i, _ in pairs], [Identity("evaluate", strength_key(p), i, seed, 0) for i, seed in pairs]

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -20,6 +20,7 @@ from icrl_dist.console.display import ReportEvent
 from icrl_dist.interfaces import Batch, MakePolicy, Method, Policy, Reference
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry
+from icrl_dist.results import attack as attack_suite
 from icrl_dist.results import evaluate, rows, training_rows
 from icrl_dist.results import posterior as posterior_suite
 from icrl_dist.results.evaluate import Agent
@@ -27,6 +28,7 @@ from icrl_dist.results.names import key_of
 from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.storage.files import StoreError
+from icrl_dist.stream.schema import as_data
 from icrl_dist.types import Variation
 
 if TYPE_CHECKING:
@@ -90,19 +92,18 @@ def online(
     report: ReportEvent,
     deploy: Deployment | None = None,
     unstored: list[StoreError] | None = None,
+    with_references: bool = True,
 ) -> pd.DataFrame:
     """Online returns of the folder's models, the newest first, and of the problem's references, as result rows.
 
     The rows are written to the folder ``results``; ``unstored`` as in ``rows.record``.  Models are deployed by
     ``deploy``; None: by the rule that they were trained for.  If that rule is not Algorithm 1, the newest model is
     deployed by Algorithm 1 as well.  Rows of the newest model have the OOD score after the last episode if it was
-    calibrated.
+    calibrated.  ``with_references``: False leaves the references out (``references`` evaluates them alone).
     """
     check_suite(run, "online")
     found, problem = models(what, deploy), registry.of(run)
-    agents: dict[Agent, MakePolicy | Reference] = {
-        agent: evaluate.in_context(model, run.context, deploy) for agent, model in found.items()
-    }
+    agents = _deployed(run, found, deploy)
     newest, model = next(iter(found.items()))
     scores: list[Surprise] = []
     if outcomes := outcomes_of(open_checkpoint(what)):
@@ -112,17 +113,73 @@ def online(
             return model.method.policy(model.model, len(rows), run.context, deploy, scores[-1].observe)
 
         agents[newest] = scored
-    if newest.deployment != "paper":
-        agents[newest._replace(deployment="paper")] = evaluate.in_context(model, run.context, "paper")
-    agents |= {Agent(key): reference for key, reference in problem.references(run).items()}
-    if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
-        report({"event": "note", "text": missing})
+    if with_references:
+        agents |= _references(run)
+        if missing := problem.missing_reference(run, str(what / "run.toml") if what.is_dir() else "RUN"):
+            report({"event": "note", "text": missing})
     evaluated = evaluate.online(run, agents, _count(report, "held-out evaluation", run, len(agents)))
     for one, score in zip((one for one in evaluated if one.agent == newest), scores, strict=False):
         column = np.full(one.returns.shape, np.nan)
         column[:, :, -1] = score.score().reshape(column.shape[:2])
         one.extra["surprise"] = column
     return _recorded(run, what, results, "online", {"evaluated": evaluated}, deploy, unstored)
+
+
+def _deployed(run: Run, found: Mapping[Agent, TrainedModel], deploy: Deployment | None) -> dict[Agent, MakePolicy | Reference]:
+    """The models by their rule, and if that is not Algorithm 1, the newest one by Algorithm 1 as well."""
+    agents: dict[Agent, MakePolicy | Reference] = {
+        agent: evaluate.in_context(model, run.context, deploy) for agent, model in found.items()
+    }
+    newest, model = next(iter(found.items()))
+    if newest.deployment != "paper":
+        agents[newest._replace(deployment="paper")] = evaluate.in_context(model, run.context, "paper")
+    return agents
+
+
+def _references(run: Run) -> dict[Agent, Reference]:
+    return {Agent(key): reference for key, reference in registry.of(run).references(run).items()}
+
+
+def references(
+    run: Run,
+    suite: Literal["online", "offline"],
+    results: Path,
+    name: str,
+    report: ReportEvent,
+    unstored: list[StoreError] | None = None,
+) -> pd.DataFrame:
+    """Returns of the problem's references alone as result rows of this suite: a run without a model has them too.
+
+    ``name``: the run's name in the rows, which are written to the folder ``results``.  The draws are those of ``online`` and
+    ``offline``, so the rows are partners of those of models that were evaluated with the same seed and settings.
+    """
+    check_suite(run, suite)
+    if suite == "online":
+        agents = _references(run)
+        found = evaluate.online(run, agents, _count(report, "reference agents", run, len(agents)))
+    else:
+        found = evaluate.offline(run, {})
+    settings = {"references": as_data(run.evaluate)}
+    return rows.record(results, suite, settings, [one.block(run, name, "evaluated") for one in found], unstored)
+
+
+def attack(
+    run: Run,
+    what: Path,
+    results: Path,
+    report: ReportEvent,
+    draws: int,
+    deploy: Deployment | None = None,
+    unstored: list[StoreError] | None = None,
+    with_references: bool = True,
+) -> pd.DataFrame:
+    """The rows of suite ``attack`` (``results.attack``) of the folder's models and of references; see ``online``."""
+    agents = _deployed(run, models(what, deploy), deploy)
+    if with_references:
+        agents |= _references(run)
+    progress = _count(report, "attacked episodes", run, len(agents))
+    settings = f"{report_name(run, what, 'attack', deploy)}-{draws}draws"
+    return rows.record(results, "attack", settings, attack_suite.blocks(run, agents, draws, name_of(what), progress), unstored)
 
 
 def _recorded(
@@ -135,10 +192,14 @@ def _recorded(
     unstored: list[StoreError] | None,
 ) -> pd.DataFrame:
     """Write the results, by the tasks that they are of, as result rows to ``results``; returns the rows."""
-    folder = run_folder(what)
-    name = named(what.stem if folder is None else folder.resolve().name)
-    blocks = [one.block(run, name, tasks) for tasks, ones in found.items() for one in ones]
+    blocks = [one.block(run, name_of(what), tasks) for tasks, ones in found.items() for one in ones]
     return rows.record(results, suite, report_name(run, what, suite, deploy), blocks, unstored)
+
+
+def name_of(what: Path) -> str:
+    """The name of the run in result rows: that of its folder, or of the checkpoint file."""
+    folder = run_folder(what)
+    return named(what.stem if folder is None else folder.resolve().name)
 
 
 def named(name: str) -> str:
@@ -161,6 +222,10 @@ def check_suite(run: Run, suite: str) -> None:
     if suite == "offline" and not evaluate.sources(run):
         lacks = "has no reference 'random' and none that is given the task"
         raise ConfigError(f"--suite offline: {run.problem} {lacks}, so nothing collects data; use --suite online")
+    if suite == "attack" and problem.certify is None:
+        raise ConfigError(f"--suite attack: {run.problem} has no exact worst case; use --suite online --prior unseen")
+    if suite == "attack" and min(run.evaluate.p) <= 0:
+        raise ConfigError("--suite attack: at p = 0 nothing attacks; name strengths above 0, as in --p 0.2 0.4")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
     if suite == "posterior" and problem.exact is None:
@@ -173,9 +238,10 @@ def offline(
     results: Path,
     deploy: Deployment | None = None,
     unstored: list[StoreError] | None = None,
+    with_references: bool = True,
 ) -> pd.DataFrame:
     """Offline returns of the folder's models and of references, given random and expert data; see ``online``."""
-    evaluated = evaluate.offline(run, models(what, deploy), deploy)
+    evaluated = evaluate.offline(run, models(what, deploy), deploy, with_references)
     return _recorded(run, what, results, "offline", {"evaluated": evaluated}, deploy, unstored)
 
 

@@ -22,6 +22,10 @@ class AgentKey(NamedTuple):
         return re.fullmatch(r"t\d+", self.agent) is not None
 
 
+MINIMAX = "minimax"
+"""Key of the policy that is best against the worst adversary of its strength, in rows of suite ``attack``."""
+
+
 def key_of(version: int) -> str:
     """The key of policy version T^version."""
     return f"t{version}"
@@ -40,7 +44,7 @@ def names(agents: list[AgentKey], suite: str, method: str, problem: str) -> dict
         known = {}
     found = {}
     for agent in agents:
-        name = known.get(agent.agent, agent.agent)
+        name = known.get(agent.agent, "minimax oracle" if agent.agent == MINIMAX else agent.agent)
         if agent.is_model:
             version = int(agent.agent[1:])
             name = f"T^{version} ({method})" if version == max(versions) else f"T^{version}"

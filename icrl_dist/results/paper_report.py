@@ -86,8 +86,8 @@ def report(
     ``setting``: the setting of the sweep; None for the only one (claims, the page and figure ``strength``: also those in
     which the disturbance must be inferred).  ``markdown``: a file for the text of the report.
     ``common_seeds``: compare only training seeds that all compared agents have; ``unequal_budgets``: compare methods whose
-    budgets differ; ``partial``: show a figure without the agents whose rows are missing.  The captions say what was
-    done.
+    budgets differ by more than 10%; ``partial``: show a figure without the agents whose rows are missing.  The captions say
+    what was done.
 
     Raises ConfigError for an unknown figure or setting, for rows that are missing (the message lists the runs that make
     them), and for seeds, splits, evaluation settings or budgets that differ; StoreError for rows of another format,

@@ -37,18 +37,20 @@ def online(
 def gaps(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """By p: the ``gap`` of the model to the exact agent, from rows of ``online`` for one set of tasks.
 
+    ``draws``: different adversaries of one task.
+
     Raises ConfigError if the exact agent's mean return is not above 0.
     """
     found = returns(frame)
     exact = {one.p: one for one in found if one.agent.agent == EXACT.key}
     models = [one for one in found if one.agent.agent != EXACT.key]
-    return {f"{one.p:g}": gap(one.returns[0], exact[one.p].returns[0], one.p) for one in models}
+    return {f"{one.p:g}": {**gap(one.returns[0], exact[one.p].returns[0], one.p), "draws": one.draws} for one in models}
 
 
 def gap(
     model: Float64[np.ndarray, "tasks seeds episodes"], exact: Float64[np.ndarray, "tasks seeds episodes"], p: float
 ) -> dict[str, Any]:
-    """Ratio of mean returns minus 1, with a 95% interval over goals and, within each goal, seeds, in pairs.
+    """Ratio of mean returns minus 1, with a 95% interval over goals and, within each, seeds (adversary draws), in pairs.
 
     The interval is that of ``statistics.estimate``; its bounds are None where it has none.  Also both means and the
     numbers of tasks, seeds and episodes.  Raises ConfigError if the exact agent's mean

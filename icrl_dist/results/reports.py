@@ -16,7 +16,7 @@ from rich.text import Text
 from icrl_dist.config.run import Run
 from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.problems import registry
-from icrl_dist.results import plots, summaries
+from icrl_dist.results import attack, plots, summaries
 from icrl_dist.results.returns import Returns, returns
 from icrl_dist.results.rows import keeping
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
@@ -108,6 +108,17 @@ def offline(run: Run, frame: pd.DataFrame, unstored: Sequence[StoreError] = ()) 
     table = returns_table(frame, f"One episode given data collected before: {title}")
     notes = (*_diverged(found), *_notes({}, unstored))
     return Evaluation(frame, (table,), notes, {"rows": summaries.result_rows(frame)})
+
+
+def attacked(run: Run, report: Path, frame: pd.DataFrame, draws: int, unstored: list[StoreError] | None = None) -> Evaluation:
+    """The evaluation with these rows of suite ``attack``, whose numbers are written to ``report``.json."""
+    found = attack.summary(frame)
+    with keeping(unstored):
+        write_json(report.with_name(f"{report.name}.json"), found)
+    title = f"One episode under attack: {run.method.upper()}, {registry.of(run).title(registry.of(run).evaluated_count)}"
+    return Evaluation(
+        frame, (attack.table(run, found, title, draws),), tuple(_notes({}, unstored)), {"draws": draws, "attack": found}
+    )
 
 
 def posterior(

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 LAST = 5
 """Episodes at the end of an evaluation whose mean return is shown."""
+Cell = tuple[object, object, tuple[tuple[object, object], ...]]
+"""A task as it was evaluated: split seed, parameters, and the adversary of each evaluation (family and parameters)."""
 _INDEX = ["training_seed", "task_index", "evaluation_seed", "episode"]
 _SETTING = ("suite", "tasks", "method", "problem", "prior")
 
@@ -30,18 +32,20 @@ class Returns:
     """What tables call the agent."""
     p: float
     returns: Float64[np.ndarray, "S C E N"]
-    optimum: Float64[np.ndarray, "S C"] | None
+    optimum: Float64[np.ndarray, "S C E"] | None
     """Expected return of the optimal policy; None if it is not known."""
     ceiling: bool
     """The agent is given the task, so other returns are also shown as a share of its returns."""
     diverged: int
     """Episodes in which the simulation diverged."""
     training_seeds: tuple[int, ...]
-    cells: tuple[tuple[tuple[object, ...], ...], ...]
-    """By training and task: split seed, task parameters, adversary's family and parameters."""
+    cells: tuple[tuple[Cell, ...], ...]
+    """By training and task."""
     evaluation_seeds: tuple[int, ...]
     setting: dict[str, str]
     """Suite, tasks, method, problem and prior of the rows."""
+    certified: Float64[np.ndarray, "S C E N"]
+    """The column ``certified``; nan where it has no value."""
 
     @property
     def crossed(self) -> bool:
@@ -51,6 +55,29 @@ class Returns:
         """
         tasks = [[cell[:2] for cell in training] for training in self.cells]
         return all(training == tasks[0] for training in tasks)
+
+    @property
+    def draws(self) -> int:
+        """The largest number of different adversaries that one task was evaluated under."""
+        return max(len(set(adversaries)) for training in self.cells for _, _, adversaries in training)
+
+    def worst_sampled(self, episodes: int = LAST) -> float:
+        """Mean return over the last episodes under the sampled adversary that lowers it most, averaged over tasks.
+
+        It estimates the worst case from few draws: the minimum of noisy means lies below the smallest true mean, and the
+        worst adversary of all may be worse.
+        """
+        lowest = []
+        for training, scores in zip(self.cells, self.scores(episodes), strict=True):
+            for (_, _, adversaries), of_task in zip(training, scores, strict=True):
+                alike = [[a == b for b in adversaries] for a in dict.fromkeys(adversaries)]
+                lowest.append(min(of_task[np.array(of)].mean() for of in alike))
+        return float(np.mean(lowest))
+
+    def certificate(self, episodes: int = LAST) -> float | None:
+        """Mean certified return over the last episodes; None if any of them has none."""
+        found = self.certified[..., -episodes:].mean()
+        return None if np.isnan(found) else float(found)
 
     def last(self, episodes: int = LAST) -> float:
         """Mean return over the last episodes."""
@@ -132,10 +159,14 @@ def _arrays(agent: AgentKey, name: str, p: float, rows: pd.DataFrame, setting: d
                 f"result rows of {agent.agent}, p = {p:g}: {column} is {level[0]} to {level[-1]}, {len(level)} numbers, where "
                 f"it should be 0 to {len(level) - 1}: choose whole evaluations by the column evaluation"
             )
-    first = rows.iloc[:: shape[2] * shape[3]]
-    splits = first["split_seed"].astype(object).where(first["split_seed"].notna(), None)
-    labels = list(zip(splits, *(first[c] for c in ("task", "adversary_family", "adversary")), strict=True))
-    optimum = first["optimum"].to_numpy(float).reshape(shape[:2])
+    first = rows.iloc[:: shape[3]]
+    splits = first["split_seed"].astype(object).where(first["split_seed"].notna(), None).tolist()
+    adversaries = list(zip(first["adversary_family"], first["adversary"], strict=True))
+    cells = [
+        (splits[row], first["task"].iloc[row], tuple(adversaries[row : row + shape[2]]))
+        for row in range(0, len(first), shape[2])
+    ]
+    optimum = first["optimum"].to_numpy(float).reshape(shape[:3])
     return Returns(
         agent=agent,
         name=name,
@@ -145,9 +176,10 @@ def _arrays(agent: AgentKey, name: str, p: float, rows: pd.DataFrame, setting: d
         ceiling=bool(rows["ceiling"].iloc[0]),
         diverged=int(rows["diverged"].sum()),
         training_seeds=tuple(map(int, levels[0])),
-        cells=tuple(tuple(labels[i * shape[1] : (i + 1) * shape[1]]) for i in range(shape[0])),
+        cells=tuple(tuple(cells[i * shape[1] : (i + 1) * shape[1]]) for i in range(shape[0])),
         evaluation_seeds=tuple(map(int, levels[2])),
         setting=setting,
+        certified=rows["certified"].to_numpy(float).reshape(shape),
     )
 
 
@@ -173,11 +205,15 @@ def check_pairs(first: Returns, second: Returns) -> None:
         for index, (here, there) in enumerate(zip(ones, twos, strict=True)):
             if here != there:
                 raise ConfigError(
-                    f"result rows at p = {first.p:g}, training seed {seed}, task {index}: {first.name} has {_cell(here)} and "
-                    f"{second.name} has {_cell(there)}: pairs need equal split seed, task and adversary; evaluate both alike"
+                    f"result rows at p = {first.p:g}, training seed {seed}, task {index}: {first.name} has "
+                    f"{_cell(here, there)} and {second.name} has {_cell(there, here)}: pairs need equal split seed, task and "
+                    "adversary in every evaluation; evaluate both alike"
                 )
 
 
-def _cell(cell: tuple[object, ...]) -> str:
-    split, task, family, adversary = cell
-    return f"split seed {split}, task {task}, adversary {family} {adversary}"
+def _cell(cell: Cell, other: Cell) -> str:
+    """The cell with the first of its adversaries that the other one does not have in the same evaluation."""
+    split, task, adversaries = cell
+    draw = next((i for i, (a, b) in enumerate(zip(adversaries, other[2], strict=True)) if a != b), 0)
+    family, parameters = adversaries[draw]
+    return f"split seed {split}, task {task}, in evaluation {draw} adversary {family} {parameters}"

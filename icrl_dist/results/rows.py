@@ -1,7 +1,7 @@
 """Result rows: one row per evaluated episode, in Parquet files that are written once and never changed.
 
 Each evaluation adds one file to ``RUN_DIR/results/``.  All tables, figures and statistics are computed from these
-rows.  ``COLUMNS`` documents the columns; docs/data.md is generated from it.  pyarrow and pandas are imported only
+rows.  ``columns.COLUMNS`` documents the columns.  pyarrow and pandas are imported only
 inside functions, because workers and most commands need neither.
 """
 
@@ -14,12 +14,13 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from icrl_dist.config.paths import folder_of
 from icrl_dist.config.run import ConfigError
+from icrl_dist.results.columns import ADDED, COLUMNS, FORMAT, FORMER
 from icrl_dist.storage.files import StoreError, atomic_write
 from icrl_dist.telemetry import provenance
 
@@ -27,83 +28,12 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-FORMAT = 2
-"""Number of the file format.  It changes whenever a column is added, removed, or gets another meaning."""
 _FORMAT_KEY = b"icrl_dist.results.format"
 
 Block = Mapping[str, Any]
 """Rows as columns: every value is an array with one entry per row, or one value for all rows.  ``return`` is an array."""
 
 
-class Column(NamedTuple):
-    """A column of the result rows."""
-
-    type: str
-    """Type of pyarrow: ``string``, ``int64``, ``double`` or ``bool``."""
-    meaning: str
-    nullable: bool = False
-
-
-COLUMNS: dict[str, Column] = {
-    "format": Column("int64", "number of the file format; this page describes format 2"),
-    "evaluation": Column("string", "name of the file without its suffix: which evaluation wrote the row"),
-    "written": Column("string", "when, in UTC"),
-    "package_version": Column("string", "version of icrl-dist"),
-    "code_digest": Column("string", "SHA-256 of the code of icrl-dist"),
-    "commit": Column("string", "Git commit of that code, with `-dirty` if it was changed; empty outside a Git checkout"),
-    "libraries": Column(
-        "string",
-        "versions of Python and of libraries, JSON; also the package of the problem or method if it is not this one",
-    ),
-    "instruction_set": Column("string", "vector instructions that torch used, such as `AVX512`"),
-    "threads": Column("int64", "CPU threads of torch"),
-    "run": Column("string", "name of the run: the name of its folder or of the checkpoint file"),
-    "method": Column("string", "method of the run, such as `icaa`"),
-    "problem": Column("string", "problem of the run, such as `darkroom`"),
-    "training_seed": Column("int64", "`seed` of the run"),
-    "split_seed": Column("int64", "`split_seed` of the run's problem; null if it has none that is a whole number", True),
-    "setting": Column("string", "name of the setting in a sweep; empty outside a sweep"),
-    "variant": Column("string", "name of the method in a sweep, such as `icag-k4`; outside a sweep the method"),
-    "adversaries": Column("int64", "K: disturbances per training task, without the null adversary"),
-    "label_source": Column("string", "what the labels of training come from, such as `optimal`; null if not known", True),
-    "training_episodes": Column("int64", "episodes that the training collected; null if not known", True),
-    "labelled_episodes": Column("int64", "those of them whose labels the fits used; null if not known", True),
-    "environment_steps": Column("int64", "environment steps of the training, of demonstrations too; null if not known", True),
-    "optimizer_steps": Column("int64", "optimizer steps of the training; null if not known", True),
-    "suite": Column("string", "`online`, `offline`, `posterior`, `label_quality` or `experts`"),
-    "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
-    "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),
-    "policy_version": Column("int64", "version of the weights; -1 for an agent without weights of this run"),
-    "weights_digest": Column("string", "SHA-256 of the weights; empty for an agent without"),
-    "ceiling": Column("bool", "whether the agent is given the task, so that other returns are shown as a share of its own"),
-    "deployment": Column("string", "deployment rule of a model, `paper` or `committed`; empty for other agents"),
-    "data": Column("string", "in suite `offline`: whose episode the context holds, `random` or `expert`; else empty"),
-    "prior": Column("string", "`evaluate.prior`: distribution of the test adversaries; empty if they are of training"),
-    "task_index": Column("int64", "number of the task among `tasks`"),
-    "task": Column("string", "parameters of the task, JSON"),
-    "p": Column("double", "strength of the test adversary, from `evaluate.p`; null if it is an adversary of training", True),
-    "adversary_family": Column("string", "family of the adversary, such as `dirichlet`; `null` is no disturbance"),
-    "adversary_index": Column(
-        "int64", "number of the test task for which the adversary was drawn; in training, number of the variation"
-    ),
-    "adversary": Column("string", "parameters of the adversary, JSON; of a network they include its seed and strength"),
-    "evaluation_seed": Column("int64", "number of the evaluation of the task, from 0; the context starts empty in each"),
-    "episode": Column("int64", "number of the episode in that evaluation, from 0"),
-    "return": Column("double", "undiscounted return; up to the step at which the simulation diverged, if it did"),
-    "optimum": Column("double", "expected return of the optimal policy in this variation, where it is known", True),
-    "diverged": Column("bool", "whether the simulation diverged in this episode"),
-    "surprise": Column("double", "out-of-distribution score after the evaluation's last episode; null elsewhere", True),
-    "certified": Column(
-        "double",
-        "expected return of this episode, given its context, against the worst override adversary of strength p; exact; "
-        "null where it is not known",
-        True,
-    ),
-    "agreement": Column(
-        "double", "in suite `label_quality`: share of the variation's labels that are optimal; null if it gave none", True
-    ),
-}
-"""The columns of the result rows, in the files' order."""
 _MADE_BY = ("package_version", "code_digest", "commit", "instruction_set", "threads")
 """The columns that are entries of ``provenance.record``."""
 REPEATED = ("run", "suite", "tasks", "agent", "deployment", "data", "p", "prior")
@@ -210,14 +140,16 @@ def read(files: Iterable[Path]) -> pd.DataFrame:
 
     Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
     """
-    return _frame([_read(path) for path in files])
+    return _frame([table_of(path) for path in files])
 
 
 def _frame(tables: Sequence[pa.Table]) -> pd.DataFrame:
     import pyarrow as pa
 
     frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
-    frame["split_seed"] = frame["split_seed"].astype("Int64")
+    for name, column in COLUMNS.items():
+        if column.nullable and column.type == "int64":
+            frame[name] = frame[name].astype("Int64")
     return frame
 
 
@@ -230,7 +162,8 @@ def _newest(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[order == last].reset_index(drop=True)
 
 
-def _read(path: Path) -> pa.Table:
+def table_of(path: Path) -> pa.Table:
+    """All rows of one file, with the columns of this format; raises as ``read``."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -240,9 +173,9 @@ def _read(path: Path) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{path}: not a file of result rows ({reason}): move it away, and evaluate again") from None
-    check_schema(path, table.schema)
+    found = check_schema(path, table.schema)
     schema = _schema()
-    for field in schema:
+    for field in (one for one in schema if one.name in table.column_names):
         if not field.nullable and (missing := table.column(field.name).null_count):
             raise StoreError(
                 f"{path}: {missing} of {len(table)} rows have no {field.name}, so they can be neither distinguished nor "
@@ -254,28 +187,46 @@ def _read(path: Path) -> pa.Table:
             raise StoreError(
                 f"{path}: {name} is no finite number in {unknown} of {len(table)} rows: move the file away, and evaluate again"
             )
+    table = _present(table) if found == str(FORMER) else table
     return table.select(schema.names).cast(schema)
 
 
-def check_schema(path: Path, found: pa.Schema) -> None:
-    """Raises StoreError, in one line with the remedy, unless the file has this format and its columns."""
-    written = (found.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
-    if written != str(FORMAT):
+def check_schema(path: Path, schema: pa.Schema) -> str:
+    """The format of a file.  Raises StoreError, in one line with the remedy, for other formats and for wrong columns."""
+    found = (schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
+    if found not in (str(FORMAT), str(FORMER)):
         raise StoreError(
-            f"{path}: result rows of format {written}, and this version reads format {FORMAT}: read them with the version that "
-            "wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
+            f"{path}: result rows of format {found}, and this version reads formats {FORMER} and {FORMAT}: read them "
+            "with the version that wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
         )
-    here, there = ({(field.name, str(field.type)) for field in schema} for schema in (found, _schema()))
-    if wrong := sorted(here ^ there):
+    expected = {(f.name, str(f.type)) for f in _schema() if found == str(FORMAT) or f.name not in ADDED}
+    if wrong := sorted({(field.name, str(field.type)) for field in schema} ^ expected):
         columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
         raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
+    return found
+
+
+def _present(table: pa.Table) -> pa.Table:
+    """Rows of format 1 with the columns of this format.
+
+    There ``adversary_index`` is the number of the test task, whose evaluations all have the adversary of draw 0.
+    """
+    import pyarrow as pa
+
+    schema, trained = _schema(), np.isin(table.column("suite").to_numpy(), _WITHOUT_P)
+    draws = pa.array(np.where(trained, table.column("adversary_index").to_numpy(), 0))
+    columns = {name: pa.repeat(pa.scalar(value, schema.field(name).type), len(table)) for name, value in ADDED.items()}
+    table = table.drop_columns(["adversary_index"])
+    for name, column in (columns | {"variant": table.column("method"), "adversary_index": draws}).items():
+        table = table.append_column(name, column)
+    return table
 
 
 def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = False, all: bool = False) -> pd.DataFrame:
     """The result rows of one run folder or of several, one row per evaluated episode; docs/data.md explains the columns.
 
     If several evaluations of a run evaluated one agent alike (equal columns ``REPEATED``), the frame holds the rows of the
-    newest only.
+    newest only.  Rows of format 1 are read as well; the columns that they lack have the values of docs/data.md.
 
     ``unfinished``: also read runs whose training has not finished; ``all``: the rows of all evaluations, which differ in
     the column ``evaluation``.  Raises ConfigError for a folder without results and for an unfinished run, StoreError for
@@ -301,9 +252,3 @@ def read_results(runs: str | Path | Sequence[str | Path], unfinished: bool = Fal
 def is_unfinished(folder: Path) -> bool:
     """Whether a run folder holds a run whose training or evaluation has not ended."""
     return (folder / "run.toml").exists() and not (folder / "result.json").exists()
-
-
-def document() -> str:
-    """The table of columns in docs/data.md."""
-    lines = ["| column | type | meaning |", "|---|---|---|"]
-    return "\n".join([*lines, *(f"| `{name}` | {column.type} | {column.meaning} |" for name, column in COLUMNS.items())])

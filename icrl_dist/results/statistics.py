@@ -1,13 +1,14 @@
 """Statistics of returns: pure functions on arrays, for summaries of rows and for tables.
 
 Scores are arrays of shape (..., trainings, cells, evaluations): a *training* is one training seed, a *cell* is one
-task with its adversary, an *evaluation* is one deployment of the agent in a cell from an empty context, and its score
-is a return, or the mean return over some of its episodes.
+task, an *evaluation* is one deployment of the agent in a cell from an empty context, under an adversary draw of its own,
+and its score is a return, or the mean return over some of its episodes.
 
 References: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021 (IQM,
 probability of improvement; the estimators are those of its library rliable).  Efron and Tibshirani, "An Introduction
 to the Bootstrap", 1993 (bootstrap standard errors and Student's t, chapters 6 and 12).  Owen, "The pigeonhole bootstrap",
-Annals of Applied Statistics 1(2), 2007 (resampling of crossed factors).  Agresti and Coull, "Approximate is better than
+Annals of Applied Statistics 1(2), 2007 (resampling of crossed factors).  Davison and Hinkley, "Bootstrap Methods and their
+Application", 1997 (resampling of nested factors, section 3.8).  Agresti and Coull, "Approximate is better than
 exact for interval estimation of binomial proportions", The American Statistician 52(2), 1998.
 """
 
@@ -81,7 +82,7 @@ def iqm(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
 
 
 def minimum(scores: Float[np.ndarray, "*batch S C"]) -> np.ndarray:
-    """Worst case: the smallest score of each training over its cells (tasks with their adversaries), averaged over trainings.
+    """Worst case: the smallest score of each training over its cells (tasks), averaged over trainings.
 
     The minimum of noisy means lies below the smallest true mean, so compare only minima over equal numbers of cells
     and evaluations.
@@ -120,27 +121,30 @@ class Resample(NamedTuple):
 
     trainings: Int64[np.ndarray, "R S 1 1"]
     cells: Int64[np.ndarray, "R|1 S|1 C 1"]
-    evaluations: Int64[np.ndarray, "R S C E"]
+    evaluations: Int64[np.ndarray, "R|1 S|1 C|1 E"]
 
 
 def resamples(
     rng: np.random.Generator, shape: tuple[int, int, int], count: int, crossed: bool, fixed_cells: bool = False
 ) -> Iterator[Resample]:
-    """Indices of ``count`` resamples of S trainings, C cells and E evaluations, all with replacement, in chunks.
+    """Indices of ``count`` resamples of S trainings, C cells and E evaluations, in chunks; draws are with replacement.
 
     First the trainings are drawn, then the cells, then the evaluations within each drawn cell.  ``crossed``: all
-    trainings were evaluated in the same cells, so a resample has the same cells in all of its trainings (Owen 2007);
-    otherwise cells are drawn for each training anew.  ``fixed_cells``: every resample has all cells once.
+    trainings were evaluated in the same cells, so a resample has the same cells in all of its trainings (Owen 2007).
+    Otherwise each of several trainings has cells of its own: it is drawn with all its cells and evaluations, because
+    training means already vary by them, and to draw them again would count their variance twice (Davison and
+    Hinkley 1997, section 3.8).  ``fixed_cells``: every resample has all cells once.
     """
     s, c, e = shape
     step = max(1, _CHUNK // (s * c * e))
     for first in range(0, count, step):
         r = min(step, count - first)
-        yield Resample(
-            rng.integers(0, s, size=(r, s, 1, 1)),
-            np.arange(c).reshape(1, 1, c, 1) if fixed_cells else rng.integers(0, c, size=(r, 1 if crossed else s, c, 1)),
-            rng.integers(0, e, size=(r, s, c, e)),
-        )
+        trainings, every = rng.integers(0, s, size=(r, s, 1, 1)), np.arange(c).reshape(1, 1, c, 1)
+        if s > 1 and not crossed:
+            yield Resample(trainings, every, np.arange(e).reshape(1, 1, 1, e))
+        else:
+            cells = every if fixed_cells else rng.integers(0, c, size=(r, 1, c, 1))
+            yield Resample(trainings, cells, rng.integers(0, e, size=(r, s, c, e)))
 
 
 def bootstrap(
@@ -153,7 +157,7 @@ def bootstrap(
 ) -> Float64[np.ndarray, "R K"]:
     """Paired hierarchical bootstrap: K numbers of ``statistic`` for each of ``count`` resamples.
 
-    Resamples training seeds, then tasks with their adversaries, then evaluations (see ``resamples``).  Every resample
+    Resamples training seeds, then tasks, then evaluations with their adversary draws, nested (see ``resamples``).  Every resample
     has the same indices for all A agents, so differences and ratios of agents are compared in pairs.
     """
     found = []
@@ -221,21 +225,26 @@ def spread(count: int) -> float:
     return float(stdtrit(count - 1, (1 + LEVEL) / 2) ** 2 * count / (count - 1))
 
 
-def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1) -> str:
+def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1, draws: int = 1) -> str:
     """What an interval was resampled over, in words, for the caption of a table.
 
-    ``episodes``: consecutive episodes of one evaluation that a score is the mean of.
+    ``episodes``: consecutive episodes of one evaluation that a score is the mean of.  ``draws``: different adversaries
+    of one task; with one, as without disturbance or with a prior of a single adversary, all evaluations have the same.
     """
     if units((trainings, tasks, evaluations)) == 1:
         return "one training, one evaluation of one task: no intervals"
-    each = _count(evaluations, "evaluation") + " of each"
+    each = counted(evaluations, "evaluation") + " of each"
+    if draws > 1:
+        over = f"{counted(tasks, 'task')}, {each} with an adversary draw of its own"
+    else:
+        over = f"{counted(tasks, 'task')} with {'its adversary' if tasks == 1 else 'their adversaries'}, {each}"
     if episodes > 1:
-        each += f", {episodes} episodes an evaluation"
-    over = f"{_count(tasks, 'task')} with {'its adversary' if tasks == 1 else 'their adversaries'}, {each}"
+        over += f", {episodes} episodes an evaluation"
     if trainings == 1:
         return f"one training: 95% interval over {over}; it says nothing about other training seeds"
     return f"95% interval over {trainings} training seeds, {over}"
 
 
-def _count(number: int, what: str) -> str:
+def counted(number: int, what: str) -> str:
+    """A number and its noun, such as ``2 tasks``."""
     return f"{number} {what}{'' if number == 1 else 's'}"

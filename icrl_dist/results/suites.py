@@ -14,11 +14,12 @@ from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.compiled import Unusable, library
 from icrl_dist.results import heldout, reports
+from icrl_dist.results.attack import DRAWS
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
 from icrl_dist.storage.files import StoreError
 
-Suite = Literal["online", "offline", "posterior"]
+Suite = Literal["online", "offline", "posterior", "attack"]
 Prior = Literal["uniform", "unseen"]
 
 
@@ -31,6 +32,8 @@ def evaluate(
     seeds: int | None = None,
     p: Sequence[float] | float | None = None,
     prior: Prior | None = None,
+    draws: int = DRAWS,
+    references: bool = True,
     progress: Show = False,
 ) -> Evaluation:
     """Evaluate a trained agent on tasks that it did not train on, beside T^0, exact agents and the oracle.
@@ -41,12 +44,15 @@ def evaluate(
     folder that can only be read, the result is returned all the same, and one of its ``notes`` says so.
 
     ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
-    of a random or an expert episode; ``posterior`` for the distance to the exact posterior.
+    of a random or an expert episode; ``posterior`` for the distance to the exact posterior; ``attack`` for one episode,
+    given its context, without adversary, under sampled ones and under the worst one (Dark Room).
     ``deploy``: the deployment rule, ``paper`` or ``committed``; None for the rule that the model was trained for.
     Suite ``posterior`` always uses ``paper``.
     ``episodes``: online episodes; ``seeds``: evaluations per task; ``p``: override probabilities of the test adversary,
-    0 to 1; ``prior``: distribution of the test adversaries.  None: the run's (suite ``posterior``: 40 episodes, 2
-    seeds, p 0, 0.2, 0.4 and 0.6, uniform).
+    0 to 1; ``prior``: distribution of the test adversaries; evaluation e of a task is under adversary draw e.  None: the
+    run's (suite ``posterior``: 40 episodes, 4 seeds, p 0, 0.2, 0.4 and 0.6, uniform; ``attack``: the run's p above 0).
+    ``draws``: sampled adversaries of suite ``attack``.  ``references``: False leaves random policy, exact agents and
+    oracle out.
     ``progress``: True shows it on standard output; a function receives each event, a dictionary.
 
     Raises ConfigError if there is no such agent or a setting is impossible, StoreError for a file that was not written
@@ -65,12 +71,22 @@ def evaluate(
     }
     given = {name: value for name, value in chosen.items() if value is not None}
     if suite == "posterior":
-        given = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 2} | given
+        given = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 4} | given
+        if not references:
+            raise ConfigError("--suite posterior: it compares with the exact agent, a reference; leave --no-references out")
+    elif suite == "attack":
+        if draws < 1:
+            raise ConfigError(f"--draws {draws}: at least 1 sampled adversary is needed")
+        given.setdefault("p", tuple(one for one in run.evaluate.p if one > 0) or run.evaluate.p)
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **given))
     validate(run, "evaluate")
     heldout.check_suite(run, suite)
     rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)
     report = folder / "report" / heldout.report_name(run, source, suite, rule)
+    if suite == "attack":
+        report = report.with_name(f"{report.name}-{draws}draws")
+    if not references:
+        report = report.with_name(f"{report.name}-no-references")
     results = (heldout.run_folder(source) or folder) / "results"  # rows of a checkpoint in a run folder belong to that run
     unstored: list[StoreError] = []
     with reporting(progress) as show:
@@ -80,10 +96,13 @@ def evaluate(
         if run.context.decoder == "kernel" and isinstance(why := library("decoder"), Unusable):
             show({"event": "note", "text": f"torch computes the decisions, not the compiled decoder as in the run: {why}"})
         if suite == "online":
-            rows = heldout.online(run, source, results, show, deploy, unstored)
+            rows = heldout.online(run, source, results, show, deploy, unstored, references)
             found = reports.online(run, report, rows, unstored)
         elif suite == "offline":
-            found = reports.offline(run, heldout.offline(run, source, results, deploy, unstored), unstored)
+            found = reports.offline(run, heldout.offline(run, source, results, deploy, unstored, references), unstored)
+        elif suite == "attack":
+            rows = heldout.attack(run, source, results, show, draws, deploy, unstored, references)
+            found = reports.attacked(run, report, rows, draws, unstored)
         else:
             found = reports.posterior(run, report, *heldout.posterior(run, source, results, show, unstored), unstored)
     answer = {"suite": suite, "deploy": rule, "what": str(source)}

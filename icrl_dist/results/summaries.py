@@ -35,11 +35,7 @@ def ceilings(found: list[Returns], last: int = LAST) -> dict[tuple[float, AgentK
     if agents:
         best = {one.p: Ceiling(one.name, one.scores(last)) for one in agents if one.agent == agents[0].agent}
         return {(one.p, one.agent): best[one.p] for one in found if one.p in best}
-    return {
-        (one.p, one.agent): Ceiling("oracle", np.broadcast_to(one.optimum[..., None], one.returns.shape[:3]))
-        for one in found
-        if one.optimum is not None
-    }
+    return {(one.p, one.agent): Ceiling("oracle", one.optimum) for one in found if one.optimum is not None}
 
 
 def intervals(found: list[Returns], last: int = LAST) -> dict[tuple[float, AgentKey], tuple[Interval, Interval | None]]:
@@ -89,6 +85,7 @@ def _result_row(one: Returns, last: Interval) -> dict[str, Any]:
         "last5": round(last.value, 3),
         "last5_interval": [_rounded(last.low, 3), _rounded(last.high, 3)],
         "last5_over_optimum": None if best is None else _share(last.value, best),
+        **({} if (worst := one.certificate()) is None else {"certified": round(worst, 3)}),
         **({"broken": one.diverged} if one.diverged else {}),
     }
 

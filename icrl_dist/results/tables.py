@@ -47,8 +47,10 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
     found = returns(frame)
     trainings, tasks, evaluations, episodes = _shape(found)
     shown, last = [e for e in (1, 2, 3, 5, 10, 20, 30, 40) if e <= episodes], min(LAST, episodes)
-    over = statistics.resampled(trainings, tasks, evaluations, last)
+    over = statistics.resampled(trainings, tasks, evaluations, last, max(one.draws for one in found))
     caption = f"[...]: {over}" if statistics.units((trainings, tasks, evaluations)) > 1 else over
+    worst = {(one.p, one.agent): worst_case(one, last) for one in found} if any_certified(found, last) else {}
+    caption += f".  {CERTIFIED}" if worst else ""
     table = NarrowTable(title=title, title_justify="left", caption=caption, caption_justify="left")
     table.spare = tuple(f"ep {e}" for e in (30, 3, 20, 5, 2, 10, 40))
     for name in ("p", "agent", *(f"ep {e}" for e in shown), f"last {last}"):
@@ -56,6 +58,8 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
     best, estimates = summaries.ceilings(found, last), summaries.intervals(found, last)
     if best:
         table.add_column(f"of {next(iter(best.values())).name}", justify="right")
+    if worst:
+        table.add_column("certified", justify="right")
     for before, one in zip([None, *found], found, strict=False):
         value, share = estimates[one.p, one.agent]
         mean, _ = one.by_episode()
@@ -65,8 +69,28 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
             *(f"{mean[e - 1]:.1f}" for e in shown),
             _with_interval(value, "{:.1f}") if share is None else f"{value.value:.1f}",
             *([] if share is None else [_with_interval(share, "{:.0%}")]),
+            *([worst[one.p, one.agent]] if worst else []),
         )
     return table
+
+
+CERTIFIED = (
+    "certified: mean expected return of these episodes, each given its context, against the worst adversary of strength p "
+    "(exact; it does not cover an adversary that also acted while the context was collected); estimated: no such value, the "
+    "worst of the sampled adversaries of each task instead"
+)
+"""Caption of the column ``certified``."""
+
+
+def any_certified(found: Sequence[Returns], last: int) -> bool:
+    """Whether the column ``certified`` is shown: whether any agent has such a value."""
+    return any(one.certificate(last) is not None for one in found)
+
+
+def worst_case(one: Returns, last: int) -> str:
+    """The certified return of an agent, or the worst of the sampled adversaries, labelled ``estimated``."""
+    certified = one.certificate(last)
+    return f"{one.worst_sampled(last):.1f} estimated" if certified is None else f"{certified:.1f}"
 
 
 def _shape(found: Sequence[Returns]) -> tuple[int, ...]:
@@ -109,7 +133,8 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
     called = list(names) or [arm[0].name for arm in arms]
     base = arms[0]
     trainings, tasks, evaluations, episodes = _shape(base)
-    over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes))
+    draws = max(one.draws for arm in arms for one in arm)
+    over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes), draws)
     table = NarrowTable(
         title=f"Return of the last {min(last, episodes)} episodes, compared with {called[0]}",
         title_justify="left",
@@ -179,7 +204,10 @@ def gap_table(report: Mapping[str, Any], title: str) -> Table:
     ``report``: holds a table of ``posterior.gap`` by p for each set of goals.
     """
     first = next(iter(report["paper_gap"].values()))
-    caption = f"{statistics.resampled(1, first['tasks'], first['seeds'], first['episodes'])}; the same resamples for both"
+    draws = max(row["draws"] for row in report["paper_gap"].values())
+    caption = (
+        f"{statistics.resampled(1, first['tasks'], first['seeds'], first['episodes'], draws)}; the same resamples for both"
+    )
     table = NarrowTable(title=title, title_justify="left", caption=caption, caption_justify="left")
     for name in ("goals", "p", "model", "exact", "gap", "95%", "difference"):
         table.add_column(name, justify="left" if name in ("goals", "difference") else "right")

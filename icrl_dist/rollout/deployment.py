@@ -67,6 +67,12 @@ class InContextPolicy(CopiedWhole):
         new = Columns(*(column[None] for column in self._stacked(self._not_encoded(), row)))
         return self._deployed.probabilities(self._deployed.decide_row(row, states, new))
 
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> Float[np.ndarray, "B Q A"] | None:
+        """T_theta(. | s, D) at any states s for the whole next episode, whose context D is fixed; None for vector actions."""
+        if not self.model.spec.discrete:
+            return None
+        return np.stack([self.distribution(states, row) for row in range(self.batch)])
+
     def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
         """D of ``distribution``: observations (T, S), actions (T), next observations (T, S) and rewards (T)."""
         ended = zip(*([c[row] for c in episode] for episode in self._episodes), strict=True)
@@ -153,6 +159,9 @@ class CommittedPolicy(InContextPolicy):
 
     _encoded = 0
     """Number of the transitions in ``_pending`` that the decoder has encoded."""
+
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> None:
+        """None: the context grows within an episode."""
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
         for step in self._pending[self._encoded : -1]:  # observed since the last decision; the newest follows below

@@ -73,11 +73,27 @@ class OfflinePolicy(Policy, Protocol):
         ...
 
 
+class FrozenPolicy(Protocol):
+    """A policy that can be fixed within an episode, so that it is a Markov policy there."""
+
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> Float[np.ndarray, "P Q A"] | None:
+        """Its distributions over discrete actions at any states in the next episode: P = B, by row, or P = 1, one for all rows.
+
+        None if they change within an episode.  It is called between episodes, and the policy does not change.
+        """
+        ...
+
+
 def deploy_offline(
     env: Batch, policy: OfflinePolicy, dataset: Sequence[Episodes], rngs: Sequence[np.random.Generator]
 ) -> Episodes:
     """Lines 3 to 7: one episode given D_off, which other policies collected."""
+    append(env, policy, dataset)
+    return episode(env, policy, rngs)
+
+
+def append(env: Batch, policy: OfflinePolicy, dataset: Sequence[Episodes]) -> None:
+    """Add D_off, which other policies collected, to the context."""
     for data in dataset:
         actions = data.actions.astype(np.int64) if env.spec.discrete else data.actions
         policy.append(data.observations[:, :-1], actions, data.observations[:, 1:], data.rewards)
-    return episode(env, policy, rngs)

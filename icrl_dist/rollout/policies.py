@@ -32,6 +32,10 @@ class RandomPolicy(DiscretePolicy):
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float[np.ndarray, "B A"]:
         return np.broadcast_to(self._uniform, (len(observation), len(self._uniform)))
 
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> Float[np.ndarray, "1 Q A"]:
+        """The distributions at any states, which never change."""
+        return self.probabilities(states)[None]
+
     def observe(self, *transition: object) -> None:
         """Does nothing: the policy does not learn."""
 

@@ -172,7 +172,7 @@ def test_a_ratio_below_the_bound_on_a_gpu_fails(monkeypatch):
 def test_the_expert_set_is_that_of_the_paper():
     assert experts_gpu.SIZES.experts == 160 and experts_gpu.SIZES.config.hidden == (256, 256, 256)
     paper = run.load(experts_gpu.PAPER)
-    assert len(registry.of(paper).split.train) * paper.adversary.count == 160
+    assert len(registry.of(paper).split.train) * paper.adversary.variations == 160
     assert (paper.sac.steps, paper.sac.update_every, paper.sac.warmup, paper.sac.hidden) == (200_000, 3, 5_000, (256,) * 3)
 
 

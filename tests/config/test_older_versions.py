@@ -13,11 +13,15 @@ from pathlib import Path
 
 import pytest
 
+from icrl_dist.agent import shipped as agent_files
 from icrl_dist.config import former_names
 from icrl_dist.config.run import ConfigError, Run, dumps, load, load_folder, parse, parse_written
+from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous import calibrated_strength
+from icrl_dist.storage.checkpoint import load_checkpoint
 from icrl_dist.storage.fork import Lineage
+from icrl_dist.types import NULL
 
 OLD = Path(__file__).parent / "written_by_0_1_0"
 ICAG, CARTPOLE = ((OLD / f"{name}.toml").read_text() for name in ("icag", "cartpole"))
@@ -102,3 +106,26 @@ def test_the_ancestors_of_an_old_fork_are_read(tmp_path: Path) -> None:
 
 def test_the_settings_in_an_old_manifest_are_read() -> None:
     check_icag(parse_written(json.loads((OLD / "manifest.json").read_text())["run"], "x"))
+
+
+def test_phi_0_was_one_of_the_counted_adversaries() -> None:
+    """A file without ``adversary.null`` means one disturbance less; one with it, and a user's, means what it says."""
+    for text, count, null in (
+        ("count = 2\np_max = 0.2", 1, True),
+        ("count = 1", 0, True),
+        ("count = 2\nnull = true", 2, True),
+        ("count = 2\nnull = false", 2, False),
+    ):
+        adversary = parse_written(f"[adversary]\n{text}", "x").adversary
+        assert (adversary.count, adversary.null) == (count, null)
+    assert parse_written(ICAG, "x").adversary == AdversaryConfig(count=1, p_max=0.2)
+    assert parse("[adversary]\ncount = 2", "x").adversary.count == 2
+    run = parse_written(ICAG, "x")
+    variations = registry.training_variations(run, 0, registry.of(run).split.train[0])
+    assert len(variations) == tomllib.loads(ICAG)["adversary"]["count"] and variations[0].adversary == NULL
+    shipped = load_checkpoint(Path(agent_files.__path__[0]) / "darkroom.npz").manifest["run"]
+    former = tomllib.loads(shipped)["adversary"]["count"]
+    assert parse_written(shipped, "x").adversary == AdversaryConfig(count=former - 1, null=True)
+    for wrong in ('count = "two"', "count = 0", "count = true"):
+        with pytest.raises(ConfigError, match=r"adversary\.count"):
+            parse_written(f"[adversary]\n{wrong}", "x")

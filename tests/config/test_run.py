@@ -83,7 +83,7 @@ def test_values_are_read_into_their_fields() -> None:
         ("[evaluate]\np = 0.2", ["evaluate.p = 0.2", "expected a list"]),
         ('[evaluate]\np = [0.2, "x"]', ["evaluate.p = 'x'", "expected float, got str"]),
         # Bad choices.
-        ('method = "ppo"', ["method = 'ppo'", "choose one of dpt, experts, icaa, icag"]),
+        ('method = "ppo"', ["method = 'ppo'", "choose one of dpt, dr, experts, icaa, icag, mix_dpt"]),
         ("method = 3", ["method = 3", "expected str, got int"]),
         ('[darkroom]\nlabels = "hard"', ["darkroom.labels = 'hard'", "'soft', 'sampled', 'heuristic'"]),
         ('[learner]\ndevice = "tpu"', ["learner.device = 'tpu'", "choose one of 'auto', 'cpu', 'cuda'"]),
@@ -97,7 +97,8 @@ def test_values_are_read_into_their_fields() -> None:
         ("[darkroom]\nlabel_slack = -0.1", ["darkroom.label_slack = -0.1"]),
         ("[darkroom]\nsplit_seed = -1", ["darkroom.split_seed = -1"]),
         ("[adversary]\np_max = 1.5", ["adversary.p_max = 1.5", "[0, 1]"]),
-        ("[adversary]\ncount = 0", ["adversary.count = 0", "null adversary"]),
+        ("[adversary]\ncount = 0\nnull = false", ["adversary.count = 0", "at least 1, or adversary.null = true"]),
+        ("[adversary]\ncount = -1", ["adversary.count = -1", "0 or more disturbances"]),
         ("seed = -1", ["seed = -1", "a seed is a whole number from 0"]),
         ("[evaluate]\np = [0.1, 2.0]", ["evaluate.p = 2.0", "[0, 1]"]),
         ("[evaluate]\np = []", ["evaluate.p = ()", "at least one"]),
@@ -164,7 +165,7 @@ def test_what_must_be_positive(section: str) -> None:
 
 def test_edges_are_allowed() -> None:
     config.parse("[model]\nwidth = 9\nheads = 3", "mine")
-    config.parse("[darkroom]\ngamma = 1.0\nlabel_slack = 0\n[adversary]\np_max = 1.0\ncount = 1", "mine")
+    config.parse("[darkroom]\ngamma = 1.0\nlabel_slack = 0\n[adversary]\np_max = 1.0\ncount = 0", "mine")
     config.parse("[icaa]\nrounds = 0\ntrials = 1\ncontext_trials = 0\nnew_fraction = 1\n[context]\nmax = 100", "mine")
     config.parse("[optim]\nwarmup = 0\nweight_decay = 0\n[learner]\nrestarts = 0", "mine")
 

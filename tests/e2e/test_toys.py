@@ -33,7 +33,7 @@ cells = 5
 [return_to_go]
 target = 4.0
 [adversary]
-count = 2
+count = 1
 [pretrain]
 contexts = 32
 steps = 20

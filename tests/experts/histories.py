@@ -25,7 +25,7 @@ def run(small_run, tmp_path):
         "dmc-reacher-easy",
         method="icag",
         control=ControlConfig(train_tasks=4, test_tasks=2, horizon=HORIZON),
-        adversary=AdversaryConfig(count=2),
+        adversary=AdversaryConfig(count=1),
         sac=dataclasses.replace(sac, cache=str(tmp_path / "experts")),
         pretrain=dataclasses.replace(small_run.pretrain, contexts=8 * 3, queries=6),
     )

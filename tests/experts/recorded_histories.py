@@ -54,7 +54,7 @@ def histories(case: str) -> list[cache.History]:
             problem,
             method="icag",
             control=ControlConfig(train_tasks=4, test_tasks=2, horizon=_HORIZON, **settings),
-            adversary=AdversaryConfig(count=experts),
+            adversary=AdversaryConfig(count=experts - 1),
             sac=SACConfig(**{**vars(sac), "cache": folder}),
             pretrain=PretrainConfig(contexts=4 * experts, queries=2),
             stream=StreamConfig(job_tasks=1),

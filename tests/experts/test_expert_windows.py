@@ -10,7 +10,8 @@ from icrl_dist.config.run import ConfigError, validate
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import cache
-from icrl_dist.experts.cache import WINDOW_EPISODES, History
+from icrl_dist.experts.cache import History
+from icrl_dist.experts.payloads import WINDOW_EPISODES
 from icrl_dist.experts.sac import batched
 from icrl_dist.experts.train import ExpertPolicy, ScriptedPolicy
 from icrl_dist.methods import registry as methods
@@ -39,7 +40,7 @@ def test_in_meta_world_labels_come_from_the_scripted_policy_at_the_true_states(s
         "metaworld-pick-place",
         method="icag",
         control=ControlConfig(train_tasks=2, test_tasks=1, horizon=30),
-        adversary=AdversaryConfig(count=2),
+        adversary=AdversaryConfig(count=1),
         sac=sac,
         pretrain=dataclasses.replace(small_run.pretrain, contexts=8, queries=5),
     )

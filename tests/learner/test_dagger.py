@@ -32,7 +32,7 @@ def run(small_run):
 def test_an_interrupted_dagger_round_continues_to_the_same_bytes(run, tmp_path, monkeypatch):
     whole = run_inline(run, tmp_path / "whole")
     assert whole["version"] == 2
-    assert whole["trajectories"] == 42 + 2 * 7 * run.adversary.count * 3
+    assert whole["trajectories"] == 42 + 2 * 7 * run.adversary.variations * 3
 
     def stop(event):
         if event["event"] == "progress" and (event["stage"], event["version"]) == ("fit", 1) and event["step"] >= 3:

@@ -145,7 +145,7 @@ def test_a_fork_with_the_same_settings_ends_with_the_bytes_of_its_parent(parent,
 
 def test_a_fork_with_other_settings_keeps_the_data_of_its_parent(parent, tmp_path):
     folder, before = tmp_path / "fork", parent[1]["dataset_digest"]
-    run = override(parent[2], ["adversary.count=2"], "--set")
+    run = override(parent[2], ["adversary.count=1"], "--set")
     result = run_inline(run, folder, source=(parent[0], 1))
     counts = [7 * 3 * (run.icaa.trials + 1), 7 * 2 * (run.icaa.trials + 1)]
     assert result["trajectories"] == 42 + sum(counts) and result["weights_digest"] != parent[1]["weights_digest"]

@@ -116,7 +116,7 @@ def test_each_round_learns_from_d0_and_all_rounds_so_far(small_run: Run, collect
     method, data = methods.of(small_run), InMemoryDataset(collected.trajectories)
     first, second, third = (pools_of(method, small_run, phase, data) for phase in method.phases(small_run))
     tasks = len(problems.of(small_run).split.train)
-    variations = tasks * small_run.adversary.count
+    variations = tasks * small_run.adversary.variations
     assert [len(pool.examples) for pool in first] == [tasks]
     assert [len(pool.examples) for pool in second] == [len(first[0].examples), variations]
     assert [len(pool.examples) for pool in third] == [len(first[0].examples), 2 * variations]

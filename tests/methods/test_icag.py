@@ -31,7 +31,7 @@ def test_dpt_and_d0_of_icaa_have_no_disturbance_and_icag_has_k_adversaries(small
     assert len(adversaries["icag"]) == len(adversaries["dpt"]) == len(problems.of(small_run).split.train)
     for chosen in adversaries["icag"]:
         assert chosen[0] == NULL
-        assert len(set(chosen)) == small_run.adversary.count
+        assert len(set(chosen)) == small_run.adversary.variations
 
 
 def test_dagger_adds_own_histories_from_the_origin_with_optimal_labels(icag_run: Run, pools_of: PoolsOf) -> None:

@@ -6,7 +6,9 @@ import dataclasses
 
 import pytest
 
+from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run, make_run
+from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.continuous.problem import ContinuousProblem
@@ -62,13 +64,26 @@ def test_variations_are_the_tasks_own_and_repeat(small_run: Run) -> None:
     train = split(small_run).train
     every = [registry.training_variations(small_run, i, t) for i, t in enumerate(train)]
     assert every == [registry.training_variations(small_run, i, t) for i, t in enumerate(train)]
-    assert all([v.task for v in vs] == [t] * small_run.adversary.count for vs, t in zip(every, train, strict=True))
+    assert all([v.task for v in vs] == [t] * small_run.adversary.variations for vs, t in zip(every, train, strict=True))
     assert all(vs[0].adversary == NULL for vs in every)
     drawn = [v.adversary for vs in every for v in vs[1:]]
     assert len(set(drawn)) == len(drawn), "two tasks share an adversary"
     other = registry.training_variations(dataclasses.replace(small_run, seed=1), 0, train[0])
     assert not {v.adversary for v in other[1:]} & set(drawn)
     assert max(a.number("p") for a in drawn) <= small_run.adversary.p_max
+
+
+@pytest.mark.parametrize("null", [True, False])
+def test_k_counts_disturbances_and_a_switch_adds_the_null_adversary(small_run: Run, null: bool) -> None:
+    task = split(small_run).train[0]
+    for count in (1, 2, 8):
+        run = dataclasses.replace(small_run, adversary=AdversaryConfig(count=count, null=null))
+        found = [v.adversary for v in registry.training_variations(run, 0, task)]
+        assert len(set(found)) == len(found) == run.adversary.variations == count + null
+        assert [one == NULL for one in found] == [True] * null + [False] * count
+        assert tuple(found[null:]) == registry.of(run).training_adversaries(
+            generator(run.seed, RandomKey.TRAINING_ADVERSARIES, 0, 0), run.adversary
+        )
 
 
 @pytest.mark.parametrize("prior", ["unseen", "uniform"])
@@ -93,6 +108,16 @@ def test_test_adversaries_repeat_and_keep_their_distribution_as_p_grows(small_ru
     assert registry.test_adversary(small_run, 3, 0.0, "unseen") == NULL
 
 
+def test_each_draw_of_a_task_is_another_adversary_and_draw_0_is_that_of_older_versions(small_run: Run) -> None:
+    drawn = [registry.test_adversary(small_run, i, 0.2, "unseen", draw) for i in range(5) for draw in range(8)]
+    assert len(set(drawn)) == 40 and {a.number("p") for a in drawn} == {0.2}
+    before = registry.of(small_run).test_adversary(
+        np.random.default_rng(np.random.SeedSequence(0, spawn_key=(103, 3))), 0.2, "unseen"
+    )
+    assert registry.test_adversary(small_run, 3, 0.2, "unseen") == before == drawn[24]
+    assert len({registry.test_adversary(small_run, 3, 0.2, "uniform", draw) for draw in range(8)}) == 1
+
+
 def continuous(run: Run, problem: str, control: ControlConfig) -> tuple[Run, ContinuousProblem]:
     made = make_run(problem, control=control, adversary=run.adversary)
     owner = registry.of(made)
@@ -113,7 +138,7 @@ def test_a_continuous_run_trains_on_the_center_and_tests_elsewhere(small_run: Ru
     assert other.train == parts.train and set(other.test) != set(parts.test)
     assert problem.spec == registry.spec(parts.test[0]) and problem.disturbances == 2
     variations = registry.training_variations(run, 1, parts.train[1])
-    assert variations[0].adversary == NULL and len({v.adversary for v in variations}) == run.adversary.count
+    assert variations[0].adversary == NULL and len({v.adversary for v in variations}) == run.adversary.variations
     assert {v.adversary["strength"] for v in variations[1:]} == {2.0}
     assert variations != registry.training_variations(run, 1, parts.train[1], 1)
     assert variations == registry.training_variations(run, 1, parts.train[1])

@@ -44,6 +44,36 @@ def test_one_evaluation_is_no_evidence():
 TWO = [[[1.0, 2.0]], [[3.0, 4.0]]]
 
 
+DRAWS = np.tile(np.repeat(['{"draw": 0}', '{"draw": 1}'], 2), 2).astype(object)
+
+
+def test_pairs_with_another_adversary_in_one_evaluation_are_refused():
+    grid = [[[1.0, 2.0]] * 2] * 2
+    other = DRAWS.copy()
+    other[6:] = '{"draw": 7}'  # the second evaluation of the second task
+    with pytest.raises(ConfigError, match=r'task 1: .* in evaluation 1 adversary null \{"draw": 1\} and .*"draw": 7\}: pairs'):
+        tables.compare(frame(block(grid, adversary=DRAWS)), frame(block(grid, adversary=other)))
+    assert "not shown" in rendered(tables.compare(frame(block(grid, adversary=DRAWS)), frame(block(grid, adversary=DRAWS))))
+
+
+def test_a_table_says_whether_evaluations_have_adversary_draws_of_their_own():
+    grid = [[[1.0, 2.0]] * 2] * 2
+    drawn, alike = (
+        unwrapped(rendered(tables.returns_table(frame(of), ""))) for of in (block(grid, adversary=DRAWS), block(grid))
+    )
+    assert "2 tasks, 2 evaluations of each with an adversary draw of its own" in drawn
+    assert "2 tasks with their adversaries, 2 evaluations of each" in alike
+
+
+def test_the_worst_sampled_adversary_is_the_lowest_of_each_task():
+    grid = [[[4.0], [2.0], [9.0]], [[5.0], [6.0], [1.0]]]
+    draws = np.array(['{"q": 0}', '{"q": 1}', '{"q": 1}'] * 2, object)
+    (found,) = returns(frame(block(grid, adversary=draws)))
+    assert found.draws == 2 and found.worst_sampled() == (4.0 + 3.5) / 2
+    (alike,) = returns(frame(block(grid)))
+    assert alike.draws == 1 and alike.worst_sampled() == (5.0 + 4.0) / 2, "one adversary: its mean, not the lowest episode"
+
+
 @pytest.mark.parametrize(
     ("other", "expected"),
     [

@@ -95,6 +95,22 @@ def test_held_out_variations_start_in_the_origin(small_run):
     assert all(v.task.vector("start") == (0, 0) and v.adversary.number("p") == 0.2 for v in chosen)
 
 
+def test_each_evaluation_of_a_task_is_under_its_own_adversary_and_the_first_repeats_old_numbers(small_run):
+    def of(seeds):
+        run = dataclasses.replace(small_run, evaluate=dataclasses.replace(small_run.evaluate, seeds=seeds, p=(0.4,)))
+        agents = {Agent("random"): references(run)["random"], Agent(ORACLE): references(run)[ORACLE]}
+        return evaluate.online(run, agents)
+
+    alone, several = of(1), of(3)
+    for one, many in zip(alone, several, strict=True):
+        np.testing.assert_array_equal(one.returns[:, 0], many.returns[:, 0])
+        assert [of_task[0] for of_task in many.variations] == list(evaluate.variations(small_run, 0.4))
+        assert all(
+            len({v.adversary for v in of_task}) == 3 and len({v.task for v in of_task}) == 1 for of_task in many.variations
+        )
+        assert known(many.optimum).shape == (2, 3) and len(np.unique(known(many.optimum)[0])) == 3
+
+
 def test_numbers_of_result_json_are_means_over_tasks_and_seeds():
     returns = np.arange(12.0).reshape(2, 2, 3)
     (row,) = summaries.result_rows(frame(block(returns, p=0.2, optimum=[10.0, 12.0])))
@@ -132,7 +148,7 @@ def test_offline_rows_have_random_and_expert_data(small_run, untrained):
     for names, source in ((named[:count], "random data"), (named[count : 2 * count], "expert data")):
         assert names == [source, *(f"{agent}, {source}" for agent in agents)]
     expert = next(r for r in rows if r.agent.key == ORACLE and r.p == 0)
-    np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), known(expert.optimum))
+    np.testing.assert_allclose(expert.returns.mean(axis=(1, 2)), known(expert.optimum).mean(axis=1))
     informed = next(r for r in rows if (r.agent.key, r.data, r.p) == (KEYS["paper"], "expert", 0))
     np.testing.assert_array_equal(informed.returns, expert.returns)
 
@@ -213,7 +229,8 @@ def test_a_missing_or_damaged_checkpoint_is_refused_in_one_line(tmp_path):
 
 def test_a_result_has_the_exact_optimum_of_its_variations(small_run):
     (result, *_) = evaluate.online(small_run, {Agent("random"): references(small_run)["random"]})
-    np.testing.assert_allclose(known(result.optimum), optimal_returns(Hypotheses.of(evaluate.variations(small_run, 0.0))))
+    for of_task, optimum in zip(result.variations, known(result.optimum), strict=True):
+        np.testing.assert_allclose(optimum, optimal_returns(Hypotheses.of(of_task)))
 
 
 @pytest.fixture

@@ -94,8 +94,13 @@ def test_the_numbers_of_the_figures_are_those_of_slow_loops(sweep, frame, monkey
 
 def test_captions_say_what_was_resampled(sweep):
     (panel,) = catalog.numbers("3d", Rows([sweep]), "room", Rules())
-    assert "95% interval over 6 training seeds, 4 tasks with their adversaries, 2 evaluations of each" in panel.caption
-    assert "training seeds 0 to 5, 6 splits of the tasks, 2 adversary draws a task" in panel.caption
+    assert (
+        "95% interval over 6 training seeds, 4 tasks, 2 evaluations of each with an adversary draw of its own" in panel.caption
+    )
+    assert (
+        "training seeds 0 to 5, 6 splits of the tasks, 2 adversary draws a task; each training is drawn with all its tasks, which are its own"
+        in panel.caption
+    )
 
 
 def test_an_interval_over_seeds_covers_the_true_effect_and_is_paired(sweep):
@@ -166,15 +171,21 @@ def test_costs_are_paired_from_the_rows_and_from_runs_json(tmp_path):
     columns = {"icag": {"environment_steps": 9000}, "icaa": {"environment_steps": 1000}}
     path = write(tmp_path, small(tmp_path, columns=columns), offline=False)
     runs = [
-        {"setting": "room", "variant": v, "seed": s, "cpu_seconds": cpu + s % 2, "label_bytes": 5}
+        {
+            "setting": "room",
+            "variant": v,
+            "seed": s,
+            "cpu_seconds": {"fit": cpu, "collect": s % 2, "evaluate": 99},
+            "label_bytes": 5,
+        }
         for v, cpu in (("icag", 10.0), ("icaa", 20.0))
         for s in range(6)
     ]
-    (tmp_path / "runs.json").write_text(json.dumps({"runs": runs}))
+    (tmp_path / "runs.json").write_text(json.dumps(runs))
     found = list(costs.findings(study(Rows([path]), None, Rules()), costs.ledger([path])))
     assert [one.effect.value for one in found] == [8000, -10, 0]
     assert [one.verdict for one in found] == ["held", "not held", "not shown"]
-    assert [one.verdict for one in costs.findings(study(Rows([path]), None, Rules()), {})][1:] == ["not decidable"] * 2
+    assert [one.verdict for one in costs.findings(study(Rows([path]), None, Rules()), {})][1:] == ["not decidable"]
     (tmp_path / "runs.json").write_text("[1]")
     with pytest.raises(StoreError, match=r"runs.json: no list of a sweep's runs"):
         costs.ledger([path])
@@ -192,8 +203,8 @@ def test_costs_are_paired_from_the_rows_and_from_runs_json(tmp_path):
         ),
         ("strength", {}, r"rows are missing; these runs make them: wind/dpt; wind/icag"),
         ("deployment", {}, r"room/icag, seeds 0 to 5, evaluated with --deploy committed"),
-        ("2", {"icaa": {"optimizer_steps": 301}}, r"figure 2: optimizer_steps is 300 of room/dpt .* and 301 of room/icaa"),
-        ("2", {"dpt": {"labelled_episodes": 9}}, r"labelled_episodes is 9 of room/dpt .* 100 of room/.*--unequal-budgets"),
+        ("2", {"icaa": {"optimizer_steps": 400}}, r"figure 2: optimizer_steps is 300 of room/dpt .* and 400 of room/icaa"),
+        ("2", {"dpt": {"labelled_episodes": 9}}, r"labelled_episodes is 9 of room/dpt .* and 100 of room/.*--unequal-budgets"),
         ("2", {"icag": {"split_seed": 3}}, r"figure 2: split seeds are .* of room/dpt .* \(3, 3, 3, 3, 3, 3\) of room/icag"),
         ("2", {"icag": {"adversary": "{}"}}, r"test adversaries differ between room/dpt .* and room/icag"),
         ("2", {"icag": {"task": "{}"}}, r"held-out tasks differ between room/dpt .* and room/icag"),
@@ -222,21 +233,23 @@ def test_unequal_budgets_and_missing_methods_are_shown_only_on_demand(tmp_path):
     path = write(tmp_path, small(tmp_path, agents=agents, columns={"icag": {"optimizer_steps": 9}}), offline=False)
     with pytest.raises(ConfigError, match="these runs make them: room/prompt_dt, seeds 0 to 5; room/mix_dpt"):
         report(path, figure="2", out=tmp_path)
-    with pytest.raises(ConfigError, match="optimizer_steps is 300 of room/dpt"):
+    with pytest.raises(ConfigError, match="optimizer_steps is 9 of room/icag .* and 300 of room/dpt"):
         report(path, figure="2", out=tmp_path, partial=True)
     text = str(report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=True))
-    assert "No rows of prompt-DT, mix-DPT, ICAA" in text and "Budgets may differ" in text
+    assert (
+        "No rows of prompt-DT, mix-DPT, ICAA" in text and "Budgets differ: optimizer_steps is 9 of icag and 300 of dpt" in text
+    )
     table = str(report(path, figure="budgets", out=tmp_path))
     assert (
-        "Budgets differ: optimizer_steps (dpt, icag)" in table
+        "Budgets differ: optimizer_steps (icag, dpt)" in table
         and "| dpt | dpt | 8 | 0 to 5 | 100 | 2,000 | 100 | 300 |" in table
     )
 
 
 def test_rows_of_another_format_of_two_runs_and_of_several_settings_are_refused(tmp_path, sweep):
     table = pq.read_table(sweep)
-    pq.write_table(table.replace_schema_metadata({result_rows._FORMAT_KEY: b"1"}), tmp_path / "old.parquet")
-    with pytest.raises(StoreError, match="result rows of format 1, and this version reads format 2"):
+    pq.write_table(table.replace_schema_metadata({result_rows._FORMAT_KEY: b"9"}), tmp_path / "old.parquet")
+    with pytest.raises(StoreError, match="result rows of format 9, and this version reads formats 1 and 2"):
         report(tmp_path / "old.parquet", claims=True)
     twice = [write(tmp_path / str(i), small(tmp_path, agents={"dpt": ("t0",)}), offline=False) for i in range(2)]
     frame = pq.read_table(twice[1])

@@ -20,8 +20,8 @@ import icrl_dist
 from icrl_dist import read_results, version
 from icrl_dist.config.run import ConfigError
 from icrl_dist.problems import registry
-from icrl_dist.results import evaluate, rows
-from icrl_dist.results.evaluate import Agent
+from icrl_dist.results import columns, evaluate, rows
+from icrl_dist.results.evaluate import Agent, parameters
 from icrl_dist.results.returns import returns
 from icrl_dist.storage import layout
 from icrl_dist.storage.files import StoreError
@@ -39,12 +39,12 @@ def folder(tmp_path: Path) -> Path:
 
 def test_each_episode_is_a_row_with_all_columns(folder):
     frame = read_results(folder)
-    assert tuple(frame.columns) == tuple(rows.COLUMNS) and len(frame) == 24
+    assert tuple(frame.columns) == tuple(columns.COLUMNS) and len(frame) == 24
     for row in frame[frame.agent == "random"].to_dict("records"):
         assert row["return"] == 100 + RETURNS[row["task_index"], row["evaluation_seed"], row["episode"]]
         assert json.loads(row["task"]) == {"goal": row["task_index"]}
     (file,) = (folder / "results").iterdir()
-    assert set(frame.evaluation) == {file.stem} and set(frame.format) == {rows.FORMAT}
+    assert set(frame.evaluation) == {file.stem} and set(frame.format) == {columns.FORMAT}
     assert set(frame.code_digest) == {version.digest()} and set(frame.package_version) == {icrl_dist.__version__}
     assert frame.optimum.isna().all() and not frame.diverged.any()
 
@@ -60,8 +60,11 @@ def test_the_rows_of_an_evaluation_are_its_returns(small_run, tmp_path):
     for one in found:
         assert one.optimum is not None
         for (task, seed, episode), value in np.ndenumerate(one.returns):
-            row, variation = by_key[one.agent.key, one.p, task, seed, episode], one.variations[task]
-            assert row["return"] == value and row["optimum"] == one.optimum[task]
+            row, variation = by_key[one.agent.key, one.p, task, seed, episode], one.variations[task][seed]
+            assert row["return"] == value and row["optimum"] == one.optimum[task, seed]
+            assert row["adversary_index"] == seed and json.loads(row["adversary"]) == json.loads(
+                parameters(variation.adversary)
+            )
             assert tuple(json.loads(row["task"])["goal"]) == variation.task.vector("goal")
             assert row["adversary_family"] == variation.adversary.kind
             assert json.loads(row["adversary"]).get("p", 0.0) == one.p
@@ -136,7 +139,7 @@ def rewritten(folder: Path, change: Callable[[pa.Table], pa.Table]) -> None:
 
 
 def other_format(table):
-    return table.replace_schema_metadata({b"icrl_dist.results.format": b"2"})
+    return table.replace_schema_metadata({b"icrl_dist.results.format": b"3"})
 
 
 def no_seeds(table):
@@ -161,7 +164,7 @@ def changed(name, value):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (other_format, r"result rows of format 2, and this version reads format 1: .*repeat `icrl-dist evaluate`"),
+        (other_format, r"result rows of format 3, and this version reads formats 1 and 2: .*repeat `icrl-dist evaluate`"),
         (lambda table: table.replace_schema_metadata(None), r"result rows of format none"),
         (lambda table: table.drop_columns(["training_seed"]), r"wrong columns \(training_seed\): move the file away"),
         (lambda table: table.append_column("mine", pa.nulls(24)), r"wrong columns \(mine\)"),
@@ -178,6 +181,49 @@ def test_a_file_of_another_format_or_without_seeds_is_refused_in_one_line(folder
     with pytest.raises(StoreError, match=expected) as refused:
         read_results(folder)
     assert str(folder) in str(refused.value) and "\n" not in str(refused.value)
+
+
+def as_format_1(table):
+    """What version 0.2.0 wrote: without the columns that format 2 added, and ``adversary_index`` is the task."""
+    index = table.schema.get_field_index("adversary_index")
+    table = table.set_column(index, table.schema.field(index), table.column("task_index"))
+    added = ["setting", "variant", "adversaries", "label_source", "training_episodes", "labelled_episodes"]
+    table = table.drop_columns([*added, "environment_steps", "optimizer_steps", "certified"])
+    return table.replace_schema_metadata({b"icrl_dist.results.format": b"1"})
+
+
+def test_rows_of_format_1_are_read_with_the_new_columns(folder):
+    present = read_results(folder)
+    rewritten(folder, as_format_1)
+    former = read_results(folder)
+    assert tuple(former.columns) == tuple(columns.COLUMNS)
+    assert set(former.setting) == {""} and (former.variant == former.method).all()
+    unknown = ["adversaries", "label_source", "training_episodes", "labelled_episodes", "environment_steps"]
+    assert former[[*unknown, "optimizer_steps", "certified"]].isna().all(axis=None)
+    assert (former.adversary_index == 0).all(), "every evaluation of a task had the adversary of draw 0"
+    kept = [name for name in columns.COLUMNS if name not in ("adversary_index", "evaluation")]
+    assert (
+        former[kept]
+        .astype(object)
+        .where(former[kept].notna(), None)
+        .equals(present[kept].astype(object).where(present[kept].notna(), None))
+    )
+    assert len(returns(former)) == 2
+    (file,) = (folder / "results").iterdir()
+    rows.append(folder / "results", "online", {"p": 9}, [block(RETURNS, "t0", p=0.3)])
+    assert len(read_results(folder)) == 24 + 12 and file.exists(), "files of both formats in one folder"
+
+
+def test_training_rows_of_format_1_keep_the_number_of_their_variation(tmp_path):
+    rows.append(tmp_path / "results", "experts", {}, [block(RETURNS, "expert", p=None)])
+    rewritten(tmp_path, as_format_1)
+    assert read_results(tmp_path).adversary_index.tolist() == read_results(tmp_path).task_index.tolist()
+
+
+def test_a_file_of_format_1_with_other_columns_is_refused(folder):
+    rewritten(folder, lambda table: as_format_1(table).append_column("certified", pa.nulls(24, pa.float64())))
+    with pytest.raises(StoreError, match=r"wrong columns \(certified\)"):
+        read_results(folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", None])
@@ -256,7 +302,7 @@ def test_a_folder_without_rows_is_refused(tmp_path):
 
 def test_the_page_has_every_column():
     page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
-    assert rows.document() in page, "put the output of `icrl_dist.results.rows.document()` into docs/data.md"
+    assert columns.document() in page, "put the output of `icrl_dist.results.columns.document()` into docs/data.md"
 
 
 @pytest.mark.integration

@@ -87,6 +87,8 @@ def slow_bootstrap(scores, statistic, rng, count, crossed, fixed=False):
     """The bootstrap, one index at a time."""
     answer = []
     for chosen in statistics.resamples(rng, scores.shape[1:], count, crossed, fixed):
+        rows = len(chosen.trainings), *scores.shape[1:]
+        cells_of, evaluations = np.broadcast_to(chosen.cells, (*rows[:3], 1)), np.broadcast_to(chosen.evaluations, rows)
         for r in range(len(chosen.trainings)):
             agents = []
             for agent in scores:
@@ -95,8 +97,8 @@ def slow_bootstrap(scores, statistic, rng, count, crossed, fixed=False):
                     training = agent[chosen.trainings[r, i, 0, 0]]
                     cells = []
                     for j in range(scores.shape[2]):
-                        cell = training[j if fixed else chosen.cells[r, 0 if crossed else i, j, 0]]
-                        drawn = [cell[chosen.evaluations[r, i, j, k]] for k in range(scores.shape[3])]
+                        cell = training[j if fixed else cells_of[r, i, j, 0]]
+                        drawn = [cell[evaluations[r, i, j, k]] for k in range(scores.shape[3])]
                         cells.append(sum(drawn) / len(drawn))
                     resample.append(cells)
                 agents.append(resample)
@@ -125,7 +127,8 @@ def test_resamples_are_drawn_evenly_and_crossed_ones_share_the_cells_of_all_trai
         shares = np.bincount(indices.ravel(), minlength=count) / indices.size
         np.testing.assert_allclose(shares, 1 / count, atol=0.02)
     (nested,) = statistics.resamples(np.random.default_rng(0), (3, 4, 2), 5000, crossed=False)
-    assert nested.cells.shape == (5000, 3, 4, 1)
+    np.testing.assert_array_equal(nested.trainings, chosen.trainings)
+    assert nested.cells.ravel().tolist() == [0, 1, 2, 3] and nested.evaluations.ravel().tolist() == [0, 1]
 
 
 def test_pairs_share_their_resamples():
@@ -211,6 +214,28 @@ def test_intervals_cover_the_true_mean_about_as_often_as_they_should(monkeypatch
     assert 0.92 < covered / runs <= (0.99 if trainings != 3 else 1)
 
 
+@pytest.mark.parametrize(("trainings", "least", "most"), [(5, 0.9, 0.985), (10, 0.92, 0.985)])
+@pytest.mark.parametrize("own_tasks", [True, False])
+@pytest.mark.parametrize("components", [(1.0, 1.0, 1.0), (0.5, 3.0, 2.0), (2.0, 1.0, 1.0)])
+def test_intervals_over_trainings_tasks_and_adversary_draws_are_right(
+    monkeypatch, trainings, least, most, own_tasks, components
+):
+    """Standard deviations between trainings, tasks and adversary draws, which are nested, or tasks that all trainings share.
+
+    To draw tasks of their own again within each drawn training made intervals 35% too wide where tasks differ most.
+    """
+    monkeypatch.setattr(statistics, "RESAMPLES", 150)
+    rng, covered, runs = np.random.default_rng(trainings), 0, 300
+    of_training, of_task, of_draw = components
+    for _ in range(runs):
+        scores = of_training * rng.normal(size=(trainings, 1, 1))
+        scores = scores + of_task * rng.normal(size=(trainings if own_tasks else 1, 20, 1))
+        scores = scores + of_draw * rng.normal(size=(trainings, 20, 4))
+        (found,) = statistics.estimate(scores[None], statistics.mean, crossed=not own_tasks)
+        covered += found.low <= 0 <= found.high
+    assert least <= covered / runs <= (most if own_tasks else 1)
+
+
 @pytest.mark.parametrize("noise", [1.0, 0.1])
 def test_equal_methods_of_three_trainings_are_seldom_called_different(monkeypatch, noise):
     """The nominal rate is 5%.  Percentile intervals gave 22%, and without its least error the probability gave 10%."""
@@ -237,6 +262,11 @@ def test_a_caption_says_what_was_resampled():
     assert statistics.resampled(3, 20, 2, 5) == (
         "95% interval over 3 training seeds, 20 tasks with their adversaries, 2 evaluations of each, 5 episodes an evaluation"
     )
+    assert statistics.resampled(3, 20, 4, 5, draws=4) == (
+        "95% interval over 3 training seeds, 20 tasks, 4 evaluations of each with an adversary draw of its own, "
+        "5 episodes an evaluation"
+    )
+    assert statistics.resampled(1, 20, 4, draws=4).endswith("draw of its own; it says nothing about other training seeds")
     one = statistics.resampled(1, 1, 2)
     assert one.startswith("one training: 95% interval over 1 task with its adversary, 2 evaluations of each; ")
     assert one.endswith("it says nothing about other training seeds")

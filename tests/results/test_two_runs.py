@@ -102,6 +102,13 @@ def with_bounds(form, value, interval):
     return form.format(value) if math.isnan(interval[0]) else f"{form.format(value)} [{low}, {high}]"
 
 
+NOT_FROZEN = ("exact:every-step", "exact:windows", "exact:committed", "exact:zeta")
+
+
+def slow_mean_of(rows):
+    return sum(row["return"] for row in rows) / len(rows)
+
+
 @pytest.mark.parametrize(("method", "seeds"), [("icag", [1]), ("icaa", [1]), ("icaa", [0, 1])])
 def test_every_number_of_the_table_of_returns_follows_from_the_rows(runs, method, seeds):
     """The table of one training, and the same table of two trainings."""
@@ -110,9 +117,9 @@ def test_every_number_of_the_table_of_returns_follows_from_the_rows(runs, method
     printed = rendered(tables.returns_table(found, "trainings"))
     rows = found.to_dict("records")
     header, body = cells_of(printed)
-    assert header == ["p", "agent", "ep 1", "ep 2", "ep 3", "last 3", "of oracle"]
+    assert header == ["p", "agent", "ep 1", "ep 2", "ep 3", "last 3", "of oracle", "certified"]
     over = "95% interval over 2 tasks" if seeds == [1] else "95% interval over 2 training seeds, 2 tasks"
-    assert f"{over} with their adversaries, 2 evaluations of each, 3 episodes an evaluation" in unwrapped(printed)
+    assert f"{over}, 2 evaluations of each with an adversary draw of its own, 3 episodes an evaluation" in unwrapped(printed)
     assert ("one training: " in unwrapped(printed)) == (seeds == [1])
     agents = list(dict.fromkeys(AgentKey(row["agent"], row["deployment"], row["data"]) for row in rows))
     called = names(agents, "online", method, "darkroom")
@@ -131,6 +138,14 @@ def test_every_number_of_the_table_of_returns_follows_from_the_rows(runs, method
         value, share = slow_mean(means(scores)), slow_mean(means(scores)) / slow_mean(means(oracle))
         assert cells[5] == f"{value:.1f}"
         assert cells[6] == with_bounds("{:.0%}", share, bounds(share, resampled))
+        values = [row["certified"] for row in own]
+        assert math.isnan(sum(values)) == (agent.deployment == "committed" or agent.agent in NOT_FROZEN)
+        if math.isnan(sum(values)):
+            tasks = [records(own, training_seed=seed, task_index=task) for seed in seeds for task in (0, 1)]
+            lowest = [min(slow_mean_of(records(of, adversary=one)) for one in {row["adversary"] for row in of}) for of in tasks]
+            assert cells[7] == f"{sum(lowest) / len(lowest):.1f} estimated"
+        else:
+            assert cells[7] == f"{sum(values) / len(values):.1f}"
 
 
 @pytest.mark.parametrize("method", ["icag", "icaa"])
@@ -138,7 +153,7 @@ def test_train_prints_four_rows_of_the_largest_p_and_a_conclusion(runs, method):
     rows = read_results([runs[method, 1].folder])
     rows = rows[(rows.suite == "online") & (rows.p == max(LEVELS))].to_dict("records")
     header, body = cells_of(runs[method, 1].printed)
-    assert header == ["agent", "return", "95%", "of oracle"]
+    assert header == ["agent", "return", "95%", "of oracle", "certified"]
     versions = sorted({row["agent"] for row in rows if row["policy_version"] >= 0}, reverse=True)
     assert versions[-1] == "t0" and (len(versions) == 2) == (method == "icaa")
     keys = [*versions, "random", "oracle"]
@@ -172,7 +187,7 @@ def test_every_number_of_result_json_follows_from_the_rows(runs):
             deviation = math.sqrt(sum((one - mean) ** 2 for one in by_seed) / (SEEDS - 1))
             assert numbers_of["episodes"][episode] == round(mean, 3)
             assert numbers_of["standard_error"][episode] == round(deviation / math.sqrt(SEEDS), 3)
-        optimum = [records(own, task_index=task)[0]["optimum"] for task in (0, 1)]
+        optimum = [sum(one["optimum"] for one in records(own, task_index=t, episode=0)) / SEEDS for t in (0, 1)]
         assert numbers_of["optimum"] == round(sum(optimum) / 2, 3)
         assert numbers_of["last5"] == round(slow_mean(means(nested(own, LAST))), 3)
         assert numbers_of["last5_over_optimum"] == round(slow_mean(means(nested(own, LAST))) / (sum(optimum) / 2), 4)
@@ -204,7 +219,7 @@ def test_every_number_of_a_comparison_follows_from_the_rows(runs):
     text = rendered(tables.compare(*frames, names=("ICAG", "ICAA"), last=LAST))
     header, body = cells_of(text)
     assert header == ["p", "statistic", "ICAG", "compared", "its value", "effect", "95%", "verdict"]
-    assert "95% interval over 2 training seeds, 2 tasks with their adversaries, 2 evaluations of each, 3 episodes" in unwrapped(
+    assert "95% interval over 2 training seeds, 2 tasks, 2 evaluations of each with an adversary draw of its own" in unwrapped(
         text
     )
     assert len(body) == 5 * len(LEVELS)

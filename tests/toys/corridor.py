@@ -56,7 +56,7 @@ class CorridorProblem(Problem):
         return Corridor(variations)
 
     def training_adversaries(self, rng, config):
-        return (NULL, *(Adversary.of("slip", p=float(rng.uniform(0, config.p_max))) for _ in range(config.count - 1)))
+        return tuple(Adversary.of("slip", p=float(rng.uniform(0, config.p_max))) for _ in range(config.count))
 
     def test_adversary(self, rng, strength, prior):
         return Adversary.of("slip", p=strength)

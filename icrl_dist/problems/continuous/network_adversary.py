@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from icrl_dist.arrays import whole
 from icrl_dist.config.toml import nearest
 from icrl_dist.problems.checks import check_parameters
-from icrl_dist.types import NULL, Adversary, Spec
+from icrl_dist.types import Adversary, Spec
 
 HIDDEN = 64
 """Units in each of the two hidden layers."""
@@ -28,9 +28,9 @@ def network(seed: int, inputs: int, outputs: int, strength: float = 1.0) -> Adve
 
 
 def networks(rng: np.random.Generator, count: int, spec: Spec, outputs: int, strength: float) -> tuple[Adversary, ...]:
-    """K adversaries of one task; the first is always phi_0 (section 4.1)."""
-    seeds = rng.integers(2**31, size=count - 1)
-    return (NULL, *(network(int(seed), spec.observation, outputs, strength) for seed in seeds))
+    """The K disturbances of one task (section 4.1)."""
+    seeds = rng.integers(2**31, size=count)
+    return tuple(network(int(seed), spec.observation, outputs, strength) for seed in seeds)
 
 
 def weights(adversary: Adversary) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from icrl_dist.config.toml import nearest
 from icrl_dist.problems.checks import check_parameters
-from icrl_dist.types import NULL, Adversary
+from icrl_dist.types import Adversary
 
 ALPHA_RANGE = (0.05, 2.0)
 """Range of each Dirichlet parameter's uniform prior; the paper gives none (docs/decisions/006-adversary-distribution.md)."""
@@ -67,5 +67,5 @@ def sample_dirichlet(rng: np.random.Generator, actions: int, p_max: float) -> Ad
 
 
 def adversary_set(rng: np.random.Generator, count: int, actions: int, p_max: float) -> tuple[Adversary, ...]:
-    """K adversaries of one task; the first is always phi_0 (section 4.1)."""
-    return (NULL, *(sample_dirichlet(rng, actions, p_max) for _ in range(count - 1)))
+    """The K disturbances of one task (section 4.1)."""
+    return tuple(sample_dirichlet(rng, actions, p_max) for _ in range(count))

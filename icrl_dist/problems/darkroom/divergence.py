@@ -13,25 +13,25 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.special import rel_entr
 
+from icrl_dist.config import plugins
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Batch, MakePolicy
 from icrl_dist.problems import registry
-from icrl_dist.problems.darkroom.adversaries import adversary_set
 from icrl_dist.problems.darkroom.behavior_policies import Walks
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.labels import labels_of
-from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom, cells
+from icrl_dist.problems.darkroom.room import DarkRoom, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior, posterior_action
 from icrl_dist.rollout.episode import deploy_online, episode
-from icrl_dist.types import Variation
+from icrl_dist.types import NULL, Variation
 
 Decide = Callable[[Sequence[np.ndarray], Float32[np.ndarray, "B N S"], Int64[np.ndarray, "B N"]], Float64[np.ndarray, "B N A"]]
 """A model's distributions at query states, each given its own prefix of the transitions (``Method.distributions``)."""
 
 KINDS = ("random walk", "persistent walk", "on policy")
 LEVELS = (0.0, 0.2)
-PRIORS = {"": "each goal has its own K adversaries", "_any": "any goal has any adversary"}
+PRIORS = {"": "each goal has its own adversaries", "_any": "any goal has any adversary"}
 """Priors over variations, by the suffix of the measure's name.
 
 The first is that of D^0 (later rounds of ICAA draw other adversaries): the training variations.
@@ -41,7 +41,7 @@ adversaries are independent, as in tests: every goal has the same adversaries, d
 CONTEXTS, EPISODES = 160, 2
 """Contexts of each kind and p, and episodes per context."""
 _ADVERSARIES = 16
-"""Approximate number of adversaries of the second prior: a multiple of K that is not smaller."""
+"""Approximate number of adversaries of the second prior: a multiple of the variations per goal that is not smaller."""
 _CHUNK = 32
 """Contexts per call of the model."""
 
@@ -74,28 +74,25 @@ class Divergence:
 
 
 def training_variations(run: Run, heldout: bool) -> list[tuple[Variation, ...]]:
-    """The K variations of each training goal; with ``heldout`` of each test goal, numbered after the training goals."""
-    split = registry.of(run).split
+    """The variations of each training goal; with ``heldout`` of each test goal, numbered after the training goals."""
+    split, method = registry.of(run).split, plugins.find("methods", run.method)()
     tasks = enumerate((*split.train, *split.test))
-    groups = [registry.training_variations(run, i, task)[: _count(run)] for i, task in tasks]
+    groups = [method.training_variations(run, i, task, 0) for i, task in tasks]
     return groups[len(split.train) :] if heldout else groups[: len(split.train)]
-
-
-def _count(run: Run) -> int:
-    return 1 if run.method == "dpt" else run.adversary.count
 
 
 def levels(run: Run) -> tuple[float, ...]:
     """The override probabilities of contexts: only 0 if training has no disturbance, because its prior allows no other."""
-    return LEVELS if _count(run) > 1 and run.adversary.p_max > 0 else LEVELS[:1]
+    return LEVELS if _disturbed_of(training_variations(run, False)[0]) and run.adversary.p_max > 0 else LEVELS[:1]
 
 
 def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
     """The equally likely variations of each of ``PRIORS``: those of training goals; for held-out contexts of all goals."""
     groups = training_variations(run, False) + (training_variations(run, True) if heldout else [])
     rng = generator(run.seed, RandomKey.POSTERIOR_SUITE)
-    sets = range(-(-_ADVERSARIES // _count(run)) if _count(run) > 1 else 1)
-    several = [a for _ in sets for a in adversary_set(rng, _count(run), ACTIONS, run.adversary.p_max)]
+    trained = [v.adversary for v in groups[0]]
+    sets = range(-(-_ADVERSARIES // len(trained))) if trained != [NULL] else ()
+    several = [a for _ in sets for a in registry.adversaries(run, rng)] or trained
     own = [v for group in groups for v in group]
     return Hypotheses.of(own), Hypotheses.of([Variation(group[0].task, a) for group in groups for a in several])
 
@@ -123,9 +120,14 @@ def divergences(
 def _disturbed(rng: np.random.Generator, group: tuple[Variation, ...], p: float) -> Variation:
     """The undisturbed variation of a goal, or a random other one with override probability p."""
     if p == 0:
-        return group[0]
-    chosen = group[int(rng.integers(1, len(group)))]
+        return Variation(group[0].task)
+    others = _disturbed_of(group)
+    chosen = others[int(rng.integers(len(others)))]
     return Variation(chosen.task, chosen.adversary.replace(p=p))
+
+
+def _disturbed_of(group: tuple[Variation, ...]) -> list[Variation]:
+    return [one for one in group if one.adversary != NULL]
 
 
 def contexts(kind: str, rows: Sequence[Variation], act: MakePolicy, rngs: Sequence[np.random.Generator]) -> RoomContext:

@@ -76,6 +76,13 @@ class ExactAgent(DiscretePolicy):
         probs: np.ndarray = (labels @ self._weight[:, :, None])[:, :, 0]
         return probs
 
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> Float64[np.ndarray, "B Q A"] | None:
+        """The distributions at any states in the next episode; None for a rule that changes them within an episode."""
+        if self._rule != "paper":
+            return None
+        cell = cell_numbers(states, self._size)
+        return np.stack([self._labels[f, cell] @ weight for f, weight in zip(self._family, self._weight, strict=True)])
+
     def observe(
         self,
         observation: Float32[np.ndarray, "B S"],
@@ -144,6 +151,11 @@ class OptimalAgent(DiscretePolicy):
     def probabilities(self, observation: Float32[np.ndarray, "B S"]) -> Float64[np.ndarray, "B A"]:
         cell = cell_numbers(observation, self._size)
         result: np.ndarray = self._labels[np.arange(len(cell)), cell].astype(np.float64)
+        return result
+
+    def frozen(self, states: Float32[np.ndarray, "Q S"]) -> Float64[np.ndarray, "B Q A"]:
+        """The distributions at any states, which never change."""
+        result: np.ndarray = self._labels[:, cell_numbers(states, self._size)].astype(np.float64)
         return result
 
     def observe(self, *transition: object) -> None:

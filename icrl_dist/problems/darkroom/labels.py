@@ -39,6 +39,8 @@ class RoomLabelling:
     """Share of the windows in which the optimal policy of another goal acts."""
     decoys: tuple[int, ...]
     """Cell numbers of the goals that decoys may have."""
+    undisturbed: bool = False
+    """Whether the labels are those of the task without its adversary, pi*_{tau,phi_0}."""
 
     @property
     def label_counts(self) -> LabelCounts:
@@ -61,7 +63,7 @@ class RoomLabeller:
 
     def __init__(self, job: Job, labelling: RoomLabelling) -> None:
         self._job, self._labelling = job, labelling
-        hypotheses = Hypotheses.of(job.variations)
+        hypotheses = Hypotheses.of([Variation(v.task) for v in job.variations] if labelling.undisturbed else job.variations)
         self._size, self._cells = hypotheses.size, cells(hypotheses.size)
         self._row = {place: row for row, place in enumerate(job.rows())}
         self._table = labels_of(hypotheses, labelling.labels, labelling.gamma, labelling.slack)

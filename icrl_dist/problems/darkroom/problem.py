@@ -28,6 +28,7 @@ from icrl_dist.interfaces import (
 from icrl_dist.problems.darkroom import picture, room
 from icrl_dist.problems.darkroom.adversaries import adversary_set, sample_dirichlet
 from icrl_dist.problems.darkroom.behavior_policies import KINDS, Walks
+from icrl_dist.problems.darkroom.certificate import RoomCertificate
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.labels import RoomLabeller, RoomLabelling
@@ -220,6 +221,10 @@ class DarkRoomProblem(Problem):
         from icrl_dist.problems.darkroom.divergence import RoomPosteriorSuite
 
         return RoomPosteriorSuite(self.config)
+
+    @property
+    def certify(self) -> RoomCertificate:
+        return RoomCertificate(self.config.size)
 
     @property
     def game(self) -> MakeGame:

@@ -6,7 +6,7 @@ exact and takes milliseconds.  All functions compute M hypotheses (goal, p, q) a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Float64, Int
 
 from icrl_dist.problems.darkroom.adversaries import override_distribution
 from icrl_dist.problems.darkroom.room import ACTIONS, MOVES, cells, check, next_cell
-from icrl_dist.types import Trajectory, Variation
+from icrl_dist.types import NULL, Trajectory, Variation
 
 
 @dataclass(frozen=True)
@@ -117,26 +117,61 @@ def worst_case(policy: Float[np.ndarray, "C A"] | None, variation: Variation, p:
     Raises ValueError for a p outside [0, 1] and for a policy of another shape or with rows that are no distributions.
     """
     check(variation.task)
+    policies = None if policy is None else np.asarray(policy, np.float64)[None]
+    return float(worst_cases(policies, [variation], p)[0])
+
+
+def worst_cases(
+    policies: Float[np.ndarray, "P C A"] | None, variations: Sequence[Variation], p: float
+) -> Float64[np.ndarray, " B"]:
+    """``worst_case`` of many policies at once: of each policy in the task of its variation.
+
+    ``policies``: P = B, one for each variation, or P = 1, one for all; None: in each task the minimax oracle.
+    Raises ValueError for a p outside [0, 1], for policies as in ``worst_case``, and for variations of several rooms.
+    """
     if not 0 <= p <= 1:
         raise ValueError(f"p = {p}: a probability lies in [0, 1]")
-    size, horizon = int(variation.task.number("size")), int(variation.task.number("horizon"))
-    if policy is not None:
-        policy = np.asarray(policy, np.float64)
-        if policy.shape != (size**2, ACTIONS):
-            raise ValueError(f"policy of shape {policy.shape}: expected probabilities of shape ({size**2}, {ACTIONS})")
-        if not (policy >= 0).all() or not np.allclose(policy.sum(axis=1), 1, atol=1e-3):  # NaN fails the first comparison
+    h = Hypotheses.of([Variation(one.task, NULL) for one in variations])
+    return _from_start(policies, h, variations, lambda own, q: (1 - p) * own + p * q.min(axis=2))
+
+
+def expected_returns(policies: Float[np.ndarray, "P C A"], variations: Sequence[Variation]) -> Float64[np.ndarray, " B"]:
+    """Expected return of one episode of each Markov policy in its variation, under the adversary of this variation.
+
+    ``policies``: as of ``worst_cases``, and so are the errors.
+    """
+    h = Hypotheses.of(variations)
+    p = h.p[:, None]
+    return _from_start(policies, h, variations, lambda own, q: (1 - p) * own + p * np.einsum("bca,ba->bc", q, h.q))
+
+
+def _from_start(
+    policies: Float[np.ndarray, "P C A"] | None,
+    h: Hypotheses,
+    variations: Sequence[Variation],
+    value_of: Callable[[Float64[np.ndarray, "B C"], Float64[np.ndarray, "B C A"]], Float64[np.ndarray, "B C"]],
+) -> Float64[np.ndarray, " B"]:
+    """V_0 at the start of each variation, by backward recursion.
+
+    ``value_of``: from the value of the agent's own choice and Q_h of every action to V_h.  Without policies the agent's
+    own choice is the best one.
+    """
+    if policies is not None:
+        policies = np.asarray(policies, np.float64)
+        if policies.ndim != 3 or len(policies) not in (1, len(variations)) or policies.shape[1:] != (h.size**2, ACTIONS):
+            shape = f"({h.size**2}, {ACTIONS})"
+            raise ValueError(f"policy of shape {policies.shape[1:]}: expected probabilities of shape {shape}")
+        if not (policies >= 0).all() or not np.allclose(policies.sum(axis=2), 1, atol=1e-3):  # NaN fails the first comparison
             raise ValueError("policy: the rows must be distributions over actions, with no negative number and the sum 1")
-        policy = policy / policy.sum(axis=1, keepdims=True)
-    goal = variation.task.vector("goal")
-    reward = np.zeros(size**2)
-    reward[int(goal[0]) * size + int(goal[1])] = 1.0
-    value, leads_to = np.zeros(size**2), next_cell(size)
-    for _ in range(horizon):
-        q = (reward + value)[leads_to]
-        own = q.max(axis=1) if policy is None else (policy * q).sum(axis=1)
-        value = (1 - p) * own + p * q.min(axis=1)
-    start = variation.task.get("start", "random")
-    return float(value.mean() if isinstance(start, (str, int, float)) else value[int(start[0]) * size + int(start[1])])
+        policies = policies / policies.sum(axis=2, keepdims=True)
+    value, rewards, leads_to = np.zeros((len(variations), h.size**2)), h.rewards(), next_cell(h.size)
+    for _ in range(h.horizon):
+        q = (rewards + value)[:, leads_to]
+        value = value_of(q.max(axis=2) if policies is None else (policies * q).sum(axis=2), q)
+    starts = [variation.task.get("start", "random") for variation in variations]
+    anywhere = [isinstance(start, (str, int, float)) for start in starts]
+    cell = [0 if drawn else int(start[0]) * h.size + int(start[1]) for drawn, start in zip(anywhere, starts, strict=True)]  # type: ignore[index]
+    return np.where(anywhere, value.mean(axis=1), value[np.arange(len(cell)), cell])
 
 
 def cell_numbers(observations: Float[np.ndarray, "*B 2"], size: int) -> Int[np.ndarray, "*B"]:

@@ -48,6 +48,8 @@ def findings(study: Study, known: Ledger) -> Iterator[Finding]:
     variants = {name: study.variant(name) for name in ("icag", "icaa")}
     arms = {name: study.model(variant, study.levels(variant)[0]) for name, variant in variants.items() if variant}
     for column, text in COSTS.items():
+        if column == "label_bytes" and not any(column in run for run in known.values()):
+            continue  # a sweep that does not measure them
         comparison = f"ICAG - ICAA, {text}"
         values = {name: cost(arm, column, known) for name, arm in arms.items() if arm is not None}
         seeds = sorted(set.intersection(*map(set, values.values()))) if len(values) == 2 else []
@@ -69,6 +71,8 @@ def cost(arm: Arm, column: str, known: Ledger) -> dict[int, float]:
         entry = known.get((arm.key.setting, arm.key.variant, part.training_seed), {})
         value = getattr(part, column, None)
         value = entry.get(column) if value is None else value
+        if isinstance(value, Mapping):  # CPU-seconds by stage: what training took
+            value = sum(seconds for stage, seconds in value.items() if stage != "evaluate")
         if value is not None:
             found[part.training_seed] = float(value)
     return found

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from icrl_dist.results.figures import styles
 from icrl_dist.results.figures.panels import Entry, is_reference
 from icrl_dist.results.figures.reading import Arm
-from icrl_dist.results.figures.selection import EXACT, REFERENCES, MissingError, Study
+from icrl_dist.results.figures.selection import EXACT, REFERENCES, MissingError, Study, of_budget, unequal
 
 
 class Spot(NamedTuple):
@@ -84,16 +84,19 @@ def entries(study: Study, what: str, choices: Sequence[Choice], spots: Sequence[
     same = iter(study.comparable([arm for _, arms in found for arm in arms], what))
     groups = [spot.group for spot in spots]
     shown = [Entry(choice.label, choice.style, [next(same) for _ in arms], groups) for choice, arms in found]
-    return shown, _note(study, lacking)
+    return shown, _note(study, lacking, [entry.arms[0] for entry in shown if not is_reference(entry.style)])
 
 
-def _note(study: Study, lacking: Sequence[Choice]) -> str:
+def _note(study: Study, lacking: Sequence[Choice], models: Sequence[Arm]) -> str:
     without = [choice.label for choice in lacking if not is_reference(choice.style)]
     exact = [choice.label for choice in lacking if is_reference(choice.style) and choice.style not in ("exact:paper", "random")]
     parts = [f"No rows of {', '.join(without)}"] if without else []
     parts += [f"No rows of {', '.join(exact)} (runs {study.run(EXACT)})"] if exact else []
     if study.rules.common_seeds:
         parts.append("Only training seeds that all of these agents have")
-    if study.rules.unequal_budgets:
-        parts.append("Budgets may differ: see the table of budgets")
+    parts += [
+        f"Budgets differ: {column} is {of_budget(one, column):,.0f} of {one.key.variant} and {of_budget(two, column):,.0f} of "
+        f"{two.key.variant}"
+        for column, one, two in unequal(models)
+    ]
     return ". ".join(parts)

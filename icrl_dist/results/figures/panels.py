@@ -139,11 +139,12 @@ def resampled(arms: Sequence[Arm], last: int = LAST) -> str:
     """What the intervals of some arms were resampled over, for a caption: seeds, splits, tasks, evaluations, adversaries."""
     arm = next((one for one in arms if one.key.p > 0), arms[0])
     trainings, tasks, evaluations, episodes = arm.returns.shape
-    over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes))
-    splits = len({part.split_seed for part in arm.parts})
     draws = max(len(np.unique(here)) for training in arm.adversaries for here in training)
+    over = statistics.resampled(trainings, tasks, evaluations, min(last, episodes), draws)
+    whole = "" if arm.crossed else "; each training is drawn with all its tasks, which are its own"
+    splits = len({part.split_seed for part in arm.parts})
     each = f"{draws} adversary draw{'' if draws == 1 else 's'} a task"
-    return f"{over}; training seeds {listed(arm.seeds)}, {splits} split{'' if splits == 1 else 's'} of the tasks, {each}"
+    return f"{over}; training seeds {listed(arm.seeds)}, {splits} split{'' if splits == 1 else 's'} of the tasks, {each}{whole}"
 
 
 def with_note(panel: Panel, note: str) -> Panel:

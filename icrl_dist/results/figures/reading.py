@@ -6,6 +6,7 @@ A batch keeps numbers only: the strings of a row (task, adversary, agent and so 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from jaxtyping import Float64, Int32
 from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError
 from icrl_dist.results import rows
+from icrl_dist.results.columns import FORMAT
 from icrl_dist.results.returns import LAST
 from icrl_dist.storage.files import StoreError
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
 BUDGETS = ("environment_steps", "labelled_episodes", "optimizer_steps")
 """Columns that must be equal for methods that are compared."""
-SUITES = ("online", "offline", "attack")
+SUITES = ("online", "offline")
 _BATCH = 1 << 17
 _ARM = ("problem", "setting", "variant", "method", "adversaries", "suite", "agent", "deployment", "data", "prior", "p")
 _PART = ("training_seed", "split_seed", "run", "evaluation", "weights_digest", "training_episodes", "label_source", *BUDGETS)
@@ -43,7 +45,7 @@ class Key(NamedTuple):
     setting: str
     variant: str
     method: str
-    adversaries: int
+    adversaries: int | None
     suite: str
     agent: str
     deployment: str
@@ -128,7 +130,7 @@ class Rows:
         self._arms: dict[Key, Arm] = {}
 
     def _add(self, key: Key, part: Part) -> None:
-        """Keep the newest evaluation of a training; refuse a second training of the same seed."""
+        """Keep the newest evaluation of a training, in a sweep the one with most rows; refuse a second training of the same seed."""
         known = self._parts.setdefault(key, {})
         other = known.get(part.training_seed)
         if other is not None and (other.run, other.weights_digest) != (part.run, part.weights_digest):
@@ -137,7 +139,7 @@ class Rows:
                 f"result rows of {named(key)}, agent {key.agent}, training seed {part.training_seed}: {what} is "
                 f"{getattr(other, what)} and {getattr(part, what)}: give rows of one run for each variant and seed"
             )
-        if other is None or _written(other.evaluation) < _written(part.evaluation):
+        if other is None or _newer(other) < _newer(part):
             known[part.training_seed] = part
 
     def seeds(self, key: Key) -> tuple[int, ...]:
@@ -190,8 +192,10 @@ def _size(shape: Sequence[int]) -> str:
     return "{} tasks, {} evaluations, {} episodes".format(*shape)
 
 
-def _written(evaluation: str) -> str:
-    return evaluation.rsplit("-", 1)[-1]
+def _newer(part: Part) -> tuple[str, int, str]:
+    """Orders evaluations of one agent: by time in a run folder; in a sweep, which has no times, by the number of rows."""
+    time = re.search(r"\d{8}T[\d.]+Z$", part.evaluation)
+    return time[0] if time else "", len(part.rows), part.evaluation
 
 
 def files_of(sources: str | Path | Sequence[str | Path]) -> list[Path]:
@@ -274,9 +278,9 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
     import pyarrow.parquet
 
     try:
-        rows.check_schema(path, pa.parquet.read_schema(path))
+        former = rows.check_schema(path, pa.parquet.read_schema(path)) != str(FORMAT)
         wanted = pa.dataset.field("suite").isin(SUITES) & pa.dataset.field("p").is_valid()
-        data = pa.dataset.dataset(path, format="parquet")
+        data = pa.dataset.dataset(rows.table_of(path)) if former else pa.dataset.dataset(path, format="parquet")
         scanner = data.scanner(list(_COLUMNS), filter=wanted, batch_size=_BATCH, batch_readahead=2, fragment_readahead=1)
         yield from (batch for batch in scanner.to_batches() if len(batch))
     except (OSError, pa.ArrowException) as error:

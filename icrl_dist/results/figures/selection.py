@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +19,8 @@ METHODS = ("dpt", "prompt_dt", "mix_dpt", "ardt", "ad", "dr", "icag", "icaa")
 """The methods of the paper and of this package, in the order of legends and tables."""
 REFERENCES = ("exact:dpt", "exact:icag", "exact:paper", "oracle", "random")
 """Reference agents that figures show where there are rows of them."""
+SAME = 0.1
+"""Share by which budgets may differ, because episodes are divided among variations; figures name such differences."""
 INFERRED = ("wind", "permuted")
 """Settings in which the disturbance itself must be inferred."""
 
@@ -101,7 +103,7 @@ class Study:
         found = self._at(variant, f"t{chosen}", p, prior, suite, data)
         rules = list(dict.fromkeys(key.deployment for key in found))
         found = [key for key in found if key.deployment == rule or (rule == "paper" and len(rules) == 1)]
-        return self.load(found[0]) if found else None
+        return self.rows.arm(found[0]) if found else None
 
     def reference(
         self, agent: str, p: float, *, prior: str = "uniform", suite: str = "online", data: str = "", of: str | None = None
@@ -109,7 +111,7 @@ class Study:
         """A reference agent at one p, of variant ``exact`` if it has rows, else of variant ``of`` or of the first that has."""
         variants = dict.fromkeys(key.variant for key in self.keys if key.agent == agent)
         order = [EXACT, *([of] if of else []), *variants]
-        return next((self.load(k) for v in order for k in self._at(v, agent, p, prior, suite, data)), None)
+        return next((self.rows.arm(k) for v in order for k in self._at(v, agent, p, prior, suite, data)), None)
 
     def _at(self, variant: str, agent: str, p: float, prior: str, suite: str, data: str) -> list[Key]:
         found = [
@@ -118,15 +120,6 @@ class Study:
             if (key.variant, key.agent, key.suite, key.data) == (variant, agent, suite, data) and math.isclose(key.p, p)
         ]
         return [key for key in found if key.prior == prior] or (found if p == 0 else [])
-
-    def load(self, key: Key) -> Arm:
-        """The arrays of an arm; its certified returns are those of suite ``attack`` if only that has them."""
-        arm, attack = self.rows.arm(key), key._replace(suite="attack")
-        if key.suite == "online" and attack in self.rows.keys and np.isnan(arm.certified).all():
-            other = self.rows.arm(attack)
-            if other.seeds == arm.seeds and other.certified.shape == arm.certified.shape:
-                return replace(arm, certified=other.certified)
-        return arm
 
     def seeds(self) -> str:
         """The training seeds of the setting, as messages list them."""
@@ -182,22 +175,23 @@ class Study:
 
     def _check_budgets(self, arms: Sequence[Arm], what: str) -> None:
         models = [arm for arm in arms if AgentKey(arm.key.agent).is_model]
-        for column, one, two in () if self.rules.unequal_budgets else unequal(models):
+        for column, one, two in () if self.rules.unequal_budgets else unequal(models, SAME):
             raise ConfigError(
                 f"{what}: {column} is {of_budget(one, column):.12g} of {_who(one)} and {of_budget(two, column):.12g} of "
                 f"{_who(two)}: train both with equal budgets, or compare them all the same with --unequal-budgets"
             )
 
 
-def unequal(models: Sequence[Arm]) -> list[tuple[str, Arm, Arm]]:
-    """Budgets that differ between methods: the column, the first arm, and the first that differs from it.
+def unequal(models: Sequence[Arm], share: float = 0.0) -> list[tuple[str, Arm, Arm]]:
+    """Budgets that differ between methods by more than this share: the column, and the arms with the least and the most.
 
     A budget that is not known of an arm is compared with nothing.
     """
     found = []
     for column in BUDGETS:
-        known = [arm for arm in models if of_budget(arm, column) is not None]
-        found += [(column, known[0], arm) for arm in known if of_budget(arm, column) != of_budget(known[0], column)][:1]
+        known = [(budget, i) for i, arm in enumerate(models) if (budget := of_budget(arm, column)) is not None]
+        if known and (least := min(known))[0] < (1 - share) * (most := max(known))[0]:
+            found.append((column, models[least[1]], models[most[1]]))
     return found
 
 

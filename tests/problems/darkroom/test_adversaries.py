@@ -72,17 +72,17 @@ def test_override_distribution_of_each_family() -> None:
     assert override_distribution(NULL, 5)[0] == 0.0
 
 
-@pytest.mark.parametrize("count", [1, 2, 8])
-def test_adversary_set_begins_with_null(count: int) -> None:
+@pytest.mark.parametrize("count", [0, 1, 8])
+def test_adversary_set_has_k_disturbances_and_no_null_adversary(count: int) -> None:
     made = adversary_set(np.random.default_rng(0), count, 5, 0.2)
     assert len(made) == len(set(made)) == count
-    assert made[0] == NULL
-    assert all(a.kind == "dirichlet" for a in made[1:])
+    assert all(a.kind == "dirichlet" for a in made)
+    assert adversary_set(np.random.default_rng(0), count + 3, 5, 0.2)[:count] == made, "a larger K changes the first ones"
 
 
 @pytest.mark.parametrize("p_max", [0.2, 0.7])
 def test_priors_are_uniform_over_their_ranges(p_max: float) -> None:
-    made = adversary_set(np.random.default_rng(0), 1001, 5, p_max)[1:]
+    made = adversary_set(np.random.default_rng(0), 1000, 5, p_max)
     p = np.array([a.number("p") for a in made])
     alpha = np.array([a.vector("alpha") for a in made])
     for values, low, high in ((p, 0.0, p_max), (alpha, *ALPHA_RANGE)):
@@ -95,4 +95,4 @@ def test_priors_are_uniform_over_their_ranges(p_max: float) -> None:
 def test_priors_repeat_with_the_generator_and_change_with_it() -> None:
     sets = [adversary_set(np.random.default_rng(seed), 4, 5, 0.2) for seed in (0, 0, 1)]
     assert sets[0] == sets[1]
-    assert not set(sets[0][1:]) & set(sets[2][1:])
+    assert not set(sets[0]) & set(sets[2])

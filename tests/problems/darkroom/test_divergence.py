@@ -41,7 +41,7 @@ OTHERS = (NULL, Adversary.of("dirichlet", p=0.2, alpha=ALPHA[::-1]))
 @pytest.fixture
 def run(small_run: Run) -> Run:
     """ICAG with two adversaries a goal: 7 goals to train on, 2 held out."""
-    return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=2))
+    return dataclasses.replace(small_run, method="icag", adversary=AdversaryConfig(count=1))
 
 
 @pytest.fixture
@@ -155,7 +155,7 @@ def test_by_the_second_prior_goals_and_adversaries_are_independent(run: Run) -> 
 
 @pytest.mark.parametrize(
     "change",
-    [{"method": "dpt"}, {"adversary": AdversaryConfig(count=1)}, {"adversary": AdversaryConfig(count=2, p_max=0.0)}],
+    [{"method": "dpt"}, {"adversary": AdversaryConfig(count=0)}, {"adversary": AdversaryConfig(count=1, p_max=0.0)}],
 )
 def test_without_disturbance_in_training_there_is_none_in_the_contexts(
     run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
@@ -165,6 +165,18 @@ def test_without_disturbance_in_training_there_is_none_in_the_contexts(
     found = [pair for heldout in (False, True) for pair in measured(run, model, heldout)]
     assert [(one.kind, one.p) for pair in found for one in pair] == [(kind, 0.0) for kind in (*KINDS, *KINDS) for _ in PRIORS]
     assert all((h.p == 0).all() for h in divergence.hypotheses(run, heldout=True))
+
+
+def test_without_phi_0_in_training_contexts_at_p_0_are_undisturbed_and_no_prior_holds_it(
+    run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Sequence[Variation]] = []
+    monkeypatch.setattr(divergence, "CONTEXTS", 8)
+    monkeypatch.setattr(divergence, "contexts", noting(made, lambda kind, rows, act, rngs: rows, divergence.contexts))
+    run = dataclasses.replace(run, adversary=AdversaryConfig(count=2, null=False))
+    assert {one.p for pair in measured(run, model, False) for one in pair} == {0.0, 0.2}
+    assert [{v.adversary == NULL for v in rows} for rows in made] == [{True}] * len(KINDS) + [{False}] * len(KINDS)
+    assert all((h.p > 0).all() for h in divergence.hypotheses(run, heldout=True))
 
 
 class RecordsEnds(RandomPolicy):
@@ -220,7 +232,7 @@ def test_contexts_take_the_goals_in_turn_each_under_one_of_its_adversaries(
     run: Run, model: PretrainedTransformer, monkeypatch: pytest.MonkeyPatch, heldout: bool
 ) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 14)
-    run = dataclasses.replace(run, adversary=AdversaryConfig(count=3))
+    run = dataclasses.replace(run, adversary=AdversaryConfig(count=2))
     asked = list[tuple[str, list[Variation]]]()
     monkeypatch.setattr(divergence, "contexts", noting(asked, lambda kind, rows, *rest: (kind, rows), divergence.contexts))
     found = [(one.kind, one.p) for one, _ in measured(run, model, heldout)]

@@ -171,10 +171,11 @@ def test_a_network_is_rebuilt_bit_for_bit_and_equals_a_slow_loop():
     np.testing.assert_array_equal(answers[1], np.zeros(4))
 
 
-def test_networks_of_a_task_begin_with_the_null_adversary():
+def test_networks_of_a_task_are_k_disturbances_and_no_null_adversary():
     spec = registry.spec(domains.task("dmc-walker-run"))
     made = network_adversary.networks(np.random.default_rng(0), 5, spec, 4, 1.0)
-    assert made[0] is NULL and len(set(made)) == 5
+    assert len(set(made)) == 5 and {one.kind for one in made} == {"network"}
+    assert made[:3] == network_adversary.networks(np.random.default_rng(0), 3, spec, 4, 1.0)
     assert made == network_adversary.networks(np.random.default_rng(0), 5, spec, 4, 1.0)
 
 

@@ -32,7 +32,7 @@ def run(small_run, monkeypatch):
     monkeypatch.setattr(environment, "ml1_tasks", lambda count, seed: chosen[:count])  # theirs take seconds to make
     control = ControlConfig(train_tasks=2, test_tasks=1, horizon=HORIZON, histories="scripted")
     pretrain = dataclasses.replace(small_run.pretrain, contexts=4 * TRIALS, queries=HORIZON)
-    more = {"method": "icag", "control": control, "adversary": AdversaryConfig(count=2), "pretrain": pretrain}
+    more = {"method": "icag", "control": control, "adversary": AdversaryConfig(count=1), "pretrain": pretrain}
     return in_problem(small_run, "metaworld-pick-place", **more)
 
 
