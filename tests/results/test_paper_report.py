@@ -98,7 +98,7 @@ def test_captions_say_what_was_resampled(sweep):
         "95% interval over 6 training seeds, 4 tasks, 2 evaluations of each with an adversary draw of its own" in panel.caption
     )
     assert (
-        "training seeds 0 to 5, 6 splits of the tasks, 2 adversary draws a task; each training is drawn with all its tasks, which are its own"
+        "training seeds 0 to 5, 6 splits of the tasks, 2 adversary draws a task; each training is drawn with all its tasks"
         in panel.caption
     )
 
@@ -302,3 +302,37 @@ def test_the_page_needs_no_other_file_and_no_network(tmp_path):
     assert "figure 6: rows are missing; these runs make them: room/icag-k4, seeds 0 to 5; room/icag-k16" in page
     text = (tmp_path / "claims.md").read_text()
     assert text.startswith("## Claims") and "| claim | comparison | effect, last episodes |" in text and "certified" in text
+
+
+def test_deployment_rules_are_shown_beside_each_other(tmp_path):
+    agents = {"dpt": ("t0",), "icag": ("t0",)}
+
+    def mean(variant, agent, p):
+        return 50.0 - 10.0 * p
+
+    paper = small(tmp_path, agents=agents, mean=mean)
+    own = small(
+        tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns=dict.fromkeys(agents, {"deployment": "committed"})
+    )
+    rows = Rows([write(tmp_path, paper, own, offline=False)])
+    panels = catalog.numbers("deployment", rows, None, Rules())
+    found = {name: point(panels, "deployment", f"ICAG, {name}", "p = 0.2").value.value for name in ("Algorithm 1", "committed")}
+    assert found["committed"] - found["Algorithm 1"] == pytest.approx(7, abs=0.1)
+    shown = study(rows, None, Rules()).model("icag", 0.2)
+    assert shown is not None and shown.key.deployment == "paper", "other figures show Algorithm 1"
+
+
+def test_small_differences_of_budgets_are_named(tmp_path):
+    columns = {"icag": {"environment_steps": 1950}}
+    path = write(tmp_path, small(tmp_path, columns=columns), offline=False)
+    assert "environment_steps is 1,950 of icag and 2,000 of dpt" in str(report(path, figure="2", out=tmp_path))
+    wide = small(tmp_path, columns={"icag": {"environment_steps": 1790}})
+    with pytest.raises(ConfigError, match="environment_steps is 1790 of room/icag"):
+        report(write(tmp_path / "wide", wide, offline=False), figure="2", out=tmp_path)
+
+
+def test_a_claim_needs_five_training_seeds(tmp_path):
+    rows = Rows([write(tmp_path, small(tmp_path, seeds=4, levels=(0.0, 0.2, 0.4, 0.6)), offline=False)])
+    finding = questions.claims(study(rows, None, Rules()), {})[2].findings[0]
+    assert finding.verdict == "not decidable" and finding.effect.low > 0
+    assert finding.reason == "4 training seeds, and at least 5 are needed"

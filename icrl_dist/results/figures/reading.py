@@ -130,7 +130,7 @@ class Rows:
         self._arms: dict[Key, Arm] = {}
 
     def _add(self, key: Key, part: Part) -> None:
-        """Keep the newest evaluation of a training, in a sweep the one with most rows; refuse a second training of the same seed."""
+        """Keep one evaluation of a training, by ``_newer``; refuse a second training of the same seed."""
         known = self._parts.setdefault(key, {})
         other = known.get(part.training_seed)
         if other is not None and (other.run, other.weights_digest) != (part.run, part.weights_digest):

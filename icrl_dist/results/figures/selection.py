@@ -189,9 +189,12 @@ def unequal(models: Sequence[Arm], share: float = 0.0) -> list[tuple[str, Arm, A
     """
     found = []
     for column in BUDGETS:
-        known = [(budget, i) for i, arm in enumerate(models) if (budget := of_budget(arm, column)) is not None]
-        if known and (least := min(known))[0] < (1 - share) * (most := max(known))[0]:
-            found.append((column, models[least[1]], models[most[1]]))
+        known = [(budget, arm) for arm in models if (budget := of_budget(arm, column)) is not None]
+        if not known:
+            continue
+        (least, one), (most, two) = (choose(known, key=lambda of: of[0]) for choose in (min, max))
+        if least < (1 - share) * most:
+            found.append((column, one, two))
     return found
 
 
