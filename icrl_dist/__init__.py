@@ -1,8 +1,8 @@
 """Robust in-context reinforcement learning, distributed.
 
 ``train`` trains a run, ``load_run`` reads one to change it, ``evaluate`` evaluates its agent, ``sweep`` does many runs;
-``read_results`` reads the returns of evaluations, ``compare`` compares trainings, ``read_dataset`` reads the trajectories
-that a run collected.
+``read_results`` reads the returns of evaluations, ``compare`` compares trainings, ``report`` makes figures and tables of
+many, ``read_dataset`` reads the trajectories that a run collected.
 ``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in; ``oracle`` computes
 exact solutions of Dark Room.  docs/python.md has an example of each.
 """
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from icrl_dist.launch.whole_run import TrainResult, train
     from icrl_dist.problems.darkroom import solver as oracle
     from icrl_dist.problems.registry import make
+    from icrl_dist.results.paper_report import report
     from icrl_dist.results.reports import Evaluation
     from icrl_dist.results.rows import read_results
     from icrl_dist.results.suites import evaluate
@@ -60,6 +61,7 @@ __all__ = [
     "oracle",
     "read_dataset",
     "read_results",
+    "report",
     "sweep",
     "train",
 ]
@@ -78,6 +80,7 @@ _MODULES = {
     "train": "icrl_dist.launch.whole_run",
     "make": "icrl_dist.problems.registry",
     "Evaluation": "icrl_dist.results.reports",
+    "report": "icrl_dist.results.paper_report",
     "read_results": "icrl_dist.results.rows",
     "evaluate": "icrl_dist.results.suites",
     "compare": "icrl_dist.results.tables",

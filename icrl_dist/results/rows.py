@@ -174,17 +174,8 @@ def read_table(path: Path) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{path}: not a file of result rows ({reason}): move it away, and evaluate again") from None
-    found = (table.schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
-    if found not in (str(FORMAT), str(FORMER)):
-        raise StoreError(
-            f"{path}: result rows of format {found}, and this version reads formats {FORMER} and {FORMAT}: read them "
-            "with the version that wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
-        )
+    found = check_schema(path, table.schema)
     schema = table_schema()
-    expected = {(f.name, str(f.type)) for f in schema if found == str(FORMAT) or f.name not in ADDED}
-    if wrong := sorted({(field.name, str(field.type)) for field in table.schema} ^ expected):
-        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
-        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
     for field in (one for one in schema if one.name in table.column_names):
         if not field.nullable and (missing := table.column(field.name).null_count):
             raise StoreError(
@@ -199,6 +190,21 @@ def read_table(path: Path) -> pa.Table:
             )
     table = _present(table) if found == str(FORMER) else table
     return table.select(schema.names).cast(schema)
+
+
+def check_schema(path: Path, schema: pa.Schema) -> str:
+    """The format of a file.  Raises StoreError, in one line with the remedy, for other formats and for wrong columns."""
+    found = (schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
+    if found not in (str(FORMAT), str(FORMER)):
+        raise StoreError(
+            f"{path}: result rows of format {found}, and this version reads formats {FORMER} and {FORMAT}: read them "
+            "with the version that wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
+        )
+    expected = {(f.name, str(f.type)) for f in table_schema() if found == str(FORMAT) or f.name not in ADDED}
+    if wrong := sorted({(field.name, str(field.type)) for field in schema} ^ expected):
+        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
+        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
+    return found
 
 
 def _present(table: pa.Table) -> pa.Table:

@@ -218,6 +218,13 @@ def bounds(
     return (np.clip(low, 0, 1), np.clip(high, 0, 1)) if probability else (low, high)
 
 
+def spread(count: int) -> float:
+    """Factor from the variance of a bootstrap over ``count`` units to (half the width of a 95% interval) ** 2."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(count - 1, (1 + LEVEL) / 2) ** 2 * count / (count - 1))
+
+
 def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1, draws: int = 1) -> str:
     """What an interval was resampled over, in words, for the caption of a table.
 

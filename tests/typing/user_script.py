@@ -51,6 +51,7 @@ def evaluate(folder: Path) -> pd.DataFrame:
 
 def results(folders: list[str]) -> Table:
     frame: pd.DataFrame = icrl_dist.read_results(folders)
+    print(icrl_dist.report("runs/sweep", figure="3c", common_seeds=True).summary)
     return icrl_dist.compare(frame, frame, names=("one", "other"))
 
 
