@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.console import Console
 
-from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, help_text, monitor, plan, play, streams, train
+from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, help_text, monitor, plan, play, streams, sweep, train
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
@@ -38,6 +38,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "play": (play.PlayArguments, play.play),
     "doctor": (doctor.DoctorArguments, doctor.doctor),
     "plan": (plan.PlanArguments, plan.plan),
+    "sweep": (sweep.SweepArguments, sweep.sweep),
 }
 
 _RENAMED = {"bench": {"--bite": "--drop"}}

@@ -157,8 +157,8 @@ def bootstrap(
 ) -> Float64[np.ndarray, "R K"]:
     """Paired hierarchical bootstrap: K numbers of ``statistic`` for each of ``count`` resamples.
 
-    Resamples training seeds, then tasks, then evaluations with their adversary draws, nested (see ``resamples``).  Every resample
-    has the same indices for all A agents, so differences and ratios of agents are compared in pairs.
+    Resamples training seeds, then tasks, then evaluations with their adversary draws, nested (see ``resamples``).  Every
+    resample has the same indices for all A agents, so differences and ratios of agents are compared in pairs.
     """
     found = []
     for chosen in resamples(rng, scores.shape[1:], count, crossed, fixed_cells):
