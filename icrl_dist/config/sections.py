@@ -16,11 +16,12 @@ Decoder = Literal["auto", "torch", "kernel"]
 Reproducible = Literal["auto", "any-machine", "this-machine"]
 """Where a fit gives the same weights digest: see ``LearnerConfig``."""
 
-Deployment = Literal["paper", "committed"]
+Deployment = Literal["paper", "committed", "growing"]
 """How T_theta is deployed online.
 
-``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition enters
-the context immediately, and T_theta also reads the agent's last actions as an action window (zeta of eq. 6).
+``paper``: Algorithm 1, the context is frozen within an episode.  ``growing``: every transition enters the
+context immediately (Algorithm Distillation).  ``committed``: the same, and T_theta also reads the agent's
+last actions as an action window (zeta of eq. 6).
 """
 
 _NEVER = Remedy("must be from 0 to 1e9; 0 turns the alert off")
@@ -36,7 +37,7 @@ class AdversaryConfig:
     null: bool = True
     """Whether the task without disturbance, phi_0, is among the variations: a task then has K + 1 of them."""
     p_max: Probability = 0.2
-    """Dark Room: an adversary overrides an action with probability p ~ U(0, p_max)."""
+    """Dark Room: an adversary disturbs a step with probability p ~ U(0, p_max)."""
 
     @property
     def variations(self) -> int:
@@ -182,11 +183,11 @@ class EvaluateConfig:
     episodes: Positive = 40
     """Online episodes per task."""
     p: Annotated[tuple[Probability, ...], MinLen(1), Remedy("name at least one override probability")] = (0.0, 0.2)
-    """Override probabilities to test; in continuous problems strengths of the adversary, as multiples of
+    """Probabilities p of a disturbed step to test; in continuous problems strengths of the adversary, as multiples of
     ``control.strength``."""
     prior: Literal["uniform", "unseen"] = "unseen"
     """Distribution of the test adversary's actions: ``uniform``, or drawn from a Dirichlet prior that no
-    training adversary uses (``unseen``)."""
+    training adversary uses (``unseen``).  Winds and permuted controls of Dark Room are drawn alike in both."""
     seeds: Positive = 10
     """Independent evaluations of every task (the paper's 10 random seeds), each under a test adversary of its own; use
     at least 4, because how much a return depends on the adversary is seen in no other way."""
