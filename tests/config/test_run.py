@@ -49,8 +49,9 @@ def test_every_number_has_a_docstring() -> None:
     ]
     assert {"AdversaryConfig", "SACConfig", "AlertsConfig", "DarkRoomConfig", "ControlConfig"} <= {s.__name__ for s in sections}
     for section in (Run, *sections):
-        source = inspect.getsource(section).splitlines()
         for item in dataclasses.fields(section):
+            owner = next(one for one in section.__mro__ if item.name in one.__dict__.get("__annotations__", {}))
+            source = inspect.getsource(owner).splitlines()
             line = next(i for i, text in enumerate(source) if text.startswith(f"    {item.name}: "))
             assert section is Run or source[line + 1].startswith('    """'), f"{section.__name__}.{item.name} has no docstring"
 
