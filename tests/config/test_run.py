@@ -50,7 +50,7 @@ def test_every_number_has_a_docstring() -> None:
     assert {"AdversaryConfig", "SACConfig", "AlertsConfig", "DarkRoomConfig", "ControlConfig"} <= {s.__name__ for s in sections}
     for section in (Run, *sections):
         for item in dataclasses.fields(section):
-            owner = next(one for one in section.__mro__ if item.name in one.__dict__.get("__annotations__", {}))
+            owner = next(one for one in section.__mro__ if item.name in inspect.get_annotations(one))
             source = inspect.getsource(owner).splitlines()
             line = next(i for i, text in enumerate(source) if text.startswith(f"    {item.name}: "))
             assert section is Run or source[line + 1].startswith('    """'), f"{section.__name__}.{item.name} has no docstring"
