@@ -69,4 +69,4 @@ def test_every_transition_joins_the_context_at_once(model, variations):
             assert policy.length == count
         done = count % HORIZON == HORIZON - 1
         policy.observe(state, np.full(3, count % 5), np.full(3, count % 2, np.float32), state, done)
-    assert policy.length == 2 * HORIZON
+    assert policy.length == 2 * HORIZON and policy.frozen(state) is None
