@@ -41,7 +41,8 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
     caption = (
         "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn "
         "with all their tasks where these are their own. The verdict is that of the last episodes: held, if the interval "
-        "lies on the claimed side of 0; not held, if on the other; not shown, if it holds 0. A claim held only if each of its comparisons did. "
+        "lies on the claimed side of 0; not held, if on the other; not shown, if it holds 0. A claim held only if each "
+        "of its comparisons did. "
         "Certified: the same difference of exact worst-case returns"
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")
