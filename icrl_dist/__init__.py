@@ -1,8 +1,9 @@
 """Robust in-context reinforcement learning, distributed.
 
-``train`` trains a run, ``load_run`` reads one to change it, ``evaluate`` evaluates its agent; ``read_results`` reads
-the returns of evaluations, ``compare`` compares trainings, ``report`` makes figures and tables of many, ``read_dataset`` reads the trajectories that a
-run collected.  ``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in; ``oracle`` computes
+``train`` trains a run, ``load_run`` reads one to change it, ``evaluate`` evaluates its agent, ``sweep`` does many runs;
+``read_results`` reads the returns of evaluations, ``compare`` compares trainings, ``report`` makes figures and tables of
+many, ``read_dataset`` reads the trajectories that a run collected.
+``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in; ``oracle`` computes
 exact solutions of Dark Room.  docs/python.md has an example of each.
 """
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from icrl_dist.results.tables import compare
     from icrl_dist.storage.files import StoreError
     from icrl_dist.storage.reading import StoredData, read_dataset
+    from icrl_dist.sweeps.sweep import SweepResult, sweep
     from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
 
 __version__ = "0.2.0"
@@ -44,6 +46,7 @@ __all__ = [
     "Run",
     "StoreError",
     "StoredData",
+    "SweepResult",
     "Task",
     "TrainFailed",
     "TrainInterrupted",
@@ -59,6 +62,7 @@ __all__ = [
     "read_dataset",
     "read_results",
     "report",
+    "sweep",
     "train",
 ]
 
@@ -83,6 +87,8 @@ _MODULES = {
     "StoreError": "icrl_dist.storage.files",
     "StoredData": "icrl_dist.storage.reading",
     "read_dataset": "icrl_dist.storage.reading",
+    "SweepResult": "icrl_dist.sweeps.sweep",
+    "sweep": "icrl_dist.sweeps.sweep",
     "NULL": "icrl_dist.types",
     "Adversary": "icrl_dist.types",
     "Identity": "icrl_dist.types",

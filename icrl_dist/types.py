@@ -176,8 +176,8 @@ class Step(NamedTuple):
     done: bool
     """Whether the horizon was reached: all environments of a batch end together."""
     adversary: Int16[np.ndarray, " B"] | Float32[np.ndarray, "B F"]
-    """The action that the adversary executed instead of the agent's, or -1 where it did not override.  With
-    vector actions the adversary's own action, 0 where there is no adversary."""
+    """The action that the adversary executed instead of the agent's, or the direction of its wind; -1 where it did
+    nothing.  With vector actions the adversary's own action, 0 where there is no adversary."""
     diverged: Bool[np.ndarray, " B"] | None = None
     """Rows whose simulation has broken down in this episode, which must not be used for training.
     None if the environment cannot break down."""

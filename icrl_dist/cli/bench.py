@@ -33,6 +33,7 @@ class BenchArguments:
             "first-action",
             "experts",
             "disturbance",
+            "ceilings",
             "monitor",
         ]
     ]
@@ -47,6 +48,7 @@ class BenchArguments:
     ``first-action``: time from the start of Python to the first action of an agent, by the compiled decoder and
     by torch.  ``experts``: batched updates of many experts, beside stable-baselines3.
     ``disturbance``: the return that an undisturbed expert loses under each default adversary.
+    ``ceilings``: returns of exact agents in Dark Room, by disturbance and strength.
     ``monitor``: cost of the monitor for a run, and of a view that follows a thousand streams."""
     problem: str | None = None
     """Problem to measure, such as ``dmc-cheetah-run`` (default for env: ``darkroom``; for disturbance:
@@ -55,8 +57,8 @@ class BenchArguments:
     """Duration of the measurement (env, stream, ingest, scale and soak)."""
     quick: bool = False
     """Measure less: one seed instead of three (incontext), 10 rounds instead of 40 (fit), 3 repetitions instead of 15
-    (experts), briefly trained experts and 3 episodes instead of 10 (disturbance), 2 pairs of short intervals instead of
-    8 (monitor)."""
+    (experts), briefly trained experts and 3 episodes instead of 10 (disturbance), one split of the goals instead of 4
+    (ceilings), 2 pairs of short intervals instead of 8 (monitor)."""
     decisions: bool = False
     """incontext: compare only the compiled decoder with torch's, in about two minutes, and train nothing."""
     drop: float | None = None
@@ -78,6 +80,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
     """Run one benchmark and print its result.  Returns the exit code."""
     from icrl_dist.bench import (
         broadcast,
+        ceilings,
         disturbance,
         drop,
         env,
@@ -97,6 +100,7 @@ def bench(arguments: BenchArguments, console: Console) -> int:
 
     if arguments.seconds is not None and arguments.name in (
         "broadcast",
+        "ceilings",
         "disturbance",
         "experts",
         "fit",
@@ -166,6 +170,10 @@ def bench(arguments: BenchArguments, console: Console) -> int:
                 text = disturbance.describe(result := disturbance.run(arguments.problem, arguments.quick, say))
             else:
                 text = drop.describe(result := drop.run(arguments.drop, arguments.problem, arguments.steps, say))
+        case "ceilings":
+            with console.status("ceilings") as status:
+                result = ceilings.run(arguments.quick, lambda part: status.update(f"ceilings: {part}"))
+            text = ceilings.describe(result)
         case "monitor":
             with console.status("monitor"):
                 result = monitor.run(arguments.folder, *((2, 2.0) if arguments.quick else ()))

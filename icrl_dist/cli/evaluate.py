@@ -40,7 +40,7 @@ class EvaluateArguments:
     """Evaluations per task.  Default: the run's number (posterior: 4).  Each evaluation of a task has a test
     adversary of its own."""
     p: tuple[float, ...] = ()
-    """Override probabilities to test.  Default: the run's (posterior: 0 0.2 0.4 0.6; attack: those above 0)."""
+    """Probabilities p of a disturbed step to test.  Default: the run's (posterior: 0 0.2 0.4 0.6; attack: those above 0)."""
     prior: Literal["uniform", "unseen"] | None = None
     """Distribution of the test adversaries.  Default: the run's (posterior: uniform)."""
     draws: int = 8

@@ -29,6 +29,7 @@ from icrl_dist.cli import (
     play,
     report,
     streams,
+    sweep,
     train,
 )
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
@@ -53,6 +54,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "play": (play.PlayArguments, play.play),
     "doctor": (doctor.DoctorArguments, doctor.doctor),
     "plan": (plan.PlanArguments, plan.plan),
+    "sweep": (sweep.SweepArguments, sweep.sweep),
 }
 
 _RENAMED = {"bench": {"--bite": "--drop"}}

@@ -36,7 +36,7 @@ class AdversaryConfig:
     null: bool = True
     """Whether the task without disturbance, phi_0, is among the variations: a task then has K + 1 of them."""
     p_max: Probability = 0.2
-    """Dark Room: an adversary overrides an action with probability p ~ U(0, p_max)."""
+    """Dark Room: an adversary disturbs a step with probability p ~ U(0, p_max)."""
 
     @property
     def variations(self) -> int:
@@ -182,11 +182,11 @@ class EvaluateConfig:
     episodes: Positive = 40
     """Online episodes per task."""
     p: Annotated[tuple[Probability, ...], MinLen(1), Remedy("name at least one override probability")] = (0.0, 0.2)
-    """Override probabilities to test; in continuous problems strengths of the adversary, as multiples of
+    """Probabilities p of a disturbed step to test; in continuous problems strengths of the adversary, as multiples of
     ``control.strength``."""
     prior: Literal["uniform", "unseen"] = "unseen"
     """Distribution of the test adversary's actions: ``uniform``, or drawn from a Dirichlet prior that no
-    training adversary uses (``unseen``)."""
+    training adversary uses (``unseen``).  Winds and permuted controls of Dark Room are drawn alike in both."""
     seeds: Positive = 10
     """Independent evaluations of every task (the paper's 10 random seeds), each under a test adversary of its own; use
     at least 4, because how much a return depends on the adversary is seen in no other way."""

@@ -72,12 +72,12 @@ def _episode(episode: dict[str, Any]) -> list[Line]:
         return [[*title, ("; only the page (--web) draws it", DIM)]]
     rows = room(drawing["size"], drawing["goal"], drawing["path"], drawing["overridden"])
     overridden = sum(drawing["overridden"])
-    text = f"number: step at which a cell was first entered; {overridden} of {len(drawing['overridden'])} actions overridden"
+    text = f"number: step at which a cell was first entered; {overridden} of {len(drawing['overridden'])} steps disturbed"
     legend: Line = [
         (" ", PLAIN),
         ("0 start", _MARKS["start"]),
         ("  G or its step: goal", _MARKS["goal"]),
-        ("  red: overridden by the adversary", _MARKS["moved"]),
+        ("  red: disturbed by the adversary", _MARKS["moved"]),
     ]
     drawn: list[Line] = [[("   ", PLAIN), *((cell(text, 4, right=True), _MARKS[mark]) for text, mark in row)] for row in rows]
     return [title, [(f" {text}", DIM)], *drawn, legend]

@@ -66,5 +66,8 @@ class Benchmarks:
     """The library's own environment of a variation's task, for ``bench env``; None for a problem without a library."""
     experts: DisturbanceExperts | None = None
     """Experts and disturbances of ``bench disturbance``."""
+    kept: Callable[[str, int, int, float], float] | None = None
+    """``kept(disturbance, size, horizon, p)``, for ``bench ceilings``: the share of the optimal return that the optimal policy
+    of the undisturbed task keeps."""
     pretraining: Callable[[int, int, int, int], PretrainingData] | None = None
     """``pretraining(seed, size, length, goals)``: data of ``bench incontext``, with contexts of ``length`` transitions."""

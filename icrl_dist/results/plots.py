@@ -64,7 +64,7 @@ def adaptation(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Pat
 
 
 def _disturbed(rows: Sequence[Mapping[str, Any]]) -> str:
-    return "adversary's strength" if rows[0]["optimum"] is None else "actions overridden with p"
+    return "adversary's strength" if rows[0]["optimum"] is None else "steps disturbed with p"
 
 
 def agreement(report: Mapping[str, Any], path: Path, title: str) -> Path:

@@ -108,7 +108,8 @@ COLUMNS = {
     "action": "number of the agent's action; of a vector in [-1, 1] the components `action.I`",
     "reward": "reward of the step",
     "next_observation.I": "component I of the observation after the step",
-    "adversary_action": "number of the action that the adversary executed instead, -1 where it did not override; "
+    "adversary_action": "number of the action that the adversary executed instead, or of the direction of its wind (0 to 3: "
+    "+x, -x, +y, -y); -1 where it did nothing; "
     "of a vector the components `adversary_action.I`",
     "policy_version": "version of the weights that chose the actions; -1 for a policy without weights",
     "weights_digest": "SHA-256 of these weights; empty for a policy without weights",

@@ -177,7 +177,7 @@ def test_sorting_filters_and_the_dialog_of_a_variation(page):
         dialog.get_by_text("uniform: p 0.25").wait_for()
         dialog.get_by_role("button", name="Copy: icrl-dist explain runs/a-run adapt/0/1/1/1").wait_for()
         expect(page, dialog.get_by_role("cell", name="abababababab")).to_have_count(2)
-        expected = "1/1: Dark Room, 3 by 3: goal reached after 2 steps, 1 of 2 actions overridden; return 5"
+        expected = "1/1: Dark Room, 3 by 3: goal reached after 2 steps, 1 of 2 steps disturbed; return 5"
         dialog.get_by_role("img", name=expected).wait_for()
         page.keyboard.press("Escape")
         dialog.wait_for(state="hidden")

@@ -233,7 +233,7 @@ def test_unequal_budgets_and_missing_methods_are_shown_only_on_demand(tmp_path):
     path = write(tmp_path, small(tmp_path, agents=agents, columns={"icag": {"optimizer_steps": 9}}), offline=False)
     with pytest.raises(ConfigError, match="these runs make them: room/prompt_dt, seeds 0 to 5; room/mix_dpt"):
         report(path, figure="2", out=tmp_path)
-    with pytest.raises(ConfigError, match="optimizer_steps is 9 of room/icag .* and 300 of room/dpt"):
+    with pytest.raises(ConfigError, match=r"optimizer_steps is 9 of room/icag .* and 300 of room/dpt"):
         report(path, figure="2", out=tmp_path, partial=True)
     text = str(report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=True))
     assert (
@@ -312,7 +312,7 @@ def test_deployment_rules_are_shown_beside_each_other(tmp_path):
 
     paper = small(tmp_path, agents=agents, mean=mean)
     own = small(
-        tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns=dict.fromkeys(agents, {"deployment": "committed"})
+        tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns={name: {"deployment": "committed"} for name in agents}
     )
     rows = Rows([write(tmp_path, paper, own, offline=False)])
     panels = catalog.numbers("deployment", rows, None, Rules())

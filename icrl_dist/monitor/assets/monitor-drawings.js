@@ -25,7 +25,7 @@ export function description(drawing) {
     const reached = drawing.path.findIndex(([x, y]) => x === drawing.goal[0] && y === drawing.goal[1]);
     const overridden = drawing.overridden.filter(Boolean).length;
     const found = reached < 0 ? "goal never reached" : `goal reached after ${number(reached)} steps`;
-    return `Dark Room, ${drawing.size} by ${drawing.size}: ${found}, ${overridden} of ${drawing.overridden.length} actions overridden`;
+    return `Dark Room, ${drawing.size} by ${drawing.size}: ${found}, ${overridden} of ${drawing.overridden.length} steps disturbed`;
   }
   if (drawing.kind === "sticks") {
     const force = drawing.force.length ? drawing.force.reduce((sum, each) => sum + each, 0) / drawing.force.length : 0;

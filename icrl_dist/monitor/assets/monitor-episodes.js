@@ -10,7 +10,7 @@ const STILL_S = 3; // time for which a drawing is shown if the user prefers redu
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
 const KEYS = {
-  room: "Square: the goal. Orange with a cross: actions overridden by the adversary.",
+  room: "Square: the goal. Orange with a cross: steps that the adversary disturbed.",
   sticks: "Bar: the adversary's force, relative to its maximum. Marks on the ground: meters.",
   arm: "From the side. Green square: the goal; orange: the object. Only the hand is observed: the arm's angles are assumed.",
   paths: "From above. Square: the goal; line: hand; dashes: object.",

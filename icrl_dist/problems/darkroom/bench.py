@@ -9,22 +9,49 @@ from jaxtyping import Float32, Float64, Int
 
 from icrl_dist.problems.benchmarks import Benchmarks
 from icrl_dist.problems.darkroom import room
-from icrl_dist.problems.darkroom.adversaries import sample_dirichlet
+from icrl_dist.problems.darkroom.adversaries import SYMMETRIES, sample_dirichlet
 from icrl_dist.problems.darkroom.room import cells, next_cell
-from icrl_dist.problems.darkroom.solver import Hypotheses, heuristic_labels, log_likelihood, posterior, posterior_action
+from icrl_dist.problems.darkroom.solver import (
+    Hypotheses,
+    expected_returns,
+    heuristic_labels,
+    log_likelihood,
+    optimal_returns,
+    posterior,
+    posterior_action,
+    soft_labels,
+)
 from icrl_dist.training.batches import TrainingBatch
-from icrl_dist.types import NULL, Variation
+from icrl_dist.types import NULL, Adversary, Variation
 
 
 def benchmarks() -> Benchmarks:
     """The parts of benchmarks of this problem."""
-    return Benchmarks(_rows, 1024, pretraining=DPTData)
+    return Benchmarks(_rows, 1024, kept=kept, pretraining=DPTData)
 
 
 def _rows(rng: np.random.Generator, batch: int) -> list[Variation]:
     """A 10x10 room with a random goal and a separate Dirichlet adversary (p > 0) in every row."""
     goals = rng.integers(0, 10, size=(batch, 2)).tolist()
     return [Variation(room.task(goal), sample_dirichlet(rng, room.ACTIONS, 0.2)) for goal in goals]
+
+
+def kept(disturbance: str, size: int, horizon: int, p: float) -> float:
+    """Share of the optimum that the undisturbed optimal policy keeps, in the mean over all goals, from the origin.
+
+    Ties between its actions are broken at random.  The adversaries are the uniform override, every direction of the
+    wind, or every symmetry of the square.
+    """
+    adversaries = {
+        "override": [Adversary.of("uniform", p=p)],
+        "wind": [Adversary.of("wind", p=p, direction=direction) for direction in range(4)],
+        "permuted": [Adversary.of("permuted", p=p, permutation=one) for one in SYMMETRIES],
+    }[disturbance]
+    goals = [room.task(divmod(cell, size), size, horizon, (0, 0)) for cell in range(size**2)]
+    policy = soft_labels(Hypotheses.of([Variation(goal) for goal in goals]), 0.99, 1e-9)
+    disturbed = [[Variation(goal, adversary) for goal in goals] for adversary in adversaries]
+    earned = sum(expected_returns(policy, variations).sum() for variations in disturbed)
+    return float(earned / sum(optimal_returns(Hypotheses.of(variations)).sum() for variations in disturbed))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, Lt
 
 from icrl_dist.config.ranges import NotNegativeFloat, Seed
+from icrl_dist.problems.darkroom.adversaries import Disturbance
 from icrl_dist.stream.schema import Remedy
 
 
@@ -27,6 +28,10 @@ class DarkRoomConfig:
     """Discount of the optimal action values that labels are computed from."""
     label_slack: NotNegativeFloat = 0.1
     """A label is uniform over the actions whose value is at most this much below the best value."""
+    disturbance: Disturbance = "override"
+    """What the adversaries of training and test do, each with its own probability p: ``override``: execute an action of
+    their own (appendix C.1); ``wind``: displace the agent by one cell after its move, always in the same direction;
+    ``permuted``: execute another action for each of the agent's, by one rotation or mirror image of the four moves."""
     labels: Literal["soft", "sampled", "heuristic"] = "soft"
     """``soft``: the distribution that label_slack describes; ``sampled``: one action drawn from it (eq. 1);
     ``heuristic``: the paper's "y first, then x" rule, which is optimal only without disturbance."""

@@ -18,10 +18,11 @@ from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Batch, MakePolicy
 from icrl_dist.problems import registry
+from icrl_dist.problems.darkroom.adversaries import grid
 from icrl_dist.problems.darkroom.behavior_policies import Walks
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.labels import labels_of
-from icrl_dist.problems.darkroom.room import DarkRoom, cells
+from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom, cells
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, log_likelihood, posterior, posterior_action
 from icrl_dist.rollout.episode import deploy_online, episode
 from icrl_dist.types import NULL, Variation
@@ -42,6 +43,8 @@ CONTEXTS, EPISODES = 160, 2
 """Contexts of each kind and p, and episodes per context."""
 _ADVERSARIES = 16
 """Approximate number of adversaries of the second prior: a multiple of the variations per goal that is not smaller."""
+_LEVELS = 4
+"""Strengths of the winds, or of the permuted controls, of the second prior."""
 _CHUNK = 32
 """Contexts per call of the model."""
 
@@ -87,12 +90,21 @@ def levels(run: Run) -> tuple[float, ...]:
 
 
 def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
-    """The equally likely variations of each of ``PRIORS``: those of training goals; for held-out contexts of all goals."""
+    """The equally likely variations of each of ``PRIORS``: those of training goals; for held-out contexts of all goals.
+
+    In the second, winds and permuted controls are a grid: a few random ones may lack the direction of a context, whose
+    probability would then be 0 under every variation.
+    """
     groups = training_variations(run, False) + (training_variations(run, True) if heldout else [])
     rng = generator(run.seed, RandomKey.POSTERIOR_SUITE)
     trained = [v.adversary for v in groups[0]]
     sets = range(-(-_ADVERSARIES // len(trained))) if trained != [NULL] else ()
     several = [a for _ in sets for a in registry.adversaries(run, rng)] or trained
+    kind = registry.of(run).config.disturbance
+    if kind != "override" and sets:
+        others = grid(kind, ACTIONS, run.adversary.p_max, _LEVELS)
+        share = trained.count(NULL) / len(trained)  # phi_0 keeps its share
+        several = [*[NULL] * round(len(others) * share / (1 - share)), *others]
     own = [v for group in groups for v in group]
     return Hypotheses.of(own), Hypotheses.of([Variation(group[0].task, a) for group in groups for a in several])
 

@@ -57,7 +57,10 @@ class ExactAgent(DiscretePolicy):
         ``labels``: the optimal policies of each family, from ``soft_labels``.
         """
         self._size, self._rule, self._family = families[0].size, rule, family.copy()
-        stacked = (np.stack([getattr(h, name) for h in families])[family] for name in ("goal", "p", "q"))
+        names = ["goal", "p", "q"]
+        if any(h.moves is not None for h in families):
+            families, names = [h.as_moves() for h in families], [*names, "moves"]
+        stacked = (np.stack([getattr(h, name) for h in families])[family] for name in names)
         self._h = Hypotheses(self._size, families[0].horizon, *stacked)
         self._by_hypothesis = np.stack(labels).astype(np.float64)
         self._log_prior = np.full(self._h.p.shape[1], -np.log(self._h.p.shape[1]))

@@ -1,4 +1,4 @@
-"""Dark Room as a ``Problem``: exact labels, exact agents, override adversaries."""
+"""Dark Room as a ``Problem``: exact labels, exact agents, and adversaries of three families."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ from icrl_dist.interfaces import (
     Reference,
 )
 from icrl_dist.problems.darkroom import picture, room
-from icrl_dist.problems.darkroom.adversaries import adversary_set, sample_dirichlet
+from icrl_dist.problems.darkroom.adversaries import adversary_set, sample
 from icrl_dist.problems.darkroom.behavior_policies import KINDS, Walks
 from icrl_dist.problems.darkroom.certificate import RoomCertificate
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.labels import RoomLabeller, RoomLabelling
+from icrl_dist.problems.darkroom.prior_agents import Prior, PriorAgent, PriorRule, dpt_prior, icag_prior, prior_agents
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import Adversary, Job, Spec, Split, Task, Variation
@@ -51,6 +52,7 @@ class ExactRoom:
     def __init__(self, config: DarkRoomConfig) -> None:
         self._config = config
         self._by_adversary: dict[Adversary, tuple[Hypotheses, Float32[np.ndarray, "M C A"]]] = {}
+        self._priors: dict[AdversaryConfig | None, Prior] = {}
 
     def optimum(self, variations: Sequence[Variation]) -> Float64[np.ndarray, " M"]:
         """Expected return of the optimal policy from the origin, by value iteration."""
@@ -76,14 +78,25 @@ class ExactRoom:
 
         return make
 
+    def prior_agent(self, adversary: AdversaryConfig | None, rule: PriorRule) -> MakePolicy:
+        """The exact agent with ICAG's prior, given the adversaries of training; None: with DPT's prior."""
+
+        def make(rows: Sequence[Variation], env: Batch) -> PriorAgent:
+            if adversary not in self._priors:
+                found = dpt_prior(self._config) if adversary is None else icag_prior(self._config, adversary)
+                self._priors[adversary] = found
+            return PriorAgent(self._priors[adversary], len(rows), rule)
+
+        return make
+
     def _any_goal(self, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
-        """One hypothesis per goal under this adversary, with their labels; cached for the latest 64 adversaries."""
+        """One hypothesis per goal under this adversary, with their labels; cached for the latest 256 adversaries."""
         if adversary not in self._by_adversary:
             size, horizon = self._config.size, self._config.horizon
             goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
             hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
             self._by_adversary[adversary] = hypotheses, soft_labels(hypotheses, self._config.gamma, self._config.label_slack)
-            if len(self._by_adversary) > 64:
+            if len(self._by_adversary) > 256:
                 del self._by_adversary[next(iter(self._by_adversary))]
         return self._by_adversary[adversary]
 
@@ -94,7 +107,9 @@ class DarkRoomProblem(Problem):
     section = "darkroom"
     Config = DarkRoomConfig
     Labelling = RoomLabelling
-    agent_names: ClassVar[Mapping[str, str]] = {KEYS[rule]: name for rule, name in RULES.items()}
+    agent_names: ClassVar[Mapping[str, str]] = {KEYS[rule]: name for rule, name in RULES.items()} | {
+        key: name for key, name, _, _ in prior_agents()
+    }
     earns_in_contexts: ClassVar[bool] = False  # a random walk may miss the goal in every episode
     config: DarkRoomConfig
 
@@ -133,13 +148,16 @@ class DarkRoomProblem(Problem):
         return task.replace(start=(0, 0))
 
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
-        return adversary_set(rng, config.count, room.ACTIONS, config.p_max)
+        return adversary_set(rng, config.count, room.ACTIONS, config.p_max, self.config.disturbance)
 
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
-        """``uniform``: q_b = 1/5 (Figures 3c, 6c); ``unseen``: a newly drawn Dirichlet adversary (Figures 3d, 6d)."""
-        if prior == "uniform":
+        """``uniform``: q_b = 1/5 (Figures 3c, 6c); ``unseen``: a newly drawn Dirichlet adversary (Figures 3d, 6d).
+
+        The priors are the same for winds and permuted controls: any direction, or any permutation, equally likely.
+        """
+        if self.config.disturbance == "override" and prior == "uniform":
             return Adversary.of("uniform", p=strength)
-        return sample_dirichlet(rng, room.ACTIONS, 1.0).replace(p=strength)
+        return sample(rng, self.config.disturbance, room.ACTIONS, 1.0).replace(p=strength)
 
     def labelling(self, run: Run) -> RoomLabelling:
         of, windows = self.config, run.pretrain.windows
@@ -160,7 +178,10 @@ class DarkRoomProblem(Problem):
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
 
     def references(self, run: Run) -> dict[str, Reference]:
-        """A random policy, the exact agent of each rule, and the oracle, which is given goal and adversary."""
+        """A random policy, exact agents, and the oracle, which is given goal and adversary.
+
+        The exact agent of each rule is given the adversary; the agents of ``prior_agents`` are given a prior.
+        """
 
         def random(rows: Sequence[Variation], env: Batch) -> Policy:
             return RandomPolicy(room.ACTIONS)
@@ -170,7 +191,11 @@ class DarkRoomProblem(Problem):
             return OptimalAgent(soft_labels(hypotheses, self.config.gamma, slack=0.0), hypotheses.size)
 
         exact = {KEYS[rule]: Reference(self.exact.agent(run, rule)) for rule in RULES}
-        return {"random": Reference(random), **exact, ORACLE: Reference(optimal, ceiling=True)}
+        priors = {
+            key: Reference(self.exact.prior_agent(None if prior == "dpt" else run.adversary, rule))
+            for key, _, prior, rule in prior_agents()
+        }
+        return {"random": Reference(random), **exact, **priors, ORACLE: Reference(optimal, ceiling=True)}
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         of = self.config

@@ -14,8 +14,8 @@ from jaxtyping import Float, Float64, Int, UInt8
 from icrl_dist.arrays import short
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.problems.checks import check_generators, check_parameters
-from icrl_dist.problems.darkroom.adversaries import override_distribution
-from icrl_dist.types import Spec, Step, Task, Variation
+from icrl_dist.problems.darkroom.adversaries import DIRECTIONS, disturbed_moves, is_override, override_distribution
+from icrl_dist.types import Adversary, Spec, Step, Task, Variation
 
 MOVES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
 """The five actions: +x, -x, +y, -y, stay."""
@@ -68,6 +68,16 @@ def next_cell(size: int) -> Int[np.ndarray, "C A"]:
     return table
 
 
+def next_move(size: int) -> Int[np.ndarray, "C X"]:
+    """Number of the cell that each move leads to from each cell.
+
+    Move a, below ``ACTIONS``, is action a alone.  Move ``ACTIONS + 4 * a + d`` is action a and then a wind in direction
+    d, a displacement as by action d.  Walls stop each of the two.
+    """
+    alone = next_cell(size)
+    return np.concatenate([alone, alone[alone][:, :, :DIRECTIONS].reshape(len(alone), -1)], axis=1)
+
+
 class DarkRoom(CopiedWhole):
     """B variation environments of one size and horizon, stepped as one batch."""
 
@@ -83,14 +93,17 @@ class DarkRoom(CopiedWhole):
         self.batch = len(tasks)
         self._h = self.spec.horizon
         self._cells = cells(size)
-        self._next = next_cell(size).ravel()
+        self._next = next_move(size).ravel()
+        self._moves = ACTIONS * (1 + DIRECTIONS)
         self._goal = np.array([int(g[0]) * size + int(g[1]) for g in (t.vector("goal") for t in tasks)])
         starts = [t.get("start", "random") for t in tasks]
         self._start = np.array([-1 if isinstance(s, (str, int, float)) else int(s[0]) * size + int(s[1]) for s in starts])
-        overrides = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
-        self._p = np.array([overrides[v.adversary][0] for v in variations])
-        # One uniform number u per step: if u < p the adversary overrides, and u / p selects its action.
-        self._edges = np.stack([overrides[v.adversary][0] * np.cumsum(overrides[v.adversary][1])[:-1] for v in variations])
+        adversaries = [v.adversary for v in variations]
+        each = {a: _disturbance(a) for a in set(adversaries)}
+        self._p = np.array([each[a][0] for a in adversaries])
+        self._edges = np.stack([each[a][1] for a in adversaries])
+        self._disturbed = np.stack([each[a][2] for a in adversaries])
+        self._override = np.array([is_override(a) for a in adversaries])
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> Float[np.ndarray, "B S"]:
         """Start an episode in every row; all random numbers of the episode are drawn here, row by row."""
@@ -114,15 +127,19 @@ class DarkRoom(CopiedWhole):
         drawn = np.zeros(self.batch, dtype=np.int64)
         for edge in self._edges.T:
             drawn += u >= edge
-        overridden = u < self._p
-        executed = np.where(overridden, drawn, actions)
-        self._cell = self._next[self._cell * ACTIONS + executed]
+        reported = drawn
+        if not self._override.all():
+            drawn = np.where(self._override, drawn, self._disturbed[np.arange(self.batch), actions])
+            reported = np.where(drawn < ACTIONS, drawn, (drawn - ACTIONS) % DIRECTIONS)
+        disturbed = u < self._p
+        executed = np.where(disturbed, drawn, actions)
+        self._cell = self._next[self._cell * self._moves + executed]
         self._h += 1
         return Step(
             observation=self._cells[self._cell],
             reward=(self._cell == self._goal).astype(np.float32),
             done=self._h == self.spec.horizon,
-            adversary=np.where(overridden, drawn, -1).astype(np.int16),
+            adversary=np.where(disturbed, reported, -1).astype(np.int16),
         )
 
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -133,3 +150,16 @@ class DarkRoom(CopiedWhole):
             x, y = divmod(int(cell), size)
             room[size - 1 - y, x] = color
         return room.repeat(24, axis=0).repeat(24, axis=1)
+
+
+def _disturbance(adversary: Adversary) -> tuple[float, Float64[np.ndarray, " E"], Int[np.ndarray, " A"]]:
+    """p, the edges and the moves of an adversary.
+
+    One uniform number u decides a step: if u < p the adversary acts.  The number of edges at most u is the action that
+    an override executes; another disturbance makes the move that belongs to the agent's action.
+    """
+    if is_override(adversary):
+        p, q = override_distribution(adversary, ACTIONS)
+        return p, p * np.cumsum(q)[:-1], np.zeros(ACTIONS, np.int64)
+    p, moves = disturbed_moves(adversary, ACTIONS)
+    return p, np.ones(ACTIONS - 1), moves

@@ -1,7 +1,8 @@
 """Exact solutions of Dark Room: optimal values, labels, the posterior over (tau, phi).
 
-A variation is a finite MDP with P = (1 - p) P_a + p sum_b q_b P_b, so value iteration is
-exact and takes milliseconds.  All functions compute M hypotheses (goal, p, q) at once.
+A variation is a finite MDP with P = (1 - p) P_a + p sum_b q_b P_b under an override, and P = sum_x P(x | a) P_x
+over moves x under any adversary, so value iteration is exact and takes milliseconds.  All functions compute M
+hypotheses (goal and adversary) at once.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
-from icrl_dist.problems.darkroom.adversaries import override_distribution
-from icrl_dist.problems.darkroom.room import ACTIONS, MOVES, cells, check, next_cell
+from icrl_dist.problems.darkroom.adversaries import is_override, move_distribution, override_distribution
+from icrl_dist.problems.darkroom.room import ACTIONS, MOVES, cells, check, next_cell, next_move
 from icrl_dist.types import NULL, Trajectory, Variation
 
 
@@ -30,6 +31,9 @@ class Hypotheses:
     """Cell number of the goal."""
     p: Float64[np.ndarray, "*B M"]
     q: Float64[np.ndarray, "*B M A"]
+    """p and q of an override: with probability p the executed action is drawn from q."""
+    moves: Float64[np.ndarray, "*B M A X"] | None = None
+    """P(move | action) if an adversary is no override, as in ``room.next_move``; p and q are then not used."""
 
     @classmethod
     def of(cls, variations: Sequence[Variation]) -> Hypotheses:
@@ -40,10 +44,30 @@ class Hypotheses:
         if len(shapes) != 1:
             raise ValueError(f"hypotheses must share one size and horizon, not {sorted(shapes)}")
         (size, horizon) = shapes.pop()
-        by_adversary = {a: override_distribution(a, ACTIONS) for a in {v.adversary for v in variations}}
-        overrides = [by_adversary[v.adversary] for v in variations]
         goal = np.array([int(g[0]) * size + int(g[1]) for g in (v.task.vector("goal") for v in variations)])
-        return cls(size, horizon, goal, np.array([p for p, _ in overrides]), np.stack([q for _, q in overrides]))
+        adversaries = {v.adversary for v in variations}
+        if all(map(is_override, adversaries)):
+            by_adversary = {a: override_distribution(a, ACTIONS) for a in adversaries}
+            overrides = [by_adversary[v.adversary] for v in variations]
+            return cls(size, horizon, goal, np.array([p for p, _ in overrides]), np.stack([q for _, q in overrides]))
+        distributions = {a: move_distribution(a, ACTIONS) for a in adversaries}
+        return cls.of_moves(size, horizon, goal, np.stack([distributions[v.adversary] for v in variations]))
+
+    @classmethod
+    def of_moves(
+        cls, size: int, horizon: int, goal: Int[np.ndarray, "*B M"], moves: Float64[np.ndarray, "*B M A X"]
+    ) -> Hypotheses:
+        """Hypotheses with any disturbance; p and q are not numbers."""
+        return cls(size, horizon, goal, np.full(goal.shape, np.nan), np.full((*goal.shape, ACTIONS), np.nan), moves)
+
+    def as_moves(self) -> Hypotheses:
+        """The same hypotheses with ``moves``."""
+        if self.moves is not None:
+            return self
+        moves = np.zeros((*self.p.shape, ACTIONS, next_move(2).shape[1]))
+        moves[..., :ACTIONS] = self.p[..., None, None] * self.q[..., None, :]
+        moves[..., range(ACTIONS), range(ACTIONS)] += 1.0 - self.p[..., None]
+        return Hypotheses.of_moves(self.size, self.horizon, self.goal, moves)
 
     def rewards(self) -> Float64[np.ndarray, "M C"]:
         """Reward for entering each cell."""
@@ -51,7 +75,11 @@ class Hypotheses:
 
 
 def _backup(h: Hypotheses, value: Float64[np.ndarray, "M C"], gamma: float) -> Float64[np.ndarray, "M C A"]:
-    """Q(s, a) = (1 - p) U(s_a) + p sum_b q_b U(s_b), with U(s') = R(s') + gamma V(s')."""
+    """Q(s, a) = sum_x P(x | a) U(s_x), with U(s') = R(s') + gamma V(s'); of an override (1 - p) U(s_a) + p sum_b q_b U(s_b)."""
+    if h.moves is not None:
+        used = h.moves.any(axis=(0, 1))
+        there = (h.rewards() + gamma * value)[:, next_move(h.size)[:, used]]
+        return there @ h.moves[:, :, used].transpose(0, 2, 1)
     arrived = (h.rewards() + gamma * value)[:, next_cell(h.size)]
     overridden = np.einsum("mca,ma->mc", arrived, h.q)
     result: np.ndarray = (1 - h.p)[:, None, None] * arrived + (h.p[:, None] * overridden)[:, :, None]
@@ -109,7 +137,8 @@ def worst_case(policy: Float[np.ndarray, "C A"] | None, variation: Variation, p:
 
     Under Algorithm 1 the context is frozen within an episode, so T_theta(. | s, D) is such a policy: the value is
     a lower bound of the expected return of one episode with this context D, for all adversaries of strength p.
-    It says nothing about how an adversary that acts while the context is collected changes D.
+    It says nothing about how an adversary that acts while the context is collected changes D, and nothing about winds
+    and permuted controls, which no override of the same strength can imitate.
 
     ``policy``: pi(a | s) by cell number (x * size + y) and action, as ``InContextAgent.law`` gives it; None: the
     policy that maximizes V against this adversary (the minimax oracle).  The adversary of the variation is not used.
@@ -140,9 +169,7 @@ def expected_returns(policies: Float[np.ndarray, "P C A"], variations: Sequence[
 
     ``policies``: as of ``worst_cases``, and so are the errors.
     """
-    h = Hypotheses.of(variations)
-    p = h.p[:, None]
-    return _from_start(policies, h, variations, lambda own, q: (1 - p) * own + p * np.einsum("bca,ba->bc", q, h.q))
+    return _from_start(policies, Hypotheses.of(variations), variations, lambda own, q: own)
 
 
 def _from_start(
@@ -151,7 +178,7 @@ def _from_start(
     variations: Sequence[Variation],
     value_of: Callable[[Float64[np.ndarray, "B C"], Float64[np.ndarray, "B C A"]], Float64[np.ndarray, "B C"]],
 ) -> Float64[np.ndarray, " B"]:
-    """V_0 at the start of each variation, by backward recursion.
+    """V_0 at the start of each variation, by backward recursion under the adversaries of ``h``.
 
     ``value_of``: from the value of the agent's own choice and Q_h of every action to V_h.  Without policies the agent's
     own choice is the best one.
@@ -164,9 +191,9 @@ def _from_start(
         if not (policies >= 0).all() or not np.allclose(policies.sum(axis=2), 1, atol=1e-3):  # NaN fails the first comparison
             raise ValueError("policy: the rows must be distributions over actions, with no negative number and the sum 1")
         policies = policies / policies.sum(axis=2, keepdims=True)
-    value, rewards, leads_to = np.zeros((len(variations), h.size**2)), h.rewards(), next_cell(h.size)
+    value = np.zeros((len(variations), h.size**2))
     for _ in range(h.horizon):
-        q = (rewards + value)[:, leads_to]
+        q = _backup(h, value, 1.0)
         value = value_of(q.max(axis=2) if policies is None else (policies * q).sum(axis=2), q)
     starts = [variation.task.get("start", "random") for variation in variations]
     anywhere = [isinstance(start, (str, int, float)) for start in starts]
@@ -194,12 +221,22 @@ def log_likelihood(
     because it is the same under every hypothesis (Assumption E.1).  Every transition may have its
     own hypotheses, ``h.p (T, M)``.
     """
-    reached = next_cell(h.size)[cell] == arrived[:, None]
-    overridden = (h.q @ reached[:, :, None].astype(np.float64))[..., 0]
-    probability = (1 - h.p) * reached[np.arange(len(cell)), action][:, None] + h.p * overridden
     consistent = (arrived[:, None] == h.goal) == (reward[:, None] > 0.5)
     with np.errstate(divide="ignore"):
-        result: np.ndarray = np.log(probability * consistent)
+        result: np.ndarray = np.log(_arrival_probability(h, cell, action, arrived) * consistent)
+    return result
+
+
+def _arrival_probability(
+    h: Hypotheses, cell: Int[np.ndarray, " T"], action: Int[np.ndarray, " T"], arrived: Int[np.ndarray, " T"]
+) -> Float64[np.ndarray, "T M"]:
+    if h.moves is not None:
+        leads = (next_move(h.size)[cell] == arrived[:, None]).astype(np.float64)
+        chosen = h.moves[np.arange(len(cell)), :, action] if h.moves.ndim == 4 else h.moves[:, action].transpose(1, 0, 2)
+        return (chosen @ leads[:, :, None])[..., 0]
+    reached = next_cell(h.size)[cell] == arrived[:, None]
+    overridden = (h.q @ reached[:, :, None].astype(np.float64))[..., 0]
+    result: np.ndarray = (1 - h.p) * reached[np.arange(len(cell)), action][:, None] + h.p * overridden
     return result
 
 

@@ -280,7 +280,7 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
     try:
         former = rows.check_schema(path, pa.parquet.read_schema(path)) != str(FORMAT)
         wanted = pa.dataset.field("suite").isin(SUITES) & pa.dataset.field("p").is_valid()
-        data = pa.dataset.dataset(rows.table_of(path)) if former else pa.dataset.dataset(path, format="parquet")
+        data = pa.dataset.dataset(rows.read_table(path)) if former else pa.dataset.dataset(path, format="parquet")
         scanner = data.scanner(list(_COLUMNS), filter=wanted, batch_size=_BATCH, batch_readahead=2, fragment_readahead=1)
         yield from (batch for batch in scanner.to_batches() if len(batch))
     except (OSError, pa.ArrowException) as error:

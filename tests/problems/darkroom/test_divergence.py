@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from icrl_dist.agent.trained_model import TrainedModel
-from icrl_dist.config.run import Run
+from icrl_dist.config.run import Run, override
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.interfaces import Batch
 from icrl_dist.methods import registry as methods
@@ -333,3 +333,22 @@ def test_curves_are_means_by_prefix_and_by_the_exact_probability() -> None:
     np.testing.assert_allclose(curve["kl"], one.kl.mean(axis=0))
     np.testing.assert_allclose(found["agreement"]["exact"], [0.0, 0.265, 0.735, 1.0])
     np.testing.assert_allclose(found["agreement"]["model"], [0.2, 0.3, 0.7, 0.8])
+
+
+@pytest.mark.parametrize("kind", ["wind", "permuted"])
+def test_every_context_of_an_inferred_disturbance_has_a_hypothesis(run: Run, kind: str) -> None:
+    """With two adversaries a goal: the second prior has every direction or permutation, so no posterior is empty."""
+    disturbed = override(run, [f"darkroom.disturbance={kind}", "adversary.p_max=1.0"], "test")
+    config = registry.of(disturbed).config
+
+    def decide(context: Sequence[np.ndarray], queries: np.ndarray, prefix: np.ndarray) -> np.ndarray:
+        return np.full((*prefix.shape, ACTIONS), 1.0 / ACTIONS)
+
+    found = list(divergence.divergences(disturbed, config, decide, lambda rows, env: RandomPolicy(ACTIONS), True))
+    assert len(found) == len(KINDS) * 2
+    for one in (prior for pair in found for prior in pair):
+        np.testing.assert_allclose(one.exact.sum(axis=2), 1.0, rtol=1e-6)
+    second = divergence.hypotheses(disturbed, True)[1]
+    assert second.moves is not None
+    null = (second.moves[:, range(ACTIONS), range(ACTIONS)] == 1).all(axis=1)
+    assert null.mean() == pytest.approx(0.5), "phi_0 has its share, 1/K"

@@ -208,7 +208,17 @@ def test_task_itself_refuses_a_goal_outside() -> None:
         (Adversary.of("uniform", p=float("nan")), "p=nan"),
         (Adversary.of("dirichlet", p=0.1, alpha=[1.0, 1.0]), r"alpha=\(1\.0, 1\.0\).*5 numbers"),
         (Adversary.of("dirichlet", p=0.1, alpha=[1.0, 1.0, 0.0, 1.0, 1.0]), "above 0"),
-        (Adversary.of("wind", p=0.1), "'wind'.*null, uniform, dirichlet"),
+        (Adversary.of("gust", p=0.1), "'gust'.*null, uniform, dirichlet, wind, permuted"),
+        (Adversary.of("wind", p=0.1), "'direction' is missing"),
+        (Adversary.of("wind", p=1.5, direction=0), r"p=1\.5.*\[0, 1\]"),
+        (Adversary.of("wind", p=0.1, direction=4), "direction=4: expected 0, 1, 2 or 3"),
+        (Adversary.of("wind", p=0.1, direction=-1), "direction=-1"),
+        (Adversary.of("wind", p=0.1, direction=1.5), r"direction=1\.5"),
+        (Adversary.of("permuted", p=-0.1, permutation=(0, 1, 2, 3, 4)), r"p=-0\.1.*\[0, 1\]"),
+        (Adversary.of("permuted", p=0.1, permutation=(0, 1, 2, 3)), r"\(0, 1, 2, 3\): expected each of 0 to 4 once"),
+        (Adversary.of("permuted", p=0.1, permutation=(0, 1, 2, 3, 3)), "3, 3.*each of 0 to 4 once"),
+        (Adversary.of("permuted", p=0.1, permutation=(1, 2, 3, 4, 5)), "each of 0 to 4 once"),
+        (Adversary.of("permuted", p=0.1, permutation=(0.5, 1, 2, 3, 4)), r"0\.5.*each of 0 to 4 once"),
     ],
 )
 def test_an_impossible_adversary_is_refused_with_its_value(adversary: Adversary, message: str) -> None:

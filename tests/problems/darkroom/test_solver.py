@@ -17,15 +17,19 @@ from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variati
 
 ALPHA = (0.1, 1.0, 0.5, 2.0, 0.3)
 ADVERSARIES = (NULL, Adversary.of("dirichlet", p=0.35, alpha=ALPHA))
+DISTURBED = (
+    Adversary.of("wind", p=0.35, direction=2),
+    Adversary.of("permuted", p=0.6, permutation=(2, 3, 1, 0, 4)),
+)
 SIZE, HORIZON = 3, 6
 Room = Callable[[int, int], tuple[Task, ...]]
 Cell = tuple[int, int]
 
 
-@pytest.fixture
-def hypotheses(room: Room) -> tuple[Variation, ...]:
+@pytest.fixture(params=[ADVERSARIES, DISTURBED, (ADVERSARIES[1], DISTURBED[0])], ids=["override", "disturbed", "mixed"])
+def hypotheses(room: Room, request: pytest.FixtureRequest) -> tuple[Variation, ...]:
     """Every goal of a 3x3 room with two adversaries: 18 variations."""
-    return tuple(Variation(t, a) for t in room(SIZE, HORIZON) for a in ADVERSARIES)
+    return tuple(Variation(t, a) for t in room(SIZE, HORIZON) for a in request.param)
 
 
 # A slow second implementation of the room.
@@ -47,8 +51,15 @@ def moved(cell: Cell, action: int, size: int) -> Cell:
 
 def outcomes(variation: Variation, cell: Cell, action: int) -> list[tuple[float, Cell]]:
     """Every (probability, next cell) of an action, one entry an executed action."""
+    size, adversary = int(variation.task.number("size")), variation.adversary
+    if adversary.kind in ("wind", "permuted"):
+        p = adversary.number("p")
+        if adversary.kind == "wind":
+            disturbed = moved(moved(cell, action, size), int(adversary.number("direction")), size)
+        else:
+            disturbed = moved(cell, int(adversary.vector("permutation")[action]), size)
+        return [(1 - p, moved(cell, action, size)), (p, disturbed)]
     p, q = override_of(variation)
-    size = int(variation.task.number("size"))
     return [(1 - p, moved(cell, action, size)), *((p * q[b], moved(cell, b, size)) for b in range(ACTIONS))]
 
 
