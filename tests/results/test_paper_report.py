@@ -131,7 +131,7 @@ def test_a_null_effect_is_not_shown_and_an_opposite_one_not_held(tmp_path):
     assert found[2].verdict == "not held"
     assert {one.verdict for one in found[2].findings if one.comparison.startswith("ICAG")} == {"held"}
     assert found[5].verdict == "not decidable"
-    assert "room/dpt, seeds 0 to 5 (offline, p = 0)" in found[5].findings[0].reason
+    assert "room/dpt, seeds 0 to 5 (evaluated at offline p = 0 expert data)" in found[5].findings[0].reason
 
 
 def test_verdicts():
@@ -320,6 +320,14 @@ def test_deployment_rules_are_shown_beside_each_other(tmp_path):
     assert found["committed"] - found["Algorithm 1"] == pytest.approx(7, abs=0.1)
     shown = study(rows, None, Rules()).model("icag", 0.2)
     assert shown is not None and shown.key.deployment == "paper", "other figures show Algorithm 1"
+
+
+def test_a_figure_with_some_panels_names_the_others(tmp_path):
+    agents = {"dpt": ("t0",), "icag": ("t0",)}
+    path = write(tmp_path, small(tmp_path, agents=agents), offline=False)
+    text = str(report(path, figure="3", out=tmp_path, partial=True))
+    assert "**3b: " in text and "**3a: " not in text
+    assert "Left out: figure 3a: rows are missing; these runs make them: room/dpt, seeds 0 to 5 (evaluated at offline" in text
 
 
 def test_small_differences_of_budgets_are_named(tmp_path):

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.results import statistics
-from icrl_dist.results.figures.choices import Choice, Spot
+from icrl_dist.results.figures.choices import Choice, Spot, run_of
 from icrl_dist.results.figures.reading import Arm
 from icrl_dist.results.figures.selection import MissingError, Study
 from icrl_dist.results.returns import LAST
@@ -77,16 +77,10 @@ def together(verdicts: Sequence[str]) -> str:
 def arms_of(study: Study, what: str, terms: Sequence[Term]) -> list[Arm]:
     """The arms of the terms.  Raises MissingError for those without rows, ConfigError for those that may not be compared."""
     found = [term.choice.at(study, term.spot) for term in terms]
-    missing = [_run(study, term) for term, arm in zip(terms, found, strict=True) if arm is None]
+    missing = [run_of(study, t.choice, [t.spot]) for t, arm in zip(terms, found, strict=True) if arm is None]
     if missing:
         raise MissingError(what, missing)
     return study.comparable([arm for arm in found if arm is not None], what)
-
-
-def _run(study: Study, term: Term) -> str:
-    where = f"{term.spot.suite}, " if term.spot.suite != "online" else ""
-    prior = f" {term.spot.prior}" if term.spot.p else ""
-    return f"{study.run(term.choice.variant or term.choice.style)} ({where}p = {term.spot.p:g}{prior})"
 
 
 def answer(study: Study, question: Question) -> Finding:
