@@ -235,7 +235,11 @@ def test_unequal_budgets_and_missing_methods_are_shown_only_on_demand(tmp_path):
         report(path, figure="2", out=tmp_path)
     with pytest.raises(ConfigError, match=r"optimizer_steps is 9 of room/icag .* and 300 of room/dpt"):
         report(path, figure="2", out=tmp_path, partial=True)
-    text = str(report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=True))
+    with pytest.raises(ConfigError, match="optimizer_steps is 9 of"):
+        report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=["labelled_episodes"])
+    with pytest.raises(ConfigError, match="no such budget; did you mean 'optimizer_steps'"):
+        report(path, figure="2", out=tmp_path, partial=True, unequal_budgets="optimiser_steps")
+    text = str(report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=["optimizer_steps"]))
     assert (
         "No rows of prompt-DT, mix-DPT, ICAA" in text and "Budgets differ: optimizer_steps is 9 of icag and 300 of dpt" in text
     )
