@@ -68,6 +68,11 @@ def verdict(effect: Interval, sign: int, seeds: int) -> str:
     return {0: NOT_SHOWN, sign: HELD}.get(side, NOT_HELD)
 
 
+def few(seeds: int) -> str:
+    """Why so many training seeds decide nothing; empty for enough."""
+    return "" if seeds >= SEEDS else f"{statistics.counted(seeds, 'training seed')}, and at least {SEEDS} are needed"
+
+
 def together(verdicts: Sequence[str]) -> str:
     """The verdict of a claim with several comparisons: it held only if each did."""
     order = (NOT_HELD, NOT_DECIDABLE, NOT_SHOWN, HELD)
@@ -96,7 +101,7 @@ def answer(study: Study, question: Question) -> Finding:
     effect, overall = statistics.estimate(scores, _weighted(weights), all(arm.crossed for arm in arms))
     certified = float(weights @ [arm.worst() for arm in arms])
     seeds = len(arms[0].seeds)
-    reason = f"{seeds} training seeds, and at least {SEEDS} are needed" if seeds < SEEDS else ""
+    reason = few(seeds)
     found = verdict(effect, question.sign, seeds)
     return Finding(question.comparison, effect, overall, certified, seeds, found, reason, question.form)
 

@@ -46,7 +46,7 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")
     return Sheet(
-        "The claims one by one", columns, tuple(rows), caption + "".join(f". [{n}] {note}" for note, n in notes.items())
+        "The claims one by one", columns, tuple(rows), caption + "".join(f"\n\n[{n}] {note}" for note, n in notes.items())
     )
 
 
