@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le, Lt
 
 from icrl_dist.config.ranges import Positive, Rate, Share, remedy
 from icrl_dist.config.run import Run
@@ -32,7 +32,7 @@ class MixDPTConfig:
     """Episodes per history; each round collects one history of every training task."""
     kappa: Share = 1 / 3
     """Share of the training batches of a round that come from D^0; the other contexts are histories (Wang et al.: 1/3)."""
-    early: Share = 0.4
+    early: Annotated[float, Gt(0), Lt(1), Remedy("must lie between 0 and 1, so that no phase is without steps")] = 0.4
     """Share of the optimizer steps in the early phase (appendix B.1: 40%); the rounds divide the others evenly."""
     learning_rate: Rate = 1e-3
     """Peak learning rate of a round."""
