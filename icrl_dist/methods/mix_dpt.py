@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from icrl_dist.config.ranges import Positive, Rate, Share, remedy
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
-from icrl_dist.methods.dpt import DPT, Histories, pretrain_phase
+from icrl_dist.methods.dpt import DPT, OwnHistories, pretrain_phase
 from icrl_dist.problems import registry
 from icrl_dist.stream.schema import Remedy
 from icrl_dist.types import Job
@@ -79,9 +79,9 @@ class MixDPT(DPT):
         contexts = run.pretrain.contexts - of.rounds * of.trials * registry.of(run).train_count
         return super().ask(dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, contexts=contexts)), phase)
 
-    def histories(self, run: Run) -> Histories:
+    def histories(self, run: Run) -> OwnHistories:
         of: MixDPTConfig = run.section(self.section)
-        return Histories(of.trials, 1 - of.kappa)
+        return OwnHistories(of.trials, 1 - of.kappa)
 
 
 def steps_of_phases(run: Run) -> list[int]:
