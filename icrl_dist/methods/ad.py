@@ -13,7 +13,7 @@ from icrl_dist.config.q_learning import QLearning
 from icrl_dist.config.ranges import Positive
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import Deployment, ModelConfig
-from icrl_dist.interfaces import Draw, LearningHistories, Phase, TrajectoryDataset, UsedLabels
+from icrl_dist.interfaces import Draw, LearningHistories, Method, Phase, TrajectoryDataset, UsedLabels
 from icrl_dist.methods import jobs
 from icrl_dist.methods.dpt import DPT, pretrain_phase
 from icrl_dist.problems import registry
@@ -47,6 +47,7 @@ class AD(DPT):
     name = "ad"
     section = "ad"
     Config = ADConfig
+    distributions = Method.distributions  # type: ignore[assignment]  # a perfect model is far from the exact posterior
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         if run.model.window > 1:

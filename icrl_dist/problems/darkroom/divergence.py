@@ -115,7 +115,7 @@ def divergences(
     """Compare T_theta with the exact posterior under each of ``PRIORS``, in contexts of every kind and p."""
     room, groups = config, training_variations(run, heldout)
     priors = hypotheses(run, heldout)
-    labels = [labels_of(h, room.labels, room.gamma, room.label_slack) for h in priors]
+    labels = [labels_of(of, room.labels, room.gamma, room.label_slack) for of in _labelled(run, priors)]
     for level, p in enumerate(levels(run)):
         for number, kind in enumerate(KINDS):
             rng = generator(run.seed, RandomKey.POSTERIOR_SUITE, int(heldout), level, number)
@@ -127,6 +127,16 @@ def divergences(
             exact = (exact_decisions(h, optimal, context, query) for h, optimal in zip(priors, labels, strict=True))
             one, other = (Divergence(kind, p, probs, decided, reached) for probs in exact)
             yield one, other
+
+
+def _labelled(run: Run, priors: Sequence[Hypotheses]) -> Sequence[Hypotheses]:
+    """The hypotheses that labels come from: those of the method ``dr`` have no disturbance."""
+    method = plugins.find("methods", run.method)()
+    payload = method.ask(run, method.phases(run)[0])[0].payload
+    if not getattr(getattr(payload, "labelling", None), "undisturbed", False):
+        return priors
+    q = np.full(ACTIONS, 1 / ACTIONS)
+    return [Hypotheses(h.size, h.horizon, h.goal, np.zeros(len(h.goal)), np.tile(q, (len(h.goal), 1))) for h in priors]
 
 
 def _disturbed(rng: np.random.Generator, group: tuple[Variation, ...], p: float) -> Variation:
