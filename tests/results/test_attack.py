@@ -28,7 +28,7 @@ from tests.results.test_evaluate import folder, references, untrained
 
 __all__ = ["folder", "untrained"]
 
-CERTIFIABLE = ["random", "exact:paper", "oracle"]
+CERTIFIABLE = ["random", "exact:paper", "exact:dpt", "exact:icag", "oracle"]
 
 
 def with_evaluation(run, **settings):
@@ -139,9 +139,9 @@ def test_agents_that_are_fixed_within_an_episode_have_a_certified_return_and_oth
         if one.agent.key == "oracle" and one.p == 0:
             np.testing.assert_allclose(certified[:, :, -1], known(one.optimum))
     text = rendered(returns_table(frame(*(one.block(run, "run", "evaluated") for one in found)), ""))
-    assert text.count(
-        "estimated"
-    ) == 1 + 2 * 4 and "against the worst adversary of strength p (exact; in Dark Room one that overrides" in unwrapped(text)
+    text = unwrapped(text)
+    assert text.count("estimated") == 1 + 2 * 6
+    assert "against the worst adversary of strength p (exact; in Dark Room one that overrides actions" in text
 
 
 @pytest.mark.integration
