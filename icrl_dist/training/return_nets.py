@@ -93,7 +93,7 @@ class ReturnNets:
         sizes = inputs[0].shape[-1], sum(part.shape[-1] for part in inputs)
         rng = generator(self._seed, RandomKey.RETURN_NETS, 0)
         with torch.random.fork_rng(()):  # torch's generator is that of the model
-            self._q1, self._q2 = (_drawn(ReturnNet(self._tasks, size, self._settings.width), rng) for size in sizes)
+            self._q1, self._q2 = (_initialized(ReturnNet(self._tasks, size, self._settings.width), rng) for size in sizes)
         with _one_thread():
             self._take_steps(histories, np.asarray(tasks))
 
@@ -159,7 +159,7 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _drawn(net: ReturnNet, rng: np.random.Generator) -> ReturnNet:
+def _initialized(net: ReturnNet, rng: np.random.Generator) -> ReturnNet:
     """The net with initial weights drawn by this generator."""
     with torch.no_grad():
         for name, parameter in net.named_parameters():
