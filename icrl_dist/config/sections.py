@@ -37,7 +37,9 @@ class AdversaryConfig:
     null: bool = True
     """Whether the task without disturbance, phi_0, is among the variations: a task then has K + 1 of them."""
     p_max: Probability = 0.2
-    """Dark Room: an adversary disturbs a step with probability p ~ U(0, p_max)."""
+    """Dark Room: an adversary disturbs a step with probability p ~ U(p_min, p_max)."""
+    p_min: Probability = 0.0
+    """Dark Room: 0 in the paper; with p_max, every disturbance has this strength."""
 
     @property
     def variations(self) -> int:

@@ -102,7 +102,7 @@ def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
     several = [a for _ in sets for a in registry.adversaries(run, rng)] or trained
     kind = registry.of(run).config.disturbance
     if kind != "override" and sets:
-        others = grid(kind, ACTIONS, run.adversary.p_max, _LEVELS)
+        others = grid(kind, ACTIONS, run.adversary.p_max, _LEVELS, run.adversary.p_min)
         share = trained.count(NULL) / len(trained)  # phi_0 keeps its share
         several = [*[NULL] * round(len(others) * share / (1 - share)), *others]
     own = [v for group in groups for v in group]
