@@ -39,7 +39,7 @@ def of_returns(trials: Sequence[Trajectory], gamma: float, slack: float) -> Labe
     for step in reversed(range(horizon)):
         to_go = rewards[:, step] + gamma * to_go
         value[:, step] = to_go
-    end = horizon - (min(math.ceil(1 / (1 - gamma)), horizon - 1) if gamma < 1 else 0)
+    end = max(1, horizon - math.ceil(1 / (1 - gamma) - 1e-6))
     shape = len(states), trials[0].labels.shape[1]
     pairs = number[:, :end], taken[:, :end]
     visits, total = np.zeros(shape), np.zeros(shape)
@@ -86,7 +86,7 @@ def _best(
     """
     value = np.where(visits > 0, value, -np.inf)
     best = value.max(axis=1, keepdims=True)
-    good = value >= best - slack * np.abs(best)
+    good = value >= best * (1 - slack) - 1e-9  # equal values differ by rounding
     labelled = best[:, 0] > 1e-6
     if not labelled.any():
         return None
