@@ -515,7 +515,8 @@ class UsedLabels(NamedTuple):
     """The labels of a job that a method learns from."""
 
     source: str
-    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions``; ``none`` without labels."""
+    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``none`` without labels;
+    ``own actions``, ``own returns`` or ``own transitions``, as ``icaa.labels``."""
     trials: int
     """Trials of each variation whose labels are used; at most so many where it depends on returns."""
 

@@ -77,9 +77,14 @@ class ICAA(DPT):
         return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), self_labelled])
 
     def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels | None:
-        """In a round the actions of the trials that ``icaa.label_trials`` selects; of ``improved`` ones at most all."""
+        """In a round the actions of the trials that ``icaa.label_trials`` selects, of ``improved`` ones at most all.
+
+        Labels that compare actions use all N + 1 trials.
+        """
         if phase.stage == "pretrain":
             return super().used_labels(run, phase, job)
+        if run.icaa.labels != "actions":
+            return UsedLabels(f"own {run.icaa.labels}", run.icaa.trials + 1)
         later = run.icaa.trials - run.icaa.context_trials
         return UsedLabels("own actions", (later + 1) // 2 if run.icaa.label_trials == "top_return" else later)
 
