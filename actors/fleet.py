@@ -9,7 +9,7 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -366,6 +366,24 @@ class Fleet:
             self._ray.shutdown()
         self._running.clear()
         local.restore_variables(self._variables)
+
+
+@contextlib.contextmanager
+def connected(address: str) -> Iterator[Any]:
+    """The module ``ray``, connected to the cluster at ``address`` within this context.  Raises ConfigError if there is none."""
+    local.refuse_running_session()
+    variables = local.variables()
+    os.environ.update(_SETTINGS)
+    try:
+        import ray
+
+        _connect(ray, address)
+        try:
+            yield ray
+        finally:
+            ray.shutdown()
+    finally:
+        local.restore_variables(variables)
 
 
 def _connect(ray: Any, address: str) -> None:

@@ -1,7 +1,8 @@
 """Robust in-context reinforcement learning, distributed.
 
-``train`` trains a run, ``load_run`` reads one to change it, ``evaluate`` evaluates its agent; ``read_results`` reads
-the returns of evaluations, ``compare`` compares trainings, ``read_dataset`` reads the trajectories that a run collected.
+``train`` trains a run, ``load_run`` reads one to change it, ``evaluate`` evaluates its agent, ``sweep`` does many runs;
+``read_results`` reads the returns of evaluations, ``compare`` compares trainings, ``report`` makes figures and tables of
+many, ``read_dataset`` reads the trajectories that a run collected.
 ``load_agent`` loads a trained agent; ``make`` creates a variation environment to deploy it in; ``oracle`` computes
 exact solutions of Dark Room.  docs/python.md has an example of each.
 """
@@ -21,12 +22,14 @@ if TYPE_CHECKING:
     from icrl_dist.launch.whole_run import TrainResult, train
     from icrl_dist.problems.darkroom import solver as oracle
     from icrl_dist.problems.registry import make
+    from icrl_dist.results.paper_report import report
     from icrl_dist.results.reports import Evaluation
     from icrl_dist.results.rows import read_results
     from icrl_dist.results.suites import evaluate
     from icrl_dist.results.tables import compare
     from icrl_dist.storage.files import StoreError
     from icrl_dist.storage.reading import StoredData, read_dataset
+    from icrl_dist.sweeps.sweep import SweepResult, sweep
     from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
 
 __version__ = "0.2.0"
@@ -43,6 +46,7 @@ __all__ = [
     "Run",
     "StoreError",
     "StoredData",
+    "SweepResult",
     "Task",
     "TrainFailed",
     "TrainInterrupted",
@@ -57,6 +61,8 @@ __all__ = [
     "oracle",
     "read_dataset",
     "read_results",
+    "report",
+    "sweep",
     "train",
 ]
 
@@ -74,12 +80,15 @@ _MODULES = {
     "train": "icrl_dist.launch.whole_run",
     "make": "icrl_dist.problems.registry",
     "Evaluation": "icrl_dist.results.reports",
+    "report": "icrl_dist.results.paper_report",
     "read_results": "icrl_dist.results.rows",
     "evaluate": "icrl_dist.results.suites",
     "compare": "icrl_dist.results.tables",
     "StoreError": "icrl_dist.storage.files",
     "StoredData": "icrl_dist.storage.reading",
     "read_dataset": "icrl_dist.storage.reading",
+    "SweepResult": "icrl_dist.sweeps.sweep",
+    "sweep": "icrl_dist.sweeps.sweep",
     "NULL": "icrl_dist.types",
     "Adversary": "icrl_dist.types",
     "Identity": "icrl_dist.types",

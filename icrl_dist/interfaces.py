@@ -137,6 +137,21 @@ class Contexts:
 
 
 @dataclass(frozen=True)
+class LearningHistories:
+    """How a problem records histories of a learning agent: the episodes of a variation, in the order in which it learned."""
+
+    payload: Payload
+    """Payload of the recording jobs."""
+    trials: int
+    """Episodes of each variation."""
+    count: int = 1
+    """Histories of each variation, one after another; each begins with an agent that knows nothing.
+
+    History h holds the trials from ``trials * h // count`` to before ``trials * (h + 1) // count``.
+    """
+
+
+@dataclass(frozen=True)
 class Reference:
     """An agent that tables compare the models with."""
 
@@ -306,6 +321,10 @@ class Problem(abc.ABC):
     @property
     def labeller(self) -> Callable[[Job, Any], Labeller] | None:
         """``labeller(job, labelling)``: a labeller for new trajectories of the job's variations."""
+        return None
+
+    def learning_histories(self, run: Run, trials: int) -> LearningHistories | None:
+        """Histories of a learning agent, of at most ``trials`` episodes in each variation, for Algorithm Distillation."""
         return None
 
     @property
@@ -515,8 +534,9 @@ class UsedLabels(NamedTuple):
     """The labels of a job that a method learns from."""
 
     source: str
-    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``none`` without labels;
-    ``own actions``, ``own returns`` or ``own transitions``, as ``icaa.labels``."""
+    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions``, ``own returns`` or ``own transitions``
+    of the model, as ``icaa.labels``; ``logged actions`` of the behavior policies, ``learner's actions`` of a learning agent;
+    ``none`` without labels."""
     trials: int
     """Trials of each variation whose labels are used; at most so many where it depends on returns."""
 

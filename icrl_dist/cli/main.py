@@ -16,7 +16,22 @@ from typing import Any
 
 from rich.console import Console
 
-from icrl_dist.cli import bench, chaos, doctor, evaluate, explain, export, help_text, monitor, plan, play, streams, train
+from icrl_dist.cli import (
+    bench,
+    chaos,
+    doctor,
+    evaluate,
+    explain,
+    export,
+    help_text,
+    monitor,
+    plan,
+    play,
+    report,
+    streams,
+    sweep,
+    train,
+)
 from icrl_dist.cli.exit_codes import FAILED, INTERRUPTED, OK, USAGE
 from icrl_dist.cli.train import TrainArguments
 from icrl_dist.config import former_names
@@ -35,9 +50,11 @@ COMMANDS: dict[str, tuple[type, Callable[[Any, Console], int]]] = {
     "explain": (explain.ExplainArguments, explain.explain),
     "export": (export.ExportArguments, export.export),
     "chaos": (chaos.ChaosArguments, chaos.chaos),
+    "report": (report.ReportArguments, report.report),
     "play": (play.PlayArguments, play.play),
     "doctor": (doctor.DoctorArguments, doctor.doctor),
     "plan": (plan.PlanArguments, plan.plan),
+    "sweep": (sweep.SweepArguments, sweep.sweep),
 }
 
 _RENAMED = {"bench": {"--bite": "--drop"}}

@@ -32,6 +32,8 @@ class RandomKey(enum.IntEnum):
     """Bootstrap of all intervals of results; its seed is 0, so equal rows give equal intervals."""
     INITIAL_WEIGHTS = 108
     """Initial weights of a fit with ``learner.reproducible = "any-machine"``; torch draws those of other fits."""
+    RETURN_NETS = 130
+    """ARDT's return nets: initial weights (0), and training batches (1, step)."""
 
 
 def strength_key(p: float) -> int:

@@ -16,11 +16,12 @@ Decoder = Literal["auto", "torch", "kernel"]
 Reproducible = Literal["auto", "any-machine", "this-machine"]
 """Where a fit gives the same weights digest: see ``LearnerConfig``."""
 
-Deployment = Literal["paper", "committed"]
+Deployment = Literal["paper", "committed", "growing"]
 """How T_theta is deployed online.
 
-``paper``: Algorithm 1, the context is frozen within an episode.  ``committed``: every transition enters
-the context immediately, and T_theta also reads the agent's last actions as an action window (zeta of eq. 6).
+``paper``: Algorithm 1, the context is frozen within an episode.  ``growing``: every transition enters the
+context immediately (Algorithm Distillation).  ``committed``: the same, and T_theta also reads the agent's
+last actions as an action window (zeta of eq. 6).
 """
 
 _NEVER = Remedy("must be from 0 to 1e9; 0 turns the alert off")

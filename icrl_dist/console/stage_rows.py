@@ -88,7 +88,9 @@ class StageRow:
         return f"{100 * done // total if total and not self.finished else 100}%"
 
     def text(self, now: float) -> str:
-        """Counts and rates, or what the run waits for."""
+        """Counts and rates, or what the run waits for; of a sweep the text of its event."""
+        if self.event["stage"] == "sweep":
+            return str(self.event["text"])
         return self._still(now) or f"{self.event['step']}/{self.event['steps']}{_info(self.event)}"
 
     def _still(self, now: float) -> str:
@@ -134,7 +136,7 @@ def fitted(text: str, width: int) -> str:
 
 def name_of(event: dict[str, Any]) -> str:
     """The name of the stage of a progress event."""
-    return str(event["phase"]) if event["stage"] == "evaluate" else stage_text(event)
+    return str(event["phase"]) if event["stage"] in ("evaluate", "sweep") else stage_text(event)
 
 
 def _info(event: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from icrl_dist.config.run import Run
-from icrl_dist.config.sections import ContextConfig, Deployment
+from icrl_dist.config.sections import ContextConfig, Deployment, ModelConfig
 from icrl_dist.interfaces import Draw, Method, Phase, TrajectoryDataset, Watch
 from icrl_dist.methods import jobs
 from icrl_dist.types import Job, Spec, Task, Variation
@@ -112,7 +112,13 @@ class DPT(Method):
         return batch_loss(model, batch)
 
     def deployment(self, run: Run) -> Deployment:
-        return "committed" if run.model.window > 1 else "paper"
+        return self.rule(run.model)
+
+    def rule(self, model: ModelConfig) -> Deployment:
+        """The deployment rule of models with these settings."""
+        from icrl_dist.rollout.deployment import default_deployment
+
+        return default_deployment(model)
 
     def policy(
         self,
@@ -124,7 +130,7 @@ class DPT(Method):
     ) -> InContextPolicy:
         from icrl_dist.rollout.deployment import in_context
 
-        return in_context(model, batch, context, deploy, watch)
+        return in_context(model, batch, context, deploy or self.rule(model.config), watch)
 
     def distributions(
         self,

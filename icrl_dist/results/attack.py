@@ -29,8 +29,6 @@ from icrl_dist.types import NULL, Adversary, Variation
 if TYPE_CHECKING:
     import pandas as pd
 
-DRAWS = 8
-"""Default number of adversaries of the unseen prior."""
 _SHOWN = (1, 2, 5, 10)
 
 

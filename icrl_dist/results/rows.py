@@ -103,7 +103,8 @@ def _made_by(block: Block) -> dict[str, Any]:
     return {name: found[name] for name in _MADE_BY} | {"libraries": json.dumps({**found["libraries"], **found["plugins"]})}
 
 
-def _schema() -> pa.Schema:
+def table_schema() -> pa.Schema:
+    """Names and types of the columns, with the number of the format."""
     import pyarrow as pa
 
     types = {"string": pa.string(), "int64": pa.int64(), "double": pa.float64(), "bool": pa.bool_()}
@@ -114,7 +115,7 @@ def _schema() -> pa.Schema:
 def _table(block: Block) -> pa.Table:
     import pyarrow as pa
 
-    schema, rows = _schema(), len(block["return"])
+    schema, rows = table_schema(), len(block["return"])
     if unknown := block.keys() - COLUMNS.keys():
         raise KeyError(f"no columns of result rows: {', '.join(sorted(unknown))}")
     if wrong := int((~np.isfinite(block["return"])).sum()):
@@ -140,13 +141,13 @@ def read(files: Iterable[Path]) -> pd.DataFrame:
 
     Raises StoreError, in one line with the remedy, for a file that is not of this format or is damaged.
     """
-    return _frame([_read(path) for path in files])
+    return _frame([read_table(path) for path in files])
 
 
 def _frame(tables: Sequence[pa.Table]) -> pd.DataFrame:
     import pyarrow as pa
 
-    frame = pa.concat_tables(tables or [_schema().empty_table()]).to_pandas()
+    frame = pa.concat_tables(tables or [table_schema().empty_table()]).to_pandas()
     for name, column in COLUMNS.items():
         if column.nullable and column.type == "int64":
             frame[name] = frame[name].astype("Int64")
@@ -162,7 +163,8 @@ def _newest(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[order == last].reset_index(drop=True)
 
 
-def _read(path: Path) -> pa.Table:
+def read_table(path: Path) -> pa.Table:
+    """The rows of one file as a table of ``table_schema``.  Raises StoreError as ``read`` does."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -172,17 +174,8 @@ def _read(path: Path) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{path}: not a file of result rows ({reason}): move it away, and evaluate again") from None
-    found = (table.schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
-    if found not in (str(FORMAT), str(FORMER)):
-        raise StoreError(
-            f"{path}: result rows of format {found}, and this version reads formats {FORMER} and {FORMAT}: read them "
-            "with the version that wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
-        )
-    schema = _schema()
-    expected = {(f.name, str(f.type)) for f in schema if found == str(FORMAT) or f.name not in ADDED}
-    if wrong := sorted({(field.name, str(field.type)) for field in table.schema} ^ expected):
-        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
-        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
+    found = check_schema(path, table.schema)
+    schema = table_schema()
     for field in (one for one in schema if one.name in table.column_names):
         if not field.nullable and (missing := table.column(field.name).null_count):
             raise StoreError(
@@ -199,6 +192,21 @@ def _read(path: Path) -> pa.Table:
     return table.select(schema.names).cast(schema)
 
 
+def check_schema(path: Path, schema: pa.Schema) -> str:
+    """The format of a file.  Raises StoreError, in one line with the remedy, for other formats and for wrong columns."""
+    found = (schema.metadata or {}).get(_FORMAT_KEY, b"none").decode(errors="replace")
+    if found not in (str(FORMAT), str(FORMER)):
+        raise StoreError(
+            f"{path}: result rows of format {found}, and this version reads formats {FORMER} and {FORMAT}: read them "
+            "with the version that wrote them (column package_version), or move the file away and repeat `icrl-dist evaluate`"
+        )
+    expected = {(f.name, str(f.type)) for f in table_schema() if found == str(FORMAT) or f.name not in ADDED}
+    if wrong := sorted({(field.name, str(field.type)) for field in schema} ^ expected):
+        columns = ", ".join(dict.fromkeys(name for name, _ in wrong))
+        raise StoreError(f"{path}: result rows with wrong columns ({columns}): move the file away, and evaluate again")
+    return found
+
+
 def _present(table: pa.Table) -> pa.Table:
     """Rows of format 1 with the columns of this format.
 
@@ -206,7 +214,7 @@ def _present(table: pa.Table) -> pa.Table:
     """
     import pyarrow as pa
 
-    schema, trained = _schema(), np.isin(table.column("suite").to_numpy(), _WITHOUT_P)
+    schema, trained = table_schema(), np.isin(table.column("suite").to_numpy(), _WITHOUT_P)
     draws = pa.array(np.where(trained, table.column("adversary_index").to_numpy(), 0))
     columns = {name: pa.repeat(pa.scalar(value, schema.field(name).type), len(table)) for name, value in ADDED.items()}
     table = table.drop_columns(["adversary_index"])

@@ -157,8 +157,8 @@ def bootstrap(
 ) -> Float64[np.ndarray, "R K"]:
     """Paired hierarchical bootstrap: K numbers of ``statistic`` for each of ``count`` resamples.
 
-    Resamples training seeds, then tasks, then evaluations with their adversary draws, nested (see ``resamples``).  Every resample
-    has the same indices for all A agents, so differences and ratios of agents are compared in pairs.
+    Resamples training seeds, then tasks, then evaluations with their adversary draws, nested (see ``resamples``).  Every
+    resample has the same indices for all A agents, so differences and ratios of agents are compared in pairs.
     """
     found = []
     for chosen in resamples(rng, scores.shape[1:], count, crossed, fixed_cells):
@@ -216,6 +216,13 @@ def bounds(
     half = stdtrit(count - 1, (1 + LEVEL) / 2) * error
     low, high = values - half, values + half
     return (np.clip(low, 0, 1), np.clip(high, 0, 1)) if probability else (low, high)
+
+
+def spread(count: int) -> float:
+    """Factor from the variance of a bootstrap over ``count`` units to (half the width of a 95% interval) ** 2."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(count - 1, (1 + LEVEL) / 2) ** 2 * count / (count - 1))
 
 
 def resampled(trainings: int, tasks: int, evaluations: int, episodes: int = 1, draws: int = 1) -> str:

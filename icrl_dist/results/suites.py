@@ -14,9 +14,9 @@ from icrl_dist.console.display import Show, reporting
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.compiled import Unusable, library
 from icrl_dist.results import heldout, reports
-from icrl_dist.results.attack import DRAWS
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
+from icrl_dist.results.suite_numbers import DRAWS, numbers
 from icrl_dist.storage.files import StoreError
 
 Suite = Literal["online", "offline", "posterior", "attack"]
@@ -70,15 +70,11 @@ def evaluate(
         "prior": prior,
     }
     given = {name: value for name, value in chosen.items() if value is not None}
-    if suite == "posterior":
-        given = {"p": (0.0, 0.2, 0.4, 0.6), "prior": "uniform", "episodes": 40, "seeds": 4} | given
-        if not references:
-            raise ConfigError("--suite posterior: it compares with the exact agent, a reference; leave --no-references out")
-    elif suite == "attack":
-        if draws < 1:
-            raise ConfigError(f"--draws {draws}: at least 1 sampled adversary is needed")
-        given.setdefault("p", tuple(one for one in run.evaluate.p if one > 0) or run.evaluate.p)
-    run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **given))
+    if suite == "posterior" and not references:
+        raise ConfigError("--suite posterior: it compares with the exact agent, a reference; leave --no-references out")
+    if suite == "attack" and draws < 1:
+        raise ConfigError(f"--draws {draws}: at least 1 sampled adversary is needed")
+    run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **numbers(run, suite, given)))
     validate(run, "evaluate")
     heldout.check_suite(run, suite)
     rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)

@@ -1,4 +1,4 @@
-"""T_theta deployed in a batch of environments: by Algorithm 1, or with action windows (zeta of eq. 6)."""
+"""T_theta deployed in a batch of environments: by Algorithm 1, by a growing context, or with action windows (eq. 6)."""
 
 from __future__ import annotations
 
@@ -149,12 +149,11 @@ class InContextPolicy(CopiedWhole):
         return dropped
 
 
-class CommittedPolicy(InContextPolicy):
-    """T_theta(. | s, D_on, zeta): every transition joins the context at once, and the agent's own action window is an input.
+class GrowingPolicy(InContextPolicy):
+    """T_theta(. | s, D_on): every transition joins the context at once, as Algorithm Distillation deploys its model.
 
-    zeta holds the agent's last transitions in this episode, as if the optimal policy had acted (eq. 6).
-    Therefore T_theta continues to act on the same hypothesis of the task.  It gives up a wrong hypothesis,
-    because some training windows hold actions of another task's policy (``pretrain.decoy_fraction``).
+    Episodes beyond ``context.max`` are dropped at the end of an episode, so that within an episode a context is up to one
+    episode longer.
     """
 
     _encoded = 0
@@ -164,15 +163,14 @@ class CommittedPolicy(InContextPolicy):
         """None: the context grows within an episode."""
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
-        for step in self._pending[self._encoded : -1]:  # observed since the last decision; the newest follows below
+        self._encode(len(self._pending))
+        return self._deployed.decide(observation)
+
+    def _encode(self, count: int) -> None:
+        """Add the first ``count`` transitions of the running episode to the decoder's context."""
+        for step in self._pending[self._encoded : count]:
             self._deployed.append(self._one(step))
-        newest = self._one(self._pending[-1]) if self._encoded < len(self._pending) else None
-        self._encoded = len(self._pending)
-        past = self._pending[1 - self.model.config.window :]
-        nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
-        columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
-        states, actions, _, rewards = (np.stack(column, axis=1) for column in columns)
-        return self._deployed.decide_window(WindowColumns(states, actions, rewards), newest)
+        self._encoded = max(self._encoded, count)
 
     def _running(self) -> list[tuple[np.ndarray, ...]]:
         return self._pending
@@ -183,14 +181,33 @@ class CommittedPolicy(InContextPolicy):
     def _one(self, step: tuple[np.ndarray, ...]) -> Columns:
         return Columns(*(column[:, None] for column in step))
 
-    def _no_action(self, rows: int) -> Actions:
-        spec = self.model.spec
-        return np.zeros(rows, np.int64) if spec.discrete else np.zeros((rows, spec.actions), np.float32)
-
     def _add_own(self, episode: Columns) -> None:
         encoded, self._encoded = self._encoded, 0
         if not self._add_to_context(episode):
             self._deployed.append(Columns(*(column[:, encoded:] for column in episode)))
+
+
+class CommittedPolicy(GrowingPolicy):
+    """T_theta(. | s, D_on, zeta): the context grows at once, and the agent's own action window is an input.
+
+    zeta holds the agent's last transitions in this episode, as if the optimal policy had acted (eq. 6).
+    Therefore T_theta continues to act on the same hypothesis of the task.  It gives up a wrong hypothesis,
+    because some training windows hold actions of another task's policy (``pretrain.decoy_fraction``).
+    """
+
+    def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B O"]:
+        self._encode(len(self._pending) - 1)  # observed since the last decision; the newest follows below
+        newest = self._one(self._pending[-1]) if self._encoded < len(self._pending) else None
+        self._encoded = len(self._pending)
+        past = self._pending[1 - self.model.config.window :]
+        nothing = np.zeros_like(past[0][1]) if past else self._no_action(len(observation))
+        columns = zip(*past, (observation, nothing, observation, np.zeros(len(observation), np.float32)), strict=True)
+        states, actions, _, rewards = (np.stack(column, axis=1) for column in columns)
+        return self._deployed.decide_window(WindowColumns(states, actions, rewards), newest)
+
+    def _no_action(self, rows: int) -> Actions:
+        spec = self.model.spec
+        return np.zeros(rows, np.int64) if spec.discrete else np.zeros((rows, spec.actions), np.float32)
 
 
 def deployed(model: PretrainedTransformer | StoredTransformer, batch: int, decoder: Decoder = "auto") -> Deployed:
@@ -212,7 +229,11 @@ def deployed(model: PretrainedTransformer | StoredTransformer, batch: int, decod
     return KernelTransformer(model.spec, model.config, weights, batch)
 
 
-_RULES: dict[Deployment, type[InContextPolicy]] = {"paper": InContextPolicy, "committed": CommittedPolicy}
+_RULES: dict[Deployment, type[InContextPolicy]] = {
+    "paper": InContextPolicy,
+    "committed": CommittedPolicy,
+    "growing": GrowingPolicy,
+}
 
 
 def in_context(

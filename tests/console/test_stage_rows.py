@@ -32,6 +32,12 @@ def test_bar_percent_and_time_left_are_kept_at_every_width(event, width, ascii_o
     assert ("100/400" in text) == (width >= 80)
 
 
+def test_a_sweep_shows_the_text_of_its_event_and_its_time_left():
+    event = {"event": "progress", "stage": "sweep", "phase": "sweep", "step": 0, "steps": 400, "text": "1/4 runs; a/b/0 fit"}
+    made, now = row(event, 100, 60)
+    assert made.name == "sweep" and made.text(now + 80) == "1/4 runs; a/b/0 fit" and made.time(now) == "3:00 left"
+
+
 def test_a_row_says_what_it_counts_and_waits_for():
     made, now = row(COLLECT, 100, 50)
     assert made.text(now) == "100/400 237/s 2 workers"

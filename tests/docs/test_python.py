@@ -31,11 +31,12 @@ def shown(tmp_path_factory):
 
 def test_every_example_runs_and_prints(shown):
     printed, names = shown
-    train, evaluate, results, compare, trajectories, agent, problem = printed
+    train, evaluate, results, compare, sweep, trajectories, agent, problem = printed
     assert "worker w0 joined" in train and "T^2 (icaa)" in train, "progress, then the table"
     assert "random" in evaluate and re.search(r"^0\.3 +\d", evaluate, re.MULTILINE)
     assert "training_seed" in results and "worker w0 joined" not in results, "no progress unless it is asked for"
     assert "2 training seeds" in " ".join(compare.split()) and "ICAG" in compare
+    assert re.fullmatch(r"small \d+ rows; 0 failed\n", sweep)
     trained = 280 + 2 * 7 * 2 * 16  # contexts; rounds, tasks, variations, trials
     assert trajectories.startswith(f"{trained} trajectories") and len(names["one"]) == 9
     assert re.findall(r"episode (\d): return \d", agent) == list("12345")

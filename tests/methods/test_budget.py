@@ -16,7 +16,7 @@ from icrl_dist.methods import budget, examples
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
 from icrl_dist.results import evaluate
-from icrl_dist.results.rows import COLUMNS
+from icrl_dist.results.columns import COLUMNS
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.training import batches
 from tests.calls import keeping

@@ -117,7 +117,7 @@ def test_the_suite_equals_slow_loops(small_run, untrained, key):
 
 
 def test_the_expected_return_is_the_mean_of_many_episodes(small_run):
-    run = with_evaluation(small_run, episodes=1, seeds=400, p=(0.4,))
+    run = with_evaluation(small_run, episodes=1, seeds=400, p=(0.4,), prior="uniform")
     (result,) = evaluate.online(run, {Agent("random"): references(run)["random"]})
     rows = Rows.of(run, 0.4)
     expected = expected_returns(np.full((1, 9, 5), 0.2), rows.flat).reshape(2, 400)

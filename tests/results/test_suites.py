@@ -100,7 +100,7 @@ def test_an_agent_of_the_package_is_named_and_a_path_is_a_folder(tmp_path, monke
     ("options", "expected"),
     [
         ({"suite": "onlin"}, "--suite onlin: choose one of online, offline, posterior"),
-        ({"deploy": "comitted"}, "--deploy comitted: choose one of paper, committed"),
+        ({"deploy": "comitted"}, "--deploy comitted: choose one of paper, committed, growing"),
         ({"p": [1.5]}, "evaluate.p = 1.5: a probability lies in [0, 1]"),
         ({"p": []}, "evaluate.p"),
         ({"prior": "seen"}, "--prior seen: choose one of uniform, unseen"),

@@ -34,6 +34,13 @@ def train(run_file: Path) -> icrl_dist.TrainResult | None:
     return icrl_dist.train("smoke", engine="ray", actors=1, resume=True, source="runs/mine@0", progress=True)
 
 
+def sweep(file: Path) -> list[dict[str, str]]:
+    found: icrl_dist.SweepResult = icrl_dist.sweep(file, only=["dpt"], seeds=[0], jobs=2, keep="rows")
+    assert_type(found.out, Path)
+    assert_type(found.runs, list[dict[str, Any]])
+    return found.failed
+
+
 def evaluate(folder: Path) -> pd.DataFrame:
     found = icrl_dist.evaluate(folder, suite="offline", deploy="paper", episodes=2, seeds=1, p=[0.0, 0.2], prior="uniform")
     assert_type(found.tables, tuple[Table, ...])
@@ -44,6 +51,7 @@ def evaluate(folder: Path) -> pd.DataFrame:
 
 def results(folders: list[str]) -> Table:
     frame: pd.DataFrame = icrl_dist.read_results(folders)
+    print(icrl_dist.report("runs/sweep", figure="3c", common_seeds=True).summary)
     return icrl_dist.compare(frame, frame, names=("one", "other"))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.config.toml import ConfigError
 from icrl_dist.experts.payloads import ExpertHistories, ExpertLabelling
-from icrl_dist.interfaces import Batch, Contexts, Limits, MakePolicy, Policy, Problem, Reference
+from icrl_dist.interfaces import Batch, Contexts, LearningHistories, Limits, MakePolicy, Policy, Problem, Reference
 from icrl_dist.problems.continuous import calibrated_strength
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.problems.continuous.network_adversary import network, networks
@@ -77,6 +77,13 @@ class ContinuousProblem(Problem):
         """Histories of SAC experts, with at most the episodes of their training."""
         most_trials = max(1, run.sac.steps // self.horizon)
         return Contexts(ExpertHistories(run.sac, self.labelling(run)), most_trials)
+
+    def learning_histories(self, run: Run, trials: int) -> LearningHistories | None:
+        """The histories of SAC experts; None where contexts are not theirs."""
+        found = self.contexts(run)
+        if not isinstance(found.payload, ExpertHistories):
+            return None
+        return LearningHistories(found.payload, trials if found.most_trials is None else min(trials, found.most_trials))
 
     def references(self, run: Run) -> dict[str, Reference]:
         return {"random": Reference(_random)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import numpy as np
@@ -40,6 +41,7 @@ SYMMETRIES = (
 """The permutations of training and test: three rotations of the four moves, then their four mirror images."""
 
 
+@functools.lru_cache(maxsize=4096)
 def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     """q_b = P(argmax of x ~ Dirichlet(alpha) is b), to about 1e-9.
 
@@ -56,7 +58,9 @@ def argmax_distribution(alpha: tuple[float, ...]) -> Float64[np.ndarray, " A"]:
     cdf = gammainc(a, t)
     others = np.stack([np.prod(np.delete(cdf, b, axis=0), axis=0) for b in range(len(alpha))])
     q = np.trapezoid(np.exp(log_density) * others, y[0], axis=1)
-    return q / q.sum()
+    q /= q.sum()
+    q.flags.writeable = False  # later callers get the same array
+    return q
 
 
 def is_override(adversary: Adversary) -> bool:

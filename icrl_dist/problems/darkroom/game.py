@@ -112,7 +112,7 @@ class PlayGame:
         self.agent.observe([before], [action], [reward], [self._cells[self.cell]], [done])
         self.total += reward
         self._since_move += 1
-        self._not_in_context = 0 if done or self.agent.deploy == "committed" else self._not_in_context + 1
+        self._not_in_context = 0 if done or self.agent.deploy != "paper" else self._not_in_context + 1
         self.path.append((self.cell, cause))
         if done:
             causes = [c for _, c in self.path]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from icrl_dist.collect.behavior import BehaviorContexts
+from icrl_dist.config.q_learning import QLearning
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.interfaces import (
@@ -17,7 +18,9 @@ from icrl_dist.interfaces import (
     Behaviors,
     BeliefReader,
     Contexts,
+    JobKind,
     Labeller,
+    LearningHistories,
     Limits,
     MakeDrawing,
     MakePolicy,
@@ -33,6 +36,7 @@ from icrl_dist.problems.darkroom.config import DarkRoomConfig
 from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent, OptimalAgent, Rule
 from icrl_dist.problems.darkroom.labels import RoomLabeller, RoomLabelling
 from icrl_dist.problems.darkroom.prior_agents import Prior, PriorAgent, PriorRule, dpt_prior, icag_prior, prior_agents
+from icrl_dist.problems.darkroom.q_learning import QLearningHistories, q_learning
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, optimal_returns, soft_labels
 from icrl_dist.rollout.policies import RandomPolicy
 from icrl_dist.types import Adversary, Job, Spec, Split, Task, Variation
@@ -90,13 +94,13 @@ class ExactRoom:
         return make
 
     def _any_goal(self, adversary: Adversary) -> tuple[Hypotheses, Float32[np.ndarray, "M C A"]]:
-        """One hypothesis per goal under this adversary, with their labels; cached for the latest 64 adversaries."""
+        """One hypothesis per goal under this adversary, with their labels; cached for the latest 256 adversaries."""
         if adversary not in self._by_adversary:
             size, horizon = self._config.size, self._config.horizon
             goals = [room.task(divmod(cell, size), size, horizon) for cell in range(size**2)]
             hypotheses = Hypotheses.of([Variation(goal, adversary) for goal in goals])
             self._by_adversary[adversary] = hypotheses, soft_labels(hypotheses, self._config.gamma, self._config.label_slack)
-            if len(self._by_adversary) > 64:
+            if len(self._by_adversary) > 256:
                 del self._by_adversary[next(iter(self._by_adversary))]
         return self._by_adversary[adversary]
 
@@ -110,6 +114,7 @@ class DarkRoomProblem(Problem):
     agent_names: ClassVar[Mapping[str, str]] = {KEYS[rule]: name for rule, name in RULES.items()} | {
         key: name for key, name, _, _ in prior_agents()
     }
+    job_kinds: ClassVar[Mapping[str, JobKind]] = {QLearningHistories.kind: JobKind(QLearningHistories, q_learning)}
     earns_in_contexts: ClassVar[bool] = False  # a random walk may miss the goal in every episode
     config: DarkRoomConfig
 
@@ -176,6 +181,12 @@ class DarkRoomProblem(Problem):
 
     def contexts(self, run: Run) -> Contexts:
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
+
+    def learning_histories(self, run: Run, trials: int) -> LearningHistories:
+        """Histories of tabular Q-learning, of ``ad.history_episodes`` episodes or more, so that no episode is left over."""
+        of = run.section("ad")
+        count = max(1, trials // of.history_episodes)
+        return LearningHistories(QLearningHistories(QLearning.of(of), count), trials, count)
 
     def references(self, run: Run) -> dict[str, Reference]:
         """A random policy, exact agents, and the oracle, which is given goal and adversary.
