@@ -115,8 +115,8 @@ class ICAAConfig:
     """Probability of a random action in the trials after the context trials, so that they try actions that T^j does not
     take.  Contexts stay those of T^j.  0: T^j acts in all trials (Algorithm 3)."""
     context: Literal["trial", "history"] = "history"
-    """``history``: a context is trials 0 to n, as the deployed agent has it (Algorithm 1, line 16);
-    ``trial``: a context is any of the trials, a single one with optim.episodes = 1 (Algorithm 3, line 13)."""
+    """``history``: a context is trials 0 to n for a random n up to N_, as the deployed agent has it (Algorithm 1,
+    line 16); ``trial``: a context is one of the trials 0 to N_ (Algorithm 3, lines 13 and 15)."""
     steps: Positive = 4000
     """Fine-tuning steps per round."""
     learning_rate: Rate = 1e-3

@@ -73,7 +73,8 @@ class ICAA(DPT):
         if not labelling:
             return examples.draw(run, [pretrain])
         share = run.icaa.new_fraction
-        self_labelled = Pool(share, CachedExamples(cache, labelling), run.icaa.context_trials + 1)
+        episodes = run.icaa.context_trials + 1 if run.icaa.context == "history" else 1
+        self_labelled = Pool(share, CachedExamples(cache, labelling), episodes)
         return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), self_labelled])
 
     def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels | None:
