@@ -114,9 +114,11 @@ class ICAAConfig:
     explore: Share = 0.0
     """Probability of a random action in the trials after the context trials, so that they try actions that T^j does not
     take.  Contexts stay those of T^j.  0: T^j acts in all trials (Algorithm 3)."""
-    context: Literal["trial", "history"] = "history"
+    context: Literal["trial", "history", "any"] = "history"
     """``history``: a context is trials 0 to n for a random n up to N_, as the deployed agent has it (Algorithm 1,
-    line 16); ``trial``: a context is one of the trials 0 to N_ (Algorithm 3, lines 13 and 15)."""
+    line 16); ``trial``: a context is one of the trials 0 to N_ (Algorithm 3, lines 13 and 15); ``any``: 1 to N_ + 1 of all
+    N + 1 trials in any order, so that a few variations give many contexts; not with ``labels = "actions"``, where the
+    labels of a trial would belong to its own context."""
     steps: Positive = 4000
     """Fine-tuning steps per round."""
     learning_rate: Rate = 1e-3

@@ -27,15 +27,16 @@ def labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
 def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
     """One variation's trials as examples (Algorithm 3, lines 13 and 14); None if no trial can label.
 
-    The first N_ + 1 trials become contexts.  The states and actions of later trials become query states
-    and labels; ``icaa.label_trials`` selects these trials.  With other ``icaa.labels`` than ``actions`` all trials
-    are compared, and each state has one label.
+    The first N_ + 1 trials become contexts, or all of them with ``icaa.context = "any"``.  The states and actions of
+    later trials become query states and labels; ``icaa.label_trials`` selects these trials.  With other ``icaa.labels``
+    than ``actions`` all trials are compared, and each state has one label.
     """
     contexts, later = trials[: run.icaa.context_trials + 1], list(trials[run.icaa.context_trials + 1 :])
     if run.icaa.labels != "actions":
         compare = own_labels.of_returns if run.icaa.labels == "returns" else own_labels.of_transitions
         found = compare(trials, run.icaa.label_gamma, run.icaa.label_slack)
-        return found and Examples.of(contexts, *found, run.icaa.context == "history")
+        episodes = trials if run.icaa.context == "any" else contexts
+        return found and Examples.of(episodes, *found, run.icaa.context == "history")
     if run.icaa.label_trials == "top_return":
         later = sorted(later, key=lambda t: -t.episode_return)[: (len(later) + 1) // 2]
     elif run.icaa.label_trials == "improved":

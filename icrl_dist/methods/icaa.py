@@ -36,6 +36,8 @@ class ICAA(DPT):
         if icaa.explore and not problem.spec.discrete:
             yield "icaa.explore", icaa.explore, "only discrete actions can be random ones; use 0"
         if icaa.labels == "actions":
+            if icaa.context == "any":
+                yield "icaa.context", icaa.context, "its contexts hold the trials that label; use history, or other icaa.labels"
             return
         if not problem.spec.discrete or problem.limits.reward[0] < 0:
             yield "icaa.labels", icaa.labels, f"{run.problem} needs discrete actions and no negative rewards; use actions"
@@ -73,7 +75,7 @@ class ICAA(DPT):
         if not labelling:
             return examples.draw(run, [pretrain])
         share = run.icaa.new_fraction
-        episodes = run.icaa.context_trials + 1 if run.icaa.context == "history" else 1
+        episodes = 1 if run.icaa.context == "trial" else run.icaa.context_trials + 1
         self_labelled = Pool(share, CachedExamples(cache, labelling), episodes)
         return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), self_labelled])
 

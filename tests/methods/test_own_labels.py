@@ -16,9 +16,10 @@ from icrl_dist.problems import registry as problems
 from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, soft_labels
 from icrl_dist.rollout.episode import deploy_online
 from icrl_dist.rollout.policies import Exploring, RandomPolicy
+from icrl_dist.training import batches
 from icrl_dist.types import Adversary, Identity, Trajectory, Variation
 from tests.jobs import FixedWeights, InMemoryDataset, do, jobs_of
-from tests.methods.conftest import Collected
+from tests.methods.conftest import Collected, PoolsOf
 
 State = tuple[float, ...]
 
@@ -148,6 +149,26 @@ def test_contexts_are_trials_0_to_n_and_every_trial_is_compared(small_run: Run, 
     assert len({tuple(s) for s in made.queries.tolist()}) == len(made.queries), "each state has one label"
 
 
+def test_contexts_of_any_trials_are_up_to_n_plus_1_of_all_in_any_order(
+    small_run: Run, collected: Collected, pools_of: PoolsOf
+) -> None:
+    icaa = dataclasses.replace(small_run.icaa, labels="transitions", context="any", context_trials=2)
+    run = dataclasses.replace(small_run, icaa=icaa)
+    numbered = [dataclasses.replace(t, rewards=0 * t.rewards + n) for n, t in enumerate(collected.trajectories)]
+    method, data = methods.of(run), InMemoryDataset(numbered)
+    _, own = pools_of(method, run, method.phases(run)[1], data)
+    orders, counts = set(), set()
+    for seed in range(60):
+        batch = batches.draw(np.random.default_rng(seed), [own], 4, 4)
+        for row in batch.rewards.reshape(len(batch.rewards), -1, 8)[..., 0]:
+            found = [(numbered[int(n)].identity[:4], numbered[int(n)].identity.trial) for n in row]
+            assert len(set(found)) == len(found) and len({key for key, _ in found}) == 1, "different trials of one variation"
+            orders.add(tuple(n for _, n in found))
+            counts.add(len(found))
+    assert counts == {1, 2, 3} and {n for order in orders for n in order} == set(range(5))
+    assert any(list(order) != sorted(order) for order in orders)
+
+
 def test_label_quality_rates_the_labels_that_compare_actions(small_run: Run, collected: Collected) -> None:
     run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, labels="transitions"))
     method, data = methods.of(run), InMemoryDataset(collected.trajectories)
@@ -209,6 +230,7 @@ def test_explored_trials_differ_only_after_the_contexts(small_run: Run) -> None:
     [
         ({"labels": "returns", "label_trials": "improved"}, {}, "icaa.label_trials"),
         ({"labels": "transitions"}, {"window": 2}, "icaa.labels"),
+        ({"context": "any"}, {}, "icaa.context"),
     ],
 )
 def test_labels_that_do_not_fit_are_refused(small_run: Run, icaa: dict[str, str], model: dict[str, int], key: str) -> None:
