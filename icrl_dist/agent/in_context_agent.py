@@ -31,7 +31,8 @@ class InContextAgent(CopiedWhole):
 
     ``act`` samples a_h ~ T_theta(. | s_h, D_on); ``observe`` records the transition.  With the deployment
     rule ``paper`` (Algorithm 1) transitions join the context D_on at the end of the episode; with
-    ``committed``, the default for a model trained on action windows, they join it at once.
+    ``committed``, the default for a model trained on action windows, and with ``growing``, that for Algorithm
+    Distillation, they join it at once.
 
     Arguments may be arrays, lists or torch tensors; they are copied, and so is what a method returns.  A copy
     (``copy.deepcopy``, ``pickle``) has the same context and draws the same actions.  Calls from several threads are done

@@ -38,8 +38,8 @@ def load_agent(
 
     ``what``: a run folder (its newest version), a checkpoint file, or the name of an agent of the package:
     ``load_agent("darkroom")`` loads that agent, ``"./darkroom"`` is a run folder of that name.
-    ``seed``: of the draws of its actions; None: other draws each time.  ``deploy``: the deployment rule, ``paper`` or
-    ``committed``; None: the rule that it was trained for.
+    ``seed``: of the draws of its actions; None: other draws each time.  ``deploy``: the deployment rule, ``paper``,
+    ``committed`` or ``growing``; None: the rule that it was trained for.
     ``threads``: CPU threads of torch while the agent acts and observes; None: the number that torch is set to.  More
     than one helps large batches on idle cores.  On busy cores threads that wait for each other can take a hundred
     times as long (docs/decisions/073-openmp-wait-policy.md).  Outside these calls the process's own number holds.

@@ -31,9 +31,10 @@ class EvaluateArguments:
     worst one of strength p, which is exact for Algorithm 1 (Dark Room)."""
     deploy: Deployment | None = None
     """``paper``: Algorithm 1, the context is fixed within an episode.  ``committed``: every transition
-    joins the context at once, and the agent's own recent actions are its action window.  Default:
-    ``committed`` for an agent trained on action windows (model.window), else ``paper``.  The
-    posterior suite always uses ``paper``."""
+    joins the context at once, and the agent's own recent actions are its action window.  ``growing``: every
+    transition joins the context at once.  Default: ``committed`` for an agent trained on action windows
+    (model.window), ``growing`` for one of the method ``ad``, else ``paper``.  The posterior suite always
+    uses ``paper``."""
     episodes: int | None = None
     """Online episodes.  Default: the run's number (posterior: 40)."""
     seeds: int | None = None

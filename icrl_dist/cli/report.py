@@ -40,9 +40,9 @@ class ReportArguments:
     """Also write the text of the report to this file, as Markdown."""
     common_seeds: bool = False
     """Compare only the training seeds that all compared agents have.  Default: different seeds are refused."""
-    unequal_budgets: bool = False
-    """Compare methods although their budgets differ by more than 10%.  Default: they are refused; smaller differences are
-    named in captions."""
+    unequal_budgets: tuple[str, ...] = ()
+    """Budgets that may differ between compared methods by more than 10%: ``environment_steps``,
+    ``labelled_episodes``, ``optimizer_steps``.  Default: they are refused; smaller differences are named in captions."""
     partial: bool = False
     """Show a figure without the agents whose rows are missing.  Default: missing rows are refused, with the runs
     that make them."""

@@ -55,7 +55,7 @@ COLUMNS: dict[str, Column] = {
     "policy_version": Column("int64", "version of the weights; -1 for an agent without weights of this run"),
     "weights_digest": Column("string", "SHA-256 of the weights; empty for an agent without"),
     "ceiling": Column("bool", "whether the agent is given the task, so that other returns are shown as a share of its own"),
-    "deployment": Column("string", "deployment rule of a model, `paper` or `committed`; empty for other agents"),
+    "deployment": Column("string", "deployment rule of a model, `paper`, `committed` or `growing`; empty for other agents"),
     "data": Column("string", "in suite `offline`: whose episode the context holds, `random` or `expert`; else empty"),
     "prior": Column("string", "`evaluate.prior`: distribution of the test adversaries; empty if they are of training"),
     "task_index": Column("int64", "number of the task among `tasks`"),

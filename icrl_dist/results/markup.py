@@ -28,7 +28,7 @@ class Sheet:
         """The table as HTML."""
         head = "".join(f"<th>{html.escape(name)}</th>" for name in self.columns)
         body = "\n".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
-        title, caption = html.escape(self.title), html.escape(self.caption)
+        title, caption = html.escape(self.title), html.escape(self.caption).replace("\n\n", "<br>")
         return f"<h3>{title}</h3>\n<table>\n<tr>{head}</tr>\n{body}\n</table>\n<p class='caption'>{caption}</p>"
 
     def data(self) -> dict[str, Any]:

@@ -9,12 +9,13 @@ from typing import Any
 
 from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError
+from icrl_dist.config.toml import nearest
 from icrl_dist.results import page
 from icrl_dist.results.claims import costs, icaa, questions
 from icrl_dist.results.claims import sheets as claim_sheets
 from icrl_dist.results.figures import budgets, catalog, sheets, styles
 from icrl_dist.results.figures.panels import data
-from icrl_dist.results.figures.reading import Rows, files_of
+from icrl_dist.results.figures.reading import BUDGETS, Rows, files_of
 from icrl_dist.results.figures.selection import Rules, Study, is_inferred, study
 from icrl_dist.results.markup import Sheet
 from icrl_dist.storage.files import atomic_write, write_json
@@ -73,7 +74,7 @@ def report(
     out: str | Path | None = None,
     markdown: str | Path | None = None,
     common_seeds: bool = False,
-    unequal_budgets: bool = False,
+    unequal_budgets: Sequence[str] = (),
     partial: bool = False,
 ) -> Report:
     """Figures, tables and the paper's claims, from the result rows of several trainings.
@@ -85,9 +86,9 @@ def report(
 
     ``setting``: the setting of the sweep; None for the only one (claims, the page and figure ``strength``: also those in
     which the disturbance must be inferred).  ``markdown``: a file for the text of the report.
-    ``common_seeds``: compare only training seeds that all compared agents have; ``unequal_budgets``: compare methods whose
-    budgets differ by more than 10%; ``partial``: show a figure without the agents whose rows are missing.  The captions say
-    what was done.
+    ``common_seeds``: compare only training seeds that all compared agents have; ``unequal_budgets``: budgets that may
+    differ by more than 10% (``environment_steps``, ``labelled_episodes``, ``optimizer_steps``); ``partial``: show a figure
+    without the agents whose rows are missing.  The captions say what was done.
 
     Raises ConfigError for an unknown figure or setting, for rows that are missing (the message lists the runs that make
     them), and for seeds, splits, evaluation settings or budgets that differ; StoreError for rows of another format,
@@ -99,7 +100,7 @@ def report(
             raise ConfigError("report: --figure and --claims were given; choose one, or give neither for the whole report")
     files = files_of(sources)
     folder = path_of("out", out) if out is not None else _beside(files[0])
-    rows, rules = Rows(files), Rules(common_seeds, unequal_budgets, partial)
+    rows, rules = Rows(files), Rules(common_seeds, _budgets(unequal_budgets), partial)
     if figure is not None:
         section, written = _figure(rows, setting, rules, figure, folder)
         found = Report((section,), (), tuple(written))
@@ -114,6 +115,17 @@ def report(
         atomic_write(path, lambda file: file.write(found.markdown().encode()))
         found = Report(found.sections, found.refused, (*found.files, path))
     return found
+
+
+def _budgets(given: Sequence[str]) -> tuple[str, ...]:
+    """Names of budgets.  Raises ConfigError, with the nearest name, for another."""
+    names = (given,) if isinstance(given, str) else tuple(given)
+    for name in names:
+        if name not in BUDGETS:
+            raise ConfigError(
+                f"--unequal-budgets {name}: no such budget{nearest(name, BUDGETS)}; choose of {', '.join(BUDGETS)}"
+            )
+    return names
 
 
 def _beside(file: Path) -> Path:

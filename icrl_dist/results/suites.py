@@ -46,7 +46,7 @@ def evaluate(
     ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
     of a random or an expert episode; ``posterior`` for the distance to the exact posterior; ``attack`` for one episode,
     given its context, without adversary, under sampled ones and under the worst one (Dark Room).
-    ``deploy``: the deployment rule, ``paper`` or ``committed``; None for the rule that the model was trained for.
+    ``deploy``: the deployment rule, ``paper``, ``committed`` or ``growing``; None for the rule that the model was trained for.
     Suite ``posterior`` always uses ``paper``.
     ``episodes``: online episodes; ``seeds``: evaluations per task; ``p``: override probabilities of the test adversary,
     0 to 1; ``prior``: distribution of the test adversaries; evaluation e of a task is under adversary draw e.  None: the

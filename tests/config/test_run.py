@@ -49,8 +49,9 @@ def test_every_number_has_a_docstring() -> None:
     ]
     assert {"AdversaryConfig", "SACConfig", "AlertsConfig", "DarkRoomConfig", "ControlConfig"} <= {s.__name__ for s in sections}
     for section in (Run, *sections):
-        source = inspect.getsource(section).splitlines()
         for item in dataclasses.fields(section):
+            owner = next(one for one in section.__mro__ if item.name in inspect.get_annotations(one))
+            source = inspect.getsource(owner).splitlines()
             line = next(i for i, text in enumerate(source) if text.startswith(f"    {item.name}: "))
             assert section is Run or source[line + 1].startswith('    """'), f"{section.__name__}.{item.name} has no docstring"
 
@@ -83,7 +84,7 @@ def test_values_are_read_into_their_fields() -> None:
         ("[evaluate]\np = 0.2", ["evaluate.p = 0.2", "expected a list"]),
         ('[evaluate]\np = [0.2, "x"]', ["evaluate.p = 'x'", "expected float, got str"]),
         # Bad choices.
-        ('method = "ppo"', ["method = 'ppo'", "choose one of ardt, dpt, dr, experts, icaa, icag, mix_dpt, prompt_dt"]),
+        ('method = "ppo"', ["method = 'ppo'", "choose one of ad, ardt, dpt, dr, experts, icaa, icag, mix_dpt, prompt_dt"]),
         ("method = 3", ["method = 3", "expected str, got int"]),
         ('[darkroom]\nlabels = "hard"', ["darkroom.labels = 'hard'", "'soft', 'sampled', 'heuristic'"]),
         ('[learner]\ndevice = "tpu"', ["learner.device = 'tpu'", "choose one of 'auto', 'cpu', 'cuda'"]),

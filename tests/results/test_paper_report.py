@@ -131,7 +131,7 @@ def test_a_null_effect_is_not_shown_and_an_opposite_one_not_held(tmp_path):
     assert found[2].verdict == "not held"
     assert {one.verdict for one in found[2].findings if one.comparison.startswith("ICAG")} == {"held"}
     assert found[5].verdict == "not decidable"
-    assert "room/dpt, seeds 0 to 5 (offline, p = 0)" in found[5].findings[0].reason
+    assert "room/dpt, seeds 0 to 5 (evaluated at offline p = 0 expert data)" in found[5].findings[0].reason
 
 
 def test_verdicts():
@@ -233,9 +233,13 @@ def test_unequal_budgets_and_missing_methods_are_shown_only_on_demand(tmp_path):
     path = write(tmp_path, small(tmp_path, agents=agents, columns={"icag": {"optimizer_steps": 9}}), offline=False)
     with pytest.raises(ConfigError, match="these runs make them: room/prompt_dt, seeds 0 to 5; room/mix_dpt"):
         report(path, figure="2", out=tmp_path)
-    with pytest.raises(ConfigError, match="optimizer_steps is 9 of room/icag .* and 300 of room/dpt"):
+    with pytest.raises(ConfigError, match=r"optimizer_steps is 9 of room/icag .* and 300 of room/dpt"):
         report(path, figure="2", out=tmp_path, partial=True)
-    text = str(report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=True))
+    with pytest.raises(ConfigError, match="optimizer_steps is 9 of"):
+        report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=["labelled_episodes"])
+    with pytest.raises(ConfigError, match="no such budget; did you mean 'optimizer_steps'"):
+        report(path, figure="2", out=tmp_path, partial=True, unequal_budgets="optimiser_steps")
+    text = str(report(path, figure="2", out=tmp_path, partial=True, unequal_budgets=["optimizer_steps"]))
     assert (
         "No rows of prompt-DT, mix-DPT, ICAA" in text and "Budgets differ: optimizer_steps is 9 of icag and 300 of dpt" in text
     )
@@ -312,7 +316,7 @@ def test_deployment_rules_are_shown_beside_each_other(tmp_path):
 
     paper = small(tmp_path, agents=agents, mean=mean)
     own = small(
-        tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns=dict.fromkeys(agents, {"deployment": "committed"})
+        tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns={name: {"deployment": "committed"} for name in agents}
     )
     rows = Rows([write(tmp_path, paper, own, offline=False)])
     panels = catalog.numbers("deployment", rows, None, Rules())
@@ -320,6 +324,14 @@ def test_deployment_rules_are_shown_beside_each_other(tmp_path):
     assert found["committed"] - found["Algorithm 1"] == pytest.approx(7, abs=0.1)
     shown = study(rows, None, Rules()).model("icag", 0.2)
     assert shown is not None and shown.key.deployment == "paper", "other figures show Algorithm 1"
+
+
+def test_a_figure_with_some_panels_names_the_others(tmp_path):
+    agents = {"dpt": ("t0",), "icag": ("t0",)}
+    path = write(tmp_path, small(tmp_path, agents=agents), offline=False)
+    text = str(report(path, figure="3", out=tmp_path, partial=True))
+    assert "**3b: " in text and "**3a: " not in text
+    assert "Left out: figure 3a: rows are missing; these runs make them: room/dpt, seeds 0 to 5 (evaluated at offline" in text
 
 
 def test_small_differences_of_budgets_are_named(tmp_path):

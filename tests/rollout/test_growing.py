@@ -9,7 +9,7 @@ from icrl_dist.config.sections import ContextConfig
 from icrl_dist.models.sampling import sample
 from icrl_dist.problems import registry
 from icrl_dist.rollout import deployment
-from icrl_dist.rollout.deployment import GrowingPolicy
+from icrl_dist.rollout.deployment import GrowingPolicy, InContextPolicy
 from icrl_dist.rollout.episode import deploy_offline, deploy_online, episode
 from icrl_dist.rollout.policies import RandomPolicy
 from tests.rollout.test_deployment import HORIZON, logits_of, model, rngs, variations
@@ -60,7 +60,8 @@ def test_episodes_of_other_policies_come_before_its_own(model, variations):
 
 
 def test_every_transition_joins_the_context_at_once(model, variations):
-    policy, state = GrowingPolicy(model, 3, ContextConfig()), np.ones((3, 2), np.float32)
+    policy: InContextPolicy = GrowingPolicy(model, 3, ContextConfig())
+    state = np.ones((3, 2), np.float32)
     for count in range(2 * HORIZON):
         assert len(policy.context(1)[1]) == count
         if count % 3:  # some transitions arrive without a decision in between
@@ -69,4 +70,4 @@ def test_every_transition_joins_the_context_at_once(model, variations):
             assert policy.length == count
         done = count % HORIZON == HORIZON - 1
         policy.observe(state, np.full(3, count % 5), np.full(3, count % 2, np.float32), state, done)
-    assert policy.length == 2 * HORIZON
+    assert policy.length == 2 * HORIZON and policy.frozen(state) is None

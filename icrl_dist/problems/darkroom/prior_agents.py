@@ -24,9 +24,10 @@ from icrl_dist.rollout.policies import DiscretePolicy
 from icrl_dist.types import NULL, Adversary, Variation
 
 PriorRule = Literal["paper", "committed"]
-LEVELS: dict[Disturbance, int] = {"override": 8, "wind": 8, "permuted": 5}
-"""Strengths p in ICAG's prior: 32 overrides, 32 winds or 35 permuted controls.  Twice as many change no return
-(docs/decisions/107-inferred-disturbances.md)."""
+LEVELS: dict[Disturbance, int] = {"override": 8, "wind": 8, "permuted": 8}
+"""Strengths p in ICAG's prior: 32 overrides, 32 winds or 56 permuted controls.  Twice as many show no other return
+(docs/results/ceilings.md).  The numbers are even: of an odd number one would be p_max / 2, and at p = 1/2 the controls
+are mirrored as often as not, so that no action is better than its opposite."""
 _LEAST = 1e-9
 """Least probability of a transition under a hypothesis, so no transition refutes all of them."""
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from icrl_dist.results import statistics
-from icrl_dist.results.claims.findings import NOT_DECIDABLE, SEEDS, UNKNOWN, Finding, verdict
+from icrl_dist.results.claims.findings import NOT_DECIDABLE, UNKNOWN, Finding, few, verdict
 from icrl_dist.results.figures.reading import Arm
 from icrl_dist.results.figures.selection import Study
 from icrl_dist.storage.files import StoreError
@@ -60,8 +60,9 @@ def findings(study: Study, known: Ledger) -> Iterator[Finding]:
             continue
         scores = np.array([[[[values[name][seed]]] for seed in seeds] for name in ("icag", "icaa")], float)
         (effect,) = statistics.estimate(scores, lambda of: statistics.mean(of[:, :1] - of[:, 1:]))
-        few = f"{len(seeds)} training seeds, and at least {SEEDS} are needed" if len(seeds) < SEEDS else ""
-        yield Finding(comparison, effect, UNKNOWN, math.nan, len(seeds), verdict(effect, 1, len(seeds)), few, "{:+,.0f}")
+        yield Finding(
+            comparison, effect, UNKNOWN, math.nan, len(seeds), verdict(effect, 1, len(seeds)), few(len(seeds)), "{:+,.0f}"
+        )
 
 
 def cost(arm: Arm, column: str, known: Ledger) -> dict[int, float]:

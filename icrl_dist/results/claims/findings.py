@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.results import statistics
-from icrl_dist.results.figures.choices import Choice, Spot
+from icrl_dist.results.figures.choices import Choice, Spot, run_of
 from icrl_dist.results.figures.reading import Arm
 from icrl_dist.results.figures.selection import MissingError, Study
 from icrl_dist.results.returns import LAST
@@ -68,6 +68,11 @@ def verdict(effect: Interval, sign: int, seeds: int) -> str:
     return {0: NOT_SHOWN, sign: HELD}.get(side, NOT_HELD)
 
 
+def few(seeds: int) -> str:
+    """Why so many training seeds decide nothing; empty for enough."""
+    return "" if seeds >= SEEDS else f"{statistics.counted(seeds, 'training seed')}, and at least {SEEDS} are needed"
+
+
 def together(verdicts: Sequence[str]) -> str:
     """The verdict of a claim with several comparisons: it held only if each did."""
     order = (NOT_HELD, NOT_DECIDABLE, NOT_SHOWN, HELD)
@@ -77,16 +82,10 @@ def together(verdicts: Sequence[str]) -> str:
 def arms_of(study: Study, what: str, terms: Sequence[Term]) -> list[Arm]:
     """The arms of the terms.  Raises MissingError for those without rows, ConfigError for those that may not be compared."""
     found = [term.choice.at(study, term.spot) for term in terms]
-    missing = [_run(study, term) for term, arm in zip(terms, found, strict=True) if arm is None]
+    missing = [run_of(study, t.choice, [t.spot]) for t, arm in zip(terms, found, strict=True) if arm is None]
     if missing:
         raise MissingError(what, missing)
     return study.comparable([arm for arm in found if arm is not None], what)
-
-
-def _run(study: Study, term: Term) -> str:
-    where = f"{term.spot.suite}, " if term.spot.suite != "online" else ""
-    prior = f" {term.spot.prior}" if term.spot.p else ""
-    return f"{study.run(term.choice.variant or term.choice.style)} ({where}p = {term.spot.p:g}{prior})"
 
 
 def answer(study: Study, question: Question) -> Finding:
@@ -102,7 +101,7 @@ def answer(study: Study, question: Question) -> Finding:
     effect, overall = statistics.estimate(scores, _weighted(weights), all(arm.crossed for arm in arms))
     certified = float(weights @ [arm.worst() for arm in arms])
     seeds = len(arms[0].seeds)
-    reason = f"{seeds} training seeds, and at least {SEEDS} are needed" if seeds < SEEDS else ""
+    reason = few(seeds)
     found = verdict(effect, question.sign, seeds)
     return Finding(question.comparison, effect, overall, certified, seeds, found, reason, question.form)
 

@@ -39,14 +39,14 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
             mark = f" [{notes.setdefault(one.reason, len(notes) + 1)}]" if one.reason else ""
             rows.append(("", *_cells(one), str(one.seeds), f"{one.verdict}{mark}"))
     caption = (
-        "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn "
-        "with all their tasks where these are their own. The verdict is that of the last episodes: held, if the interval "
-        "lies on the claimed side of 0; not held, if on the other; not shown, if it holds 0. A claim held only if each of its comparisons did. "
-        "Certified: the same difference of exact worst-case returns"
+        "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn with all "
+        "their tasks where these are their own. The verdict is that of the last episodes: held, if the interval lies on the "
+        "claimed side of 0; not held, if on the other; not shown, if it holds 0. A claim held only if each of its comparisons "
+        "did. Certified: the same difference of exact worst-case returns"
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")
     return Sheet(
-        "The claims one by one", columns, tuple(rows), caption + "".join(f". [{n}] {note}" for note, n in notes.items())
+        "The claims one by one", columns, tuple(rows), caption + "".join(f"\n\n[{n}] {note}" for note, n in notes.items())
     )
 
 

@@ -72,19 +72,38 @@ def entries(study: Study, what: str, choices: Sequence[Choice], spots: Sequence[
     """
     found: list[tuple[Choice, list[Arm]]] = []
     lacking: list[Choice] = []
+    absent: dict[Choice, list[Spot]] = {}
     for choice in choices:
-        arms = [arm for arm in (choice.at(study, spot) for spot in spots) if arm is not None]
+        every = [choice.at(study, spot) for spot in spots]
+        arms = [arm for arm in every if arm is not None]
+        absent[choice] = [spot for spot, arm in zip(spots, every, strict=True) if arm is None]
         if len(arms) == len(spots):
             found.append((choice, arms))
         elif choice.needed or not is_reference(choice.style) or choice.style in REFERENCES:
             lacking.append(choice)
+    if any(choice.style == "exact:icag" for choice, _ in found):  # ``exact:paper`` is the exact agent of a run without it
+        found = [(choice, arms) for choice, arms in found if choice.style != "exact:paper"]
     needed = [choice for choice in lacking if choice.needed]
     if (needed and not study.rules.partial) or not any(not is_reference(choice.style) for choice, _ in found):
-        raise MissingError(what, [study.run(choice.variant or choice.style) for choice in needed or lacking or choices])
+        raise MissingError(what, [run_of(study, choice, absent[choice]) for choice in needed or lacking or choices])
     same = iter(study.comparable([arm for _, arms in found for arm in arms], what))
     groups = [spot.group for spot in spots]
     shown = [Entry(choice.label, choice.style, [next(same) for _ in arms], groups) for choice, arms in found]
     return shown, _note(study, lacking, [entry.arms[0] for entry in shown if not is_reference(entry.style)])
+
+
+def run_of(study: Study, choice: Choice, absent: Sequence[Spot]) -> str:
+    """The runs that make rows of an agent; of runs that have some, also the places that were not evaluated."""
+    name = choice.variant or (EXACT if is_reference(choice.style) else choice.style)
+    if not any(key.variant == name for key in study.keys):
+        return study.run(name)
+    places = [
+        " ".join(
+            part for part in (one.suite, f"p = {one.p:g}", one.prior if one.p else "", one.data and f"{one.data} data") if part
+        )
+        for one in absent
+    ]
+    return f"{study.run(name)} (evaluated at {', '.join(places)})" if places else study.run(name)
 
 
 def _note(study: Study, lacking: Sequence[Choice], models: Sequence[Arm]) -> str:

@@ -23,5 +23,6 @@ def numbers(study: Study, letter: str = "") -> list[Panel]:
 def choice(study: Study, count: int) -> Choice:
     """ICAG with K = ``count``; a variant without rows has the name that a sweep gives it."""
     variant = study.variant("icag", count)
-    style = "icag" if variant or count == 8 else f"icag-k{count}"
+    free = not any(key.variant == "icag" for key in study.keys)
+    style = "icag" if variant or (count == 8 and free) else f"icag-k{count}"
     return Choice(style, variant, f"ICAG, K = {count}")

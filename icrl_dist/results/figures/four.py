@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from icrl_dist.results.figures import panels
-from icrl_dist.results.figures.choices import Choice, Spot, entries
+from icrl_dist.results.figures.choices import Choice, Spot, entries, run_of
 from icrl_dist.results.figures.panels import Panel
 from icrl_dist.results.figures.selection import MissingError, Study
 from icrl_dist.results.returns import LAST
@@ -39,7 +39,8 @@ def against_p(study: Study, name: str, choices: Sequence[Choice], title: str = "
     several = [levels for c in choices if c.variant and len(levels := study.levels(c.variant)) > 1]
     levels = several[0] if several else []
     if not levels:
-        raise MissingError(f"figure {name}", [study.run(choice.variant or choice.style) for choice in choices if choice.needed])
+        places = [Spot(p) for p in (0.0, 0.2, 0.4, 0.6)]
+        raise MissingError(f"figure {name}", [run_of(study, choice, places) for choice in choices if choice.needed])
     shown, note = entries(study, f"figure {name}", choices, [Spot(p) for p in levels])
     arms = [arm for entry in shown for arm in entry.arms]
     episodes = arms[0].returns.shape[3]
@@ -66,7 +67,7 @@ def four(study: Study, number: str, choices: Sequence[Choice], letter: str = "")
 
 
 def allowed(study: Study, makers: Sequence[Callable[[], list[Panel]]]) -> list[Panel]:
-    """The panels of all makers; with ``rules.partial`` without those whose rows are missing, unless none is left."""
+    """The panels of all makers; with ``rules.partial`` without those whose rows are missing, which the last caption names."""
     found: list[Panel] = []
     missing: list[MissingError] = []
     for make in makers:
@@ -76,4 +77,5 @@ def allowed(study: Study, makers: Sequence[Callable[[], list[Panel]]]) -> list[P
             missing.append(error)
     if missing and (not found or not study.rules.partial):
         raise MissingError(str(missing[0]).split(":")[0], [run for error in missing for run in error.runs])
-    return found
+    notes = ". ".join(f"Left out: {error}" for error in missing)
+    return [*found[:-1], panels.with_note(found[-1], notes)]

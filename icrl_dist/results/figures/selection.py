@@ -39,8 +39,8 @@ class Rules:
 
     common_seeds: bool = False
     """Compare only the training seeds that all of them have."""
-    unequal_budgets: bool = False
-    """Compare methods whose budgets differ."""
+    unequal_budgets: tuple[str, ...] = ()
+    """Budgets, of ``BUDGETS``, that may differ between compared methods."""
     partial: bool = False
     """Show a figure without the arms whose rows are missing, and say which."""
 
@@ -175,10 +175,12 @@ class Study:
 
     def _check_budgets(self, arms: Sequence[Arm], what: str) -> None:
         models = [arm for arm in arms if AgentKey(arm.key.agent).is_model]
-        for column, one, two in () if self.rules.unequal_budgets else unequal(models, SAME):
+        for column, one, two in unequal(models, SAME):
+            if column in self.rules.unequal_budgets:
+                continue
             raise ConfigError(
                 f"{what}: {column} is {of_budget(one, column):.12g} of {_who(one)} and {of_budget(two, column):.12g} of "
-                f"{_who(two)}: train both with equal budgets, or compare them all the same with --unequal-budgets"
+                f"{_who(two)}: train both with equal budgets, or compare them all the same with --unequal-budgets {column}"
             )
 
 

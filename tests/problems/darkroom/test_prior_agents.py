@@ -16,7 +16,7 @@ from icrl_dist.problems.darkroom import room as darkroom
 from icrl_dist.problems.darkroom import solver
 from icrl_dist.problems.darkroom.adversaries import Disturbance, grid
 from icrl_dist.problems.darkroom.config import DarkRoomConfig
-from icrl_dist.problems.darkroom.prior_agents import Prior, PriorAgent, PriorRule, dpt_prior, icag_prior
+from icrl_dist.problems.darkroom.prior_agents import LEVELS, Prior, PriorAgent, PriorRule, dpt_prior, icag_prior
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.problems.darkroom.solver import Hypotheses
 from icrl_dist.results import evaluate
@@ -129,6 +129,7 @@ def test_phi_0_has_its_share_of_the_prior() -> None:
     without = icag_prior(room(), AdversaryConfig(count=4, null=False, p_max=0.6))
     np.testing.assert_allclose(np.exp(without.log_weight), 1 / 32)
     assert len(grid("permuted", ACTIONS, 1.0, 5)) == 35 and len(grid("override", ACTIONS, 1.0, 8)) == 32
+    assert all(a.number("p") != 0.5 for kind, levels in LEVELS.items() for a in grid(kind, ACTIONS, 1.0, levels))
     assert grid("override", ACTIONS, 1.0, 8) == grid("override", ACTIONS, 1.0, 8)
 
 
