@@ -60,7 +60,8 @@ class ICAA(DPT):
         def choose(index: int, task: Task) -> tuple[Variation, ...]:
             return self.training_variations(run, index, task, phase.round)
 
-        return jobs.rollouts(run, phase, choose, self.deployment(run))
+        icaa = run.icaa
+        return jobs.rollouts(run, phase, choose, icaa.trials + 1, self.deployment(run), icaa.explore, icaa.context_trials + 1)
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
         """Lines 13 to 19: contexts are the first trials, labels come from later ones; D_pre is the union over rounds."""

@@ -53,11 +53,15 @@ def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], tri
     return tuple(jobs)
 
 
-def rollouts(run: Run, phase: Phase, choose: Choose, rule: Deployment) -> tuple[Job, ...]:
-    """Jobs that deploy T^j in every variation for N + 1 trials, without labels; episodes start as test episodes do."""
-    icaa = run.icaa
-    payload = Rollouts(run.context.max, rule, run.context.decoder, icaa.explore, icaa.context_trials + 1)
-    return grouped(run, phase, _at_test_start(run, choose), icaa.trials + 1, payload)
+def rollouts(
+    run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployment, explore: float = 0.0, explore_from: int = 0
+) -> tuple[Job, ...]:
+    """Jobs that deploy T^j in every variation, without labels; episodes start as test episodes do.
+
+    From trial ``explore_from`` on actions are random with probability ``explore``.
+    """
+    payload = Rollouts(run.context.max, rule, run.context.decoder, explore, explore_from)
+    return grouped(run, phase, _at_test_start(run, choose), trials, payload)
 
 
 def labelled_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment], trials: int) -> tuple[Job, ...]:

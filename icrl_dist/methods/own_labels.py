@@ -17,6 +17,7 @@ from icrl_dist.types import Trajectory
 
 Labels = tuple[Float32[np.ndarray, "Q S"], Float32[np.ndarray, "Q A"]]
 """Query states and their labels."""
+_Numbered = tuple[Float32[np.ndarray, "M S"], Int[np.ndarray, "N H"], Int[np.ndarray, "N H"], Int[np.ndarray, "N H"]]
 
 
 def of_actions(trials: Sequence[Trajectory]) -> Labels:
@@ -68,7 +69,7 @@ def of_transitions(trials: Sequence[Trajectory], gamma: float, slack: float) -> 
     return _best(states, value, visits, slack)
 
 
-def _numbered(trials: Sequence[Trajectory]) -> tuple[Float32[np.ndarray, "M S"], Int[np.ndarray, "N H"], ...]:
+def _numbered(trials: Sequence[Trajectory]) -> _Numbered:
     """The distinct states; by trial and step the number of the state, the action, and the number of the next state."""
     observations = np.stack([t.observations for t in trials])
     states, number = np.unique(observations.reshape(-1, observations.shape[2]), axis=0, return_inverse=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -135,7 +136,9 @@ def test_labels_of_transitions_are_optimal_where_the_undisturbed_actions_are_not
 
 
 @pytest.mark.parametrize("labels", ["returns", "transitions"])
-def test_contexts_are_trials_0_to_n_and_every_trial_is_compared(small_run: Run, labels: str) -> None:
+def test_contexts_are_trials_0_to_n_and_every_trial_is_compared(
+    small_run: Run, labels: Literal["returns", "transitions"]
+) -> None:
     """The first trial that finds the goal is the last one: its states have labels all the same, and it is no context."""
     run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, labels=labels, label_gamma=0.5))
     trials = walks(run, Adversary.of("null"), 5)
@@ -233,7 +236,7 @@ def test_explored_trials_differ_only_after_the_contexts(small_run: Run) -> None:
         ({"context": "any"}, {}, "icaa.context"),
     ],
 )
-def test_labels_that_do_not_fit_are_refused(small_run: Run, icaa: dict[str, str], model: dict[str, int], key: str) -> None:
+def test_labels_that_do_not_fit_are_refused(small_run: Run, icaa: dict[str, Any], model: dict[str, int], key: str) -> None:
     run = dataclasses.replace(
         small_run, icaa=dataclasses.replace(small_run.icaa, **icaa), model=dataclasses.replace(small_run.model, **model)
     )
