@@ -28,7 +28,7 @@ from tests.results.test_evaluate import folder, references, untrained
 
 __all__ = ["folder", "untrained"]
 
-CERTIFIABLE = ["random", "exact:paper", "oracle"]
+CERTIFIABLE = ["random", "exact:paper", "exact:dpt", "exact:icag", "oracle"]
 
 
 def with_evaluation(run, **settings):
@@ -139,7 +139,7 @@ def test_agents_that_are_fixed_within_an_episode_have_a_certified_return_and_oth
         if one.agent.key == "oracle" and one.p == 0:
             np.testing.assert_allclose(certified[:, :, -1], known(one.optimum))
     text = rendered(returns_table(frame(*(one.block(run, "run", "evaluated") for one in found)), ""))
-    assert text.count("estimated") == 1 + 2 * 4 and "against the worst adversary of strength p" in unwrapped(text)
+    assert text.count("estimated") == 1 + 2 * 6 and "against the worst adversary of strength p" in unwrapped(text)
 
 
 @pytest.mark.integration
