@@ -76,9 +76,8 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
 
 CERTIFIED = (
     "certified: mean expected return of these episodes, each given its context, against the worst adversary of strength p "
-    "(exact; in Dark Room one that overrides actions, also in runs with winds or permuted controls; it does not cover an "
-    "adversary that also acted while the context was collected); estimated: no such value, the worst of the sampled "
-    "adversaries of each task instead"
+    "(exact; it does not cover an adversary that also acted while the context was collected); estimated: no such value, the "
+    "worst of the sampled adversaries of each task instead"
 )
 """Caption of the column ``certified``."""
 

@@ -259,8 +259,9 @@ class DarkRoomProblem(Problem):
         return RoomPosteriorSuite(self.config)
 
     @property
-    def certify(self) -> RoomCertificate:
-        return RoomCertificate(self.config.size)
+    def certify(self) -> RoomCertificate | None:
+        """Only for overrides: the worst override adversary says nothing about winds and permuted controls."""
+        return RoomCertificate(self.config.size) if self.config.disturbance == "override" else None
 
     @property
     def game(self) -> MakeGame:

@@ -130,6 +130,12 @@ def test_the_optimal_agent_earns_the_optimal_return(adversary: Adversary) -> Non
         assert abs(earned.mean() - expected) <= 4 * error + 1e-9 and expected <= promised + 1e-9
 
 
+@pytest.mark.parametrize("kind", ["override", "wind", "permuted"])
+def test_only_overrides_have_an_exact_worst_case(small_run: Run, kind: str) -> None:
+    problem = registry.of(override(small_run, [f"darkroom.disturbance={kind}"], "test"))
+    assert (problem.certify is not None) == (kind == "override")
+
+
 @pytest.mark.parametrize("kind", ["wind", "permuted"])
 def test_a_job_labels_contexts_and_windows_of_the_disturbed_optimum(small_run: Run, kind: str) -> None:
     """Contexts are disturbed, and labels, also those of windows, are optimal for goal and adversary."""
