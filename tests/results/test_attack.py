@@ -141,7 +141,7 @@ def test_agents_that_are_fixed_within_an_episode_have_a_certified_return_and_oth
     text = rendered(returns_table(frame(*(one.block(run, "run", "evaluated") for one in found)), ""))
     text = unwrapped(text)
     assert text.count("estimated") == 1 + 2 * 6
-    assert "against the worst adversary of strength p (exact; in Dark Room one that overrides actions" in text
+    assert "against the worst adversary of strength p (exact" in text
 
 
 @pytest.mark.integration
