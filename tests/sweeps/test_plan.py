@@ -67,6 +67,13 @@ def test_the_base_run_may_be_a_file_beside_the_sweep_file(tmp_path):
         ('run = "smoke"', 'run = "smok"', "did you mean 'smoke'?"),
         ('run = "smoke"', 'run = "smoke"\nsplits = 1', "unknown key splits"),
         ("split_seed = ", 'split_seed = "sed" # ', "split_seed = 'sed': use \"seed\""),
+        ('method = "dpt"', 'method = "dpt"\nseed = 7', "[methods.dpt]: seed = 7: training seeds are those of seeds"),
+        (
+            'method = "dpt"',
+            'method = "dpt"\ndarkroom.split_seed = 7',
+            "[methods.dpt]: darkroom.split_seed: split_seed of the file",
+        ),
+        ("[settings.strong]", "[settings.strong]\nseed = 3", "[settings.strong]: seed = 3"),
         ("[methods.icag-k2]", '[methods."a/b"]', "use letters, digits and . _ -"),
         ("[evaluations.unseen]", "[evaluations.training]", "[evaluations.training]"),
         ("[settings.override]", "[settings]\noverride = 3", "expected a table"),
