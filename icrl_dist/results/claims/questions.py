@@ -39,7 +39,7 @@ def claims(study: Study, ledger: costs.Ledger) -> list[Claim]:
         if everywhere or not is_inferred(study.setting):
             findings = tuple(answer(study, question) for question in questions(study))
             found.append(Claim(number, text, study.setting, findings))
-    text = "ICAA is cheaper than ICAG"
+    text = "A label of ICAA is cheaper than one of ICAG"
     return [*found, Claim(len(_CLAIMS) + 1, text, study.setting, tuple(costs.findings(study, ledger)))]
 
 
