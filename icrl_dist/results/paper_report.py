@@ -101,6 +101,8 @@ def report(
             raise ConfigError("report: --figure and --claims were given; choose one, or give neither for the whole report")
     files = files_of(sources)
     folder = path_of("out", out) if out is not None else _beside(files[0])
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"--out {folder}: is a file; name a folder, such as report")
     path = None if markdown is None else path_of("markdown", markdown)
     if path is not None and (path.is_dir() or not path.name):
         raise ConfigError(f"--markdown {str(markdown)!r}: is a folder; name a file, such as report.md")

@@ -210,8 +210,9 @@ def _gather(made: Plan, show: Any) -> tuple[list[dict[str, Any]], int]:
         if found.done(one) and file.is_file():
             files.append(file)
             runs.append(_described(one, found))
-    write_json(made.out / "runs.json", runs)
-    return runs, rows.join(files, made.out / "rows.parquet")
+    count = rows.join(files, made.out / "rows.parquet")
+    write_json(made.out / "runs.json", runs)  # after the rows: a damaged file leaves both as they were
+    return runs, count
 
 
 def _described(member: Member, found: State) -> dict[str, Any]:

@@ -343,6 +343,23 @@ def test_small_differences_of_budgets_are_named(tmp_path):
         report(write(tmp_path / "wide", wide, offline=False), figure="2", out=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--out", "FILE"], r"--out \S+/file: is a file; name a folder"),
+        (["--claims", "--markdown", ""], r"--markdown '\.': is a folder; name a file"),
+        (["--claims", "--markdown", "FOLDER"], r"--markdown '\S+': is a folder; name a file"),
+    ],
+)
+def test_where_nothing_can_be_written_is_said_before_anything_is_made(tmp_path, capsys, options, expected):
+    path = write(tmp_path, small(tmp_path, agents={"dpt": ("t0",)}), offline=False)
+    (tmp_path / "file").touch()
+    words = [{"FILE": str(tmp_path / "file"), "FOLDER": str(tmp_path)}.get(word, word) for word in options]
+    assert main.main(["report", str(path), *words]) == 2
+    error = capsys.readouterr().err
+    assert re.search(expected, error) and error.count("\n") == 1
+
+
 def test_a_claim_needs_five_training_seeds(tmp_path):
     rows = Rows([write(tmp_path, small(tmp_path, seeds=4, levels=(0.0, 0.2, 0.4, 0.6)), offline=False)])
     finding = questions.claims(study(rows, None, Rules()), {})[2].findings[0]
