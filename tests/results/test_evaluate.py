@@ -22,8 +22,8 @@ from icrl_dist.models.weights import weights_of
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.problem import EXPERT
 from icrl_dist.problems.darkroom import divergence, room
-from icrl_dist.problems.darkroom.exact_agents import KEYS, RULES, ExactAgent
-from icrl_dist.problems.darkroom.problem import ORACLE
+from icrl_dist.problems.darkroom.exact_agents import KEYS, ExactAgent
+from icrl_dist.problems.darkroom.problem import ORACLE, DarkRoomProblem
 from icrl_dist.problems.darkroom.solver import Hypotheses, optimal_returns, soft_labels
 from icrl_dist.results import evaluate, plots, statistics, summaries
 from icrl_dist.results.evaluate import Agent
@@ -140,9 +140,8 @@ def test_adaptation_is_measured_relative_to_the_oracle():
 
 
 def test_offline_rows_have_random_and_expert_data(small_run, untrained):
-    every = evaluate.offline(small_run, {Agent("t0", "paper", 0): untrained})
-    rows = [one for one in every if one.agent.key in ("t0", "random", *KEYS.values(), ORACLE)]
-    agents = ["T^0 (icaa)", *RULES.values()]
+    rows = evaluate.offline(small_run, {Agent("t0", "paper", 0): untrained})
+    agents = ["T^0 (icaa)", *DarkRoomProblem.agent_names.values()]
     count = 1 + len(agents)
     found = frame(*(row.block(small_run, "run", "evaluated") for row in rows), suite="offline")
     named = [row["agent"] for row in summaries.result_rows(found)]
@@ -156,7 +155,8 @@ def test_offline_rows_have_random_and_expert_data(small_run, untrained):
 
 def test_exact_agents_find_the_goal_and_know_the_adversary_of_their_row(small_run):
     run = dataclasses.replace(small_run, evaluate=EvaluateConfig(episodes=6, seeds=20, p=(0.0, 0.4), prior="unseen"))
-    agents = {Agent(key): references(run)[key] for key in (*KEYS.values(), ORACLE)}
+    agents = {Agent(key): reference for key, reference in references(run).items() if key != "random"}
+    assert [agent.key for agent in agents] == [*DarkRoomProblem.agent_names, ORACLE]
     results = {(r.agent.key, r.p): r.returns for r in evaluate.online(run, agents)}
     for name in KEYS.values():
         np.testing.assert_array_equal(results[name, 0.0][:, :, -1], results[ORACLE, 0.0][:, :, -1])

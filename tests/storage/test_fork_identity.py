@@ -45,6 +45,8 @@ def another(section: str, cls: type, field: str, value: Any) -> Any:
     hint = typing.get_type_hints(cls)[field]
     if typing.get_origin(hint) is typing.Literal:
         return next(choice for choice in typing.get_args(hint) if choice != value)
+    if hint is bool:
+        return not value
     return value + 1 if hint is int else value / 2 or 0.25
 
 
