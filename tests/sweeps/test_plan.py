@@ -177,7 +177,7 @@ def test_rows_that_cannot_be_joined_leave_the_list_of_runs_as_it_was(tmp_path, m
     def damaged(files, to):
         raise StoreError("damaged")
 
-    monkeypatch.setattr(sweep.rows, "join", damaged)
+    monkeypatch.setattr("icrl_dist.sweeps.rows.join", damaged)
     with pytest.raises(StoreError, match="damaged"):
         sweep._gather(made, None)
     assert not (made.out / "runs.json").exists()
