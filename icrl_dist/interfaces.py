@@ -534,8 +534,9 @@ class UsedLabels(NamedTuple):
     """The labels of a job that a method learns from."""
 
     source: str
-    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions`` of the model, ``logged actions`` of
-    the behavior policies, ``learner's actions`` of a learning agent; ``none`` without labels."""
+    """``optimal``, ``heuristic`` or ``expert`` as ``Trajectory.origin``; ``own actions``, ``own returns`` or
+    ``own transitions`` of the model, as ``icaa.labels``; ``logged actions`` of the behavior policies, ``learner's actions``
+    of a learning agent; ``none`` without labels."""
     trials: int
     """Trials of each variation whose labels are used; at most so many where it depends on returns."""
 

@@ -20,13 +20,13 @@ DISTURBANCES = ("override", "wind", "permuted")
 STRENGTHS = (0.2, 0.4, 0.6, 0.8, 1.0)
 AGENTS = ("random", "exact:dpt", "exact:dpt-committed", "exact:icag", "exact:icag-committed", "exact:paper", "oracle")
 ROOMS = ((7, 35), (10, 100))
-"""Size and horizon of the rooms of the demo and of the paper."""
+"""Size and horizon of the rooms of darkroom-7x7 and of the paper."""
 LAST = 5
 """Episodes at the end that the mean is over."""
 
 
 def run(quick: bool = False, report: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Mean returns in the room of the demo over its last ``LAST`` of 20 episodes, and shares of the optimum.
+    """Mean returns in the room of darkroom-7x7 over its last ``LAST`` of 20 episodes, and shares of the optimum.
 
     Four splits of the goals, each with its own test adversaries and 10 held-out goals, two evaluations of each; ``quick``:
     one split.  ``p_max`` is 1.
@@ -51,7 +51,7 @@ def run(quick: bool = False, report: Callable[[str], None] = lambda text: None) 
 def _run(disturbance: str, split: int, seeds: int) -> Run:
     settings = [f"darkroom.disturbance={disturbance}", f"darkroom.split_seed={split}", f"seed={split}", "adversary.p_max=1.0"]
     settings += [f"evaluate.p={[0.0, *STRENGTHS]}", f"evaluate.seeds={seeds}", "evaluate.episodes=20"]
-    return override(load("demo"), settings, "bench ceilings")
+    return override(load("darkroom-7x7"), settings, "bench ceilings")
 
 
 def _returns(disturbance: str, runs: list[Run]) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ from icrl_dist.config.run import Run, load_run
 from icrl_dist.interfaces import Draw
 from icrl_dist.methods import registry as methods
 
-RUNS = ("demo", "darkroom")
+RUNS = ("darkroom-7x7", "darkroom")
 FIT_OVER_TORCH = 1.5
 """Least steps of a run per step of torch in the same time."""
 STEP_OVER_FLOOR = 2.0
@@ -182,5 +182,5 @@ def describe(result: dict[str, Any]) -> str:
 
 
 def _name(row: dict[str, Any]) -> str:
-    """What a row is called in tables: ``demo, 2 threads``."""
+    """What a row is called in tables: ``darkroom, 2 threads``."""
     return f"{row['run']}, {row['threads']} thread{'s' * (row['threads'] > 1)}"

@@ -67,7 +67,7 @@ def targets() -> dict[str, Target]:
     variations = (trajectory.variation, Variation(trajectory.variation.task, NULL))
     run = make_run()
     problem = registry.of(run)
-    contexts, payload = problem.contexts(run).payload, Rollouts(400, "paper", "auto")
+    contexts, payload = problem.contexts(run).payload, Rollouts(400, "paper", "auto", 0.0, 0)
     job = Job(payload.kind, "adapt", 1, 2, variations, 4, 0, 2**40, payload)
     large_job = dataclasses.replace(job, kind=contexts.kind, payload=contexts, variations=variations * 200)
 

@@ -46,7 +46,7 @@ def run(folder: Path = Path("runs"), trajectories: int = 10_000, kills: int = 3)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix="recovery-") as scratch:
         out = Path(scratch) / "recovery"
-        with training("demo", out, *_settings(trajectories)) as process:
+        with training("darkroom-7x7", out, *_settings(trajectories)) as process:
             endpoint = _wait(lambda: _endpoint(out), process)
             with ZenohLink.connect(endpoint, 60.0) as link:
                 events = _RunEvents(link, out.name, process)

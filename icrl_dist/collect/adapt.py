@@ -9,10 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from icrl_dist.collect.trajectories import trajectory, unlabelled
-from icrl_dist.config.ranges import Positive
+from icrl_dist.config.ranges import NotNegative, Positive, Share
 from icrl_dist.config.sections import ContextConfig, Decoder, Deployment
 from icrl_dist.interfaces import Method, Policy, Problem, WeightSource
 from icrl_dist.rollout.episode import deploy_online
+from icrl_dist.rollout.policies import Exploring
 from icrl_dist.types import Identity, Job, LabelCounts, Payload, Trajectory, Variation
 
 Look = Callable[[Policy, int, Identity, Variation], None]
@@ -30,6 +31,10 @@ class Rollouts(Payload):
     """The deployment rule."""
     decoder: Decoder
     """What computes decisions on a CPU, as ``context.decoder``: the run's own, because digests depend on it."""
+    explore: Share
+    """Probability of a random action, as ``icaa.explore``."""
+    explore_from: NotNegative
+    """The first trial with random actions."""
 
     @property
     def labels(self) -> LabelCounts | None:
@@ -71,7 +76,8 @@ def rollouts(
         labeller = problem.labeller(job, payload.labelling)
     rows = [[Identity(job.stage, job.round, i, k, n) for i, k in job.rows()] for n in range(job.trials)]
     rngs = [[identity.rng(job.seed) for identity in row] for row in rows]
-    for row, generators, ran in zip(rows, rngs, deploy_online(env, policy, rngs), strict=True):
+    acting = Exploring(policy, env.spec.actions, payload.explore, payload.explore_from) if payload.explore else policy
+    for row, generators, ran in zip(rows, rngs, deploy_online(env, acting, rngs), strict=True):
         if ran.diverged is not None and ran.diverged.any():
             lost = [str(identity) for identity, gone in zip(row, ran.diverged, strict=True) if gone]
             raise RuntimeError(f"{', '.join(lost)}: the simulation diverged, so the episode is not used for training")

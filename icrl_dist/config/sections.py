@@ -37,7 +37,9 @@ class AdversaryConfig:
     null: bool = True
     """Whether the task without disturbance, phi_0, is among the variations: a task then has K + 1 of them."""
     p_max: Probability = 0.2
-    """Dark Room: an adversary disturbs a step with probability p ~ U(0, p_max)."""
+    """Dark Room: an adversary disturbs a step with probability p ~ U(p_min, p_max)."""
+    p_min: Probability = 0.0
+    """Dark Room: 0 in the paper; with p_max, every disturbance has this strength."""
 
     @property
     def variations(self) -> int:
@@ -102,9 +104,23 @@ class ICAAConfig:
     """Trials that labels come from.  ``later``: every later trial (Algorithm 3); ``top_return``: the half of
     them with the higher returns; ``improved``: those whose return exceeds the mean return of the context
     trials, so that a variation in which the agent did not improve gives no labels."""
-    context: Literal["trial", "history"] = "history"
-    """``history``: a context is trials 0 to n, as the deployed agent has it (Algorithm 1, line 16);
-    ``trial``: a context is any of the trials, a single one with optim.episodes = 1 (Algorithm 3, line 13)."""
+    labels: Literal["actions", "returns", "transitions"] = "actions"
+    """What labels are made of.  ``actions``: the agent's actions (Algorithm 3).  The other two compare actions by all N + 1
+    trials of a variation, and label each state once with the nearly best ones: ``returns`` by the mean discounted
+    return that followed, ``transitions`` by value iteration on the counted transitions.  They need discrete actions, states
+    that recur, and rewards of at least 0."""
+    label_gamma: Annotated[float, Gt(0), Lt(1), Remedy("a discount below 1")] = 0.9
+    """Discount of these values."""
+    label_slack: Share = 0.03
+    """With ``returns`` and ``transitions`` an action is nearly best if its value is at most this share below the best."""
+    explore: Share = 0.0
+    """Probability of a random action in the trials after the context trials, so that they try actions that T^j does not
+    take.  Contexts stay those of T^j.  0: T^j acts in all trials (Algorithm 3)."""
+    context: Literal["trial", "history", "any"] = "history"
+    """``history``: a context is trials 0 to n for a random n up to N_, as the deployed agent has it (Algorithm 1,
+    line 16); ``trial``: a context is one of the trials 0 to N_ (Algorithm 3, lines 13 and 15); ``any``: 1 to N_ + 1 of all
+    N + 1 trials in any order, so that a few variations give many contexts; not with ``labels = "actions"``, where the
+    labels of a trial would belong to its own context."""
     steps: Positive = 4000
     """Fine-tuning steps per round."""
     learning_rate: Rate = 1e-3

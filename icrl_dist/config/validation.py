@@ -41,6 +41,8 @@ def _objections(run: Run, problem: Any) -> Iterator[Objection]:
         yield "problem", run.problem, "it has no tasks to evaluate on: change its section"
     if not run.adversary.variations:
         yield "adversary.count", 0, "use at least 1, or adversary.null = true, which trains on the tasks without disturbance"
+    if run.adversary.p_min > run.adversary.p_max:
+        yield "adversary.p_min", run.adversary.p_min, f"use 0 to adversary.p_max, which is {run.adversary.p_max:g}"
     icaa, horizon = run.icaa, problem.horizon
     if run.pretrain.contexts < train:
         yield "pretrain.contexts", run.pretrain.contexts, remedy(train, None, "at least one per training task")

@@ -13,7 +13,7 @@ from icrl_dist.config.q_learning import QLearning
 from icrl_dist.config.ranges import Positive
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import Deployment, ModelConfig
-from icrl_dist.interfaces import Draw, LearningHistories, Phase, TrajectoryDataset, UsedLabels
+from icrl_dist.interfaces import Draw, LearningHistories, Method, Phase, TrajectoryDataset, UsedLabels
 from icrl_dist.methods import jobs
 from icrl_dist.methods.dpt import DPT, pretrain_phase
 from icrl_dist.problems import registry
@@ -47,6 +47,7 @@ class AD(DPT):
     name = "ad"
     section = "ad"
     Config = ADConfig
+    distributions = Method.distributions  # type: ignore[assignment]  # a perfect model is far from the exact posterior
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         if run.model.window > 1:
@@ -73,7 +74,9 @@ class AD(DPT):
         """Jobs of histories in every variation; episodes start as test episodes do."""
         found = self._histories(run)
         assert found is not None, "objections refuses a problem without histories"
-        return jobs.grouped(run, phase, self._chosen(run), found.trials, found.payload)
+        return jobs.grouped(
+            run, phase, jobs.at_test_start(run, functools.partial(self._choose, run)), found.trials, found.payload
+        )
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
         """Draws windows of the histories."""
@@ -103,11 +106,6 @@ class AD(DPT):
     def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels:
         """The actions of all episodes."""
         return UsedLabels("learner's actions", job.trials)
-
-    def _chosen(self, run: Run) -> list[tuple[Variation, ...]]:
-        problem = registry.of(run)
-        tasks = map(problem.at_test_start, problem.split.train)
-        return [self.training_variations(run, index, task, 0) for index, task in enumerate(tasks)]
 
     def _histories(self, run: Run) -> LearningHistories | None:
         """The histories of each variation; all variations together have at most ``pretrain.contexts`` episodes."""

@@ -25,6 +25,7 @@ class Budget(NamedTuple):
     environment_steps: int
     """Environment steps: of the episodes, of action windows, and of the training of experts that give demonstrations."""
     optimizer_steps: int
+    """Those of the in-context model; ARDT's return nets take ``ardt.steps`` smaller ones beside these."""
     contexts: int
     """Contexts in all training batches; at most so many if ``optim.transitions`` limits them."""
 

@@ -30,7 +30,7 @@ def pretrain_phase(run: Run) -> Phase:
     return Phase("pretrain", 0, run.pretrain.steps, run.optim.learning_rate)
 
 
-class Histories(NamedTuple):
+class OwnHistories(NamedTuple):
     """The labelled histories of T^j in the rounds after pretraining."""
 
     trials: int
@@ -72,9 +72,9 @@ class DPT(Method):
         rules: tuple[Deployment, ...] = ("paper", "committed", "paper") if run.model.window > 1 else ("paper",)
         return jobs.labelled_rollouts(run, phase, choose, rules, self.histories(run).trials)
 
-    def histories(self, run: Run) -> Histories:
+    def histories(self, run: Run) -> OwnHistories:
         """The histories that the rounds after pretraining collect."""
-        return Histories(run.dagger.trials, run.dagger.new_fraction)
+        return OwnHistories(run.dagger.trials, run.dagger.new_fraction)
 
     def _choose(self, run: Run, index: int, task: Task) -> tuple[Variation, ...]:
         return self.training_variations(run, index, task, 0)

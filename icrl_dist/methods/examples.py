@@ -9,6 +9,7 @@ import numpy as np
 
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw, TrajectoryDataset, VariationKey
+from icrl_dist.methods import own_labels
 from icrl_dist.training import batches
 from icrl_dist.training.batches import Examples, ExamplesCache, LabelledWindows, Pool
 from icrl_dist.types import Trajectory
@@ -26,10 +27,16 @@ def labelled(run: Run, trials: Sequence[Trajectory]) -> Examples:
 def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
     """One variation's trials as examples (Algorithm 3, lines 13 and 14); None if no trial can label.
 
-    The first N_ + 1 trials become contexts.  The states and actions of later trials become query states
-    and labels; ``icaa.label_trials`` selects these trials.
+    The first N_ + 1 trials become contexts, or all of them with ``icaa.context = "any"``.  The states and actions of
+    later trials become query states and labels; ``icaa.label_trials`` selects these trials.  With other ``icaa.labels``
+    than ``actions`` all trials are compared, and each state has one label.
     """
     contexts, later = trials[: run.icaa.context_trials + 1], list(trials[run.icaa.context_trials + 1 :])
+    if run.icaa.labels != "actions":
+        compare = own_labels.of_returns if run.icaa.labels == "returns" else own_labels.of_transitions
+        found = compare(trials, run.icaa.label_gamma, run.icaa.label_slack)
+        episodes = trials if run.icaa.context == "any" else contexts
+        return found and Examples.of(episodes, *found, run.icaa.context == "history")
     if run.icaa.label_trials == "top_return":
         later = sorted(later, key=lambda t: -t.episode_return)[: (len(later) + 1) // 2]
     elif run.icaa.label_trials == "improved":
@@ -37,9 +44,8 @@ def self_labelled(run: Run, trials: Sequence[Trajectory]) -> Examples | None:
         later = [t for t in later if t.episode_return > baseline]
     if not later:
         return None
-    queries = np.concatenate([t.observations[:-1] for t in later])
+    queries, labels = own_labels.of_actions(later)
     actions = np.concatenate([t.actions for t in later])
-    labels = actions if actions.ndim == 2 else np.eye(trials[0].labels.shape[1], dtype=np.float32)[actions]
     length, horizon = run.model.window, len(later[0].actions)
     steps = np.arange(len(later) * horizon).reshape(-1, horizon)[:, : horizon // length * length].ravel()
     rewards = np.concatenate([t.rewards for t in later])

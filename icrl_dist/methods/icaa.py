@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,22 @@ class ICAA(DPT):
         """All variations, with new adversaries in every round (line 11)."""
         return registry.training_variations(run, index, task, round)
 
+    def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        """Labels that compare actions need the same state again, and no labels along action windows."""
+        icaa, problem = run.icaa, registry.of(run)
+        if icaa.explore and not problem.spec.discrete:
+            yield "icaa.explore", icaa.explore, "only discrete actions can be random ones; use 0"
+        if icaa.labels == "actions":
+            if icaa.context == "any":
+                yield "icaa.context", icaa.context, "its contexts hold the trials that label; use history, or other icaa.labels"
+            return
+        if not problem.spec.discrete or problem.limits.reward[0] < 0:
+            yield "icaa.labels", icaa.labels, f"{run.problem} needs discrete actions and no negative rewards; use actions"
+        if icaa.label_trials != "later":
+            yield "icaa.label_trials", icaa.label_trials, f'icaa.labels = "{icaa.labels}" compares all trials; use later'
+        if run.model.window > 1:
+            yield "icaa.labels", icaa.labels, "it labels states, not action windows; use actions, or model.window = 1"
+
     def phases(self, run: Run) -> tuple[Phase, ...]:
         """Lines 3 and 5: T^0 from D^0, then rounds j = 0..J."""
         icaa = run.icaa
@@ -43,7 +60,8 @@ class ICAA(DPT):
         def choose(index: int, task: Task) -> tuple[Variation, ...]:
             return self.training_variations(run, index, task, phase.round)
 
-        return jobs.rollouts(run, phase, choose, run.icaa.trials + 1, self.deployment(run))
+        icaa = run.icaa
+        return jobs.rollouts(run, phase, choose, icaa.trials + 1, self.deployment(run), icaa.explore, icaa.context_trials + 1)
 
     def data(self, run: Run, phase: Phase, dataset: TrajectoryDataset) -> Draw:
         """Lines 13 to 19: contexts are the first trials, labels come from later ones; D_pre is the union over rounds."""
@@ -51,20 +69,26 @@ class ICAA(DPT):
         from icrl_dist.training.batches import CachedExamples, Pool
 
         cache = self._examples(run, dataset)
-        pretrain, episodes = CachedExamples(cache, dataset.variations("pretrain", 0)), run.optim.episodes
+        pretrain = Pool(1.0, CachedExamples(cache, dataset.variations("pretrain", 0)), run.optim.episodes)
         rounds = range(phase.round + 1) if phase.stage == "adapt" else ()
         adapted = [key for j in rounds for key in dataset.variations("adapt", j)]
         labelling = [key for key in adapted if self._has_labels(run, dataset, key)]
         if not labelling:
-            return examples.draw(run, [Pool(1.0, pretrain, episodes)])
+            return examples.draw(run, [pretrain])
         share = run.icaa.new_fraction
+        episodes = 1 if run.icaa.context == "trial" else run.icaa.context_trials + 1
         self_labelled = Pool(share, CachedExamples(cache, labelling), episodes)
-        return examples.draw(run, [Pool(1 - share, pretrain, episodes), self_labelled])
+        return examples.draw(run, [dataclasses.replace(pretrain, share=1 - share), self_labelled])
 
     def used_labels(self, run: Run, phase: Phase, job: Job) -> UsedLabels | None:
-        """In a round the actions of the trials that ``icaa.label_trials`` selects; of ``improved`` ones at most all."""
+        """In a round the actions of the trials that ``icaa.label_trials`` selects, of ``improved`` ones at most all.
+
+        Labels that compare actions use all N + 1 trials.
+        """
         if phase.stage == "pretrain":
             return super().used_labels(run, phase, job)
+        if run.icaa.labels != "actions":
+            return UsedLabels(f"own {run.icaa.labels}", run.icaa.trials + 1)
         later = run.icaa.trials - run.icaa.context_trials
         return UsedLabels("own actions", (later + 1) // 2 if run.icaa.label_trials == "top_return" else later)
 

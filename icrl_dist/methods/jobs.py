@@ -53,9 +53,15 @@ def grouped(run: Run, phase: Phase, chosen: Sequence[tuple[Variation, ...]], tri
     return tuple(jobs)
 
 
-def rollouts(run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployment) -> tuple[Job, ...]:
-    """Jobs that deploy T^j in every variation, without labels; episodes start as test episodes do."""
-    return grouped(run, phase, _at_test_start(run, choose), trials, Rollouts(run.context.max, rule, run.context.decoder))
+def rollouts(
+    run: Run, phase: Phase, choose: Choose, trials: int, rule: Deployment, explore: float = 0.0, explore_from: int = 0
+) -> tuple[Job, ...]:
+    """Jobs that deploy T^j in every variation, without labels; episodes start as test episodes do.
+
+    From trial ``explore_from`` on actions are random with probability ``explore``.
+    """
+    payload = Rollouts(run.context.max, rule, run.context.decoder, explore, explore_from)
+    return grouped(run, phase, at_test_start(run, choose), trials, payload)
 
 
 def labelled_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[Deployment], trials: int) -> tuple[Job, ...]:
@@ -64,14 +70,15 @@ def labelled_rollouts(run: Run, phase: Phase, choose: Choose, rules: Sequence[De
     Episodes start as test episodes do.  Jobs take the deployment rules in turn, because each rule gives
     another kind of history.
     """
-    payload = LabelledRollouts(run.context.max, rules[0], run.context.decoder, registry.of(run).labelling(run))
-    jobs = grouped(run, phase, _at_test_start(run, choose), trials, payload)
+    payload = LabelledRollouts(run.context.max, rules[0], run.context.decoder, 0.0, 0, registry.of(run).labelling(run))
+    jobs = grouped(run, phase, at_test_start(run, choose), trials, payload)
     return tuple(
         dataclasses.replace(job, payload=dataclasses.replace(payload, deploy=rules[(phase.round + number) % len(rules)]))
         for number, job in enumerate(jobs)
     )
 
 
-def _at_test_start(run: Run, choose: Choose) -> list[tuple[Variation, ...]]:
+def at_test_start(run: Run, choose: Choose) -> list[tuple[Variation, ...]]:
+    """The variations of every training task; episodes start as test episodes do."""
     problem = registry.of(run)
     return [choose(i, problem.at_test_start(task)) for i, task in enumerate(problem.split.train)]

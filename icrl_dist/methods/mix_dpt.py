@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le, Lt
 
 from icrl_dist.config.ranges import Positive, Rate, Share, remedy
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Phase
-from icrl_dist.methods.dpt import DPT, Histories, pretrain_phase
+from icrl_dist.methods.dpt import DPT, OwnHistories, pretrain_phase
 from icrl_dist.problems import registry
 from icrl_dist.stream.schema import Remedy
 from icrl_dist.types import Job
@@ -32,7 +32,7 @@ class MixDPTConfig:
     """Episodes per history; each round collects one history of every training task."""
     kappa: Share = 1 / 3
     """Share of the training batches of a round that come from D^0; the other contexts are histories (Wang et al.: 1/3)."""
-    early: Share = 0.4
+    early: Annotated[float, Gt(0), Lt(1), Remedy("must lie between 0 and 1, so that no phase is without steps")] = 0.4
     """Share of the optimizer steps in the early phase (appendix B.1: 40%); the rounds divide the others evenly."""
     learning_rate: Rate = 1e-3
     """Peak learning rate of a round."""
@@ -79,9 +79,9 @@ class MixDPT(DPT):
         contexts = run.pretrain.contexts - of.rounds * of.trials * registry.of(run).train_count
         return super().ask(dataclasses.replace(run, pretrain=dataclasses.replace(run.pretrain, contexts=contexts)), phase)
 
-    def histories(self, run: Run) -> Histories:
+    def histories(self, run: Run) -> OwnHistories:
         of: MixDPTConfig = run.section(self.section)
-        return Histories(of.trials, 1 - of.kappa)
+        return OwnHistories(of.trials, 1 - of.kappa)
 
 
 def steps_of_phases(run: Run) -> list[int]:

@@ -180,8 +180,8 @@ def table(run: Run, found: Sequence[Mapping[str, Any]], title: str, draws: int) 
         f"sampled: of each goal the lowest of {draws} adversaries of "
         "the unseen prior.  certified: against the worst adversary that overrides actions with probability p, knows the policy "
         "and chooses by state and step; exact; the minimax oracle is the best policy against it.  It certifies one episode "
-        "given its context, and not an adversary that also acts while the context is collected; where wind or permuted "
-        "controls disturb, it does not cover them, and the other columns may lie below it.  estimated: the context grows "
+        "given its context, and not an adversary that also acts while the context is collected.  "
+        "estimated: the context grows "
         "within the episode, so nothing is exact and there is no certificate; the worst of the sampled adversaries instead.  "
         "One training: it says nothing about other training seeds"
     )

@@ -223,7 +223,9 @@ def check_suite(run: Run, suite: str) -> None:
         lacks = "has no reference 'random' and none that is given the task"
         raise ConfigError(f"--suite offline: {run.problem} {lacks}, so nothing collects data; use --suite online")
     if suite == "attack" and problem.certify is None:
-        raise ConfigError(f"--suite attack: {run.problem} has no exact worst case; use --suite online --prior unseen")
+        raise ConfigError(
+            f"--suite attack: {run.problem} with these adversaries has no exact worst case; use --suite online --prior unseen"
+        )
     if suite == "attack" and min(run.evaluate.p) <= 0:
         raise ConfigError("--suite attack: at p = 0 nothing attacks; name strengths above 0, as in --p 0.2 0.4")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):

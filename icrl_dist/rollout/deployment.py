@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,15 @@ if TYPE_CHECKING:
 def default_deployment(model: ModelConfig) -> Deployment:
     """``committed`` for a model that is trained on action windows, else ``paper``."""
     return "committed" if model.window > 1 else "paper"
+
+
+def with_episode(episodes: Sequence[Columns], episode: Columns, config: ContextConfig) -> list[Columns]:
+    """The episodes of a context after one more: without the oldest beyond ``context.max``, or with ``keep = "last"`` alone."""
+    kept = [] if config.keep == "last" else list(episodes)
+    total = sum(e.actions.shape[1] for e in kept) + episode.actions.shape[1]
+    while kept and total > config.max:
+        total -= kept.pop(0).actions.shape[1]
+    return [*kept, episode]
 
 
 class InContextPolicy(CopiedWhole):
@@ -138,11 +148,8 @@ class InContextPolicy(CopiedWhole):
 
     def _add_to_context(self, episode: Columns) -> bool:
         """Add an episode to the context; True if older ones were dropped and the whole context was encoded again."""
-        kept = [] if self._config.keep == "last" else list(self._episodes)
-        total = sum(e.actions.shape[1] for e in kept) + episode.actions.shape[1]
-        while kept and total > self._config.max:
-            total -= kept.pop(0).actions.shape[1]
-        dropped, self._episodes = len(kept) < len(self._episodes), [*kept, episode]
+        kept = with_episode(self._episodes, episode, self._config)
+        dropped, self._episodes = len(kept) <= len(self._episodes), kept
         if dropped:
             self._deployed.clear()
             self._deployed.append(Columns(*(np.concatenate(columns, axis=1) for columns in zip(*self._episodes, strict=True))))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from icrl_dist.copies import CopiedWhole
+from icrl_dist.interfaces import Policy
 from icrl_dist.models.sampling import sample
 
 
@@ -49,3 +50,34 @@ class RandomVectorPolicy:
 
     def observe(self, *transition: object) -> None:
         """Does nothing: the policy does not learn."""
+
+
+class Exploring:
+    """A policy that takes a random discrete action with probability ``share``, from episode number ``first`` on.
+
+    The policy observes these actions as its own.  One uniform number decides both whether an action is random and which
+    it is, so that an episode draws as many numbers as without exploration.
+    """
+
+    def __init__(self, policy: Policy, actions: int, share: float, first: int) -> None:
+        self._policy, self._actions, self._share, self._first = policy, actions, share, first
+        self._episode = 0
+
+    def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B 1"]) -> Int64[np.ndarray, " B"]:
+        """A random action where the uniform number in [0, 1) is below the share, else the policy's."""
+        share = self._share if self._episode >= self._first else 0.0
+        own = self._policy.act(observation, ((u - share) / (1 - share)).clip(0, 1 - 2**-53) if share < 1 else u)
+        drawn = (u[:, 0] / share * self._actions).astype(np.int64) if share else own
+        explored: Int64[np.ndarray, " B"] = np.where(u[:, 0] < share, drawn, own)
+        return explored
+
+    def observe(
+        self,
+        observation: Float32[np.ndarray, "B S"],
+        action: Int64[np.ndarray, " B"],
+        reward: Float32[np.ndarray, " B"],
+        next_observation: Float32[np.ndarray, "B S"],
+        done: bool,
+    ) -> None:
+        self._policy.observe(observation, action, reward, next_observation, done)
+        self._episode += done

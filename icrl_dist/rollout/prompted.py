@@ -12,7 +12,9 @@ from icrl_dist.config.run import ConfigError
 from icrl_dist.config.sections import ContextConfig, Deployment
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.interfaces import Actions
+from icrl_dist.models.deployed import Columns
 from icrl_dist.models.segments import Segments, returns_to_go
+from icrl_dist.rollout.deployment import with_episode
 
 if TYPE_CHECKING:
     from icrl_dist.models.dt import DecisionTransformer, Encoded
@@ -28,7 +30,7 @@ class PromptedPolicy(CopiedWhole):
 
     def __init__(self, model: DecisionTransformer, batch: int, context: ContextConfig) -> None:
         """The weights are copied.  ``context.keep = "last"``: the newest episode gives the prompt, not the best one."""
-        self.model, self._newest = copy.deepcopy(model).eval(), context.keep == "last"
+        self.model, self._config = copy.deepcopy(model).eval(), context
         spec, shape = model.spec, (batch, model.prompt)
         self._prompt = Segments(
             np.zeros(shape, np.float32),
@@ -38,6 +40,7 @@ class PromptedPolicy(CopiedWhole):
             np.zeros(shape, bool),
         )
         self._best = np.full(batch, -np.inf)
+        self._episodes: list[Columns] = []
         self._start()
 
     def _start(self) -> None:
@@ -46,7 +49,7 @@ class PromptedPolicy(CopiedWhole):
         self._known: Encoded | None = None  # the prompt and the first ``_count`` steps of this episode
         self._count = 0
         self._steps: list[tuple[np.ndarray, ...]] = []  # return-to-go, observation and action of each step so far
-        self._rewards: list[np.ndarray] = []
+        self._outcomes: list[tuple[np.ndarray, ...]] = []  # next observation and reward of each step so far
         self._to_go = np.full(len(self._best), self.model.target.item(), np.float32)
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: Float[np.ndarray, "B U"]) -> Actions:
@@ -67,6 +70,17 @@ class PromptedPolicy(CopiedWhole):
         to_go, _, nothing = map(of, self._now(states))
         encoded = self.model.encode_frozen(Segments(*map(of, self._prompt)))
         return self.model.probabilities(self.model.decide(encoded, self._window([*steps, (to_go, states, nothing)]))[0])
+
+    def context(self, row: int = 0) -> tuple[np.ndarray, ...]:
+        """Observations (T, S), actions (T), next observations (T, S) and rewards (T) of the ended episodes of an environment.
+
+        The newest ones, at most ``context.max`` transitions; the prompt may be of an older episode, if that was better.
+        """
+        if self._episodes:
+            ended = zip(*([column[row] for column in episode] for episode in self._episodes), strict=True)
+            return tuple(np.concatenate(column) for column in ended)
+        observations, actions = self._prompt.observations[row, :0], self._prompt.actions[row, :0]
+        return observations, actions, observations, self._prompt.to_go[row, :0]
 
     def _decide(self, observation: Float32[np.ndarray, "B S"]) -> Float32[np.ndarray, "B A"]:
         """Within the first window of an episode a decision costs the newest step; later the window loses its first step."""
@@ -109,11 +123,11 @@ class PromptedPolicy(CopiedWhole):
         done: bool,
     ) -> None:
         self._steps.append((self._to_go, observation.copy(), action.copy()))
-        self._rewards.append(reward.copy())
+        self._outcomes.append((next_observation.copy(), reward.copy()))
         self._to_go = (self._to_go - reward).astype(np.float32)
         if done:
             _, states, actions = (np.stack(column, axis=1) for column in zip(*self._steps, strict=True))
-            self._offer(states, actions, np.stack(self._rewards, axis=1))
+            self._offer(Columns(states, actions, *(np.stack(column, axis=1) for column in zip(*self._outcomes, strict=True))))
             self._start()
 
     def append(
@@ -124,17 +138,19 @@ class PromptedPolicy(CopiedWhole):
         rewards: Float32[np.ndarray, "B T"],
     ) -> None:
         """Add one episode, of this or any other policy, from which the prompt may come."""
-        self._offer(observations, actions, rewards)
+        self._offer(Columns(*(np.array(column) for column in (observations, actions, next_observations, rewards))))
         self._encoded = None
 
-    def _offer(self, states: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
-        """Take the prompt from this episode in the environments where it is the best so far."""
+    def _offer(self, episode: Columns) -> None:
+        """Add an episode to the context, and take the prompt from it in the environments where it is the best so far."""
+        self._episodes = with_episode(self._episodes, episode, self._config)
+        states, actions, _, rewards = episode
         length = min(self.model.prompt, rewards.shape[1])
         steps = best_steps(rewards, length)
         rows = np.arange(len(rewards))[:, None]
         found = self._segments(returns_to_go(rewards)[rows, steps], states[rows, steps], actions[rows, steps], steps)
         total = rewards.sum(axis=1, dtype=np.float64)
-        better = (total > self._best) | self._newest
+        better = (total > self._best) | (self._config.keep == "last")
         self._best[better] = total[better]
         for column, new in zip(self._prompt, found, strict=True):
             column[better] = 0

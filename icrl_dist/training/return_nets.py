@@ -11,8 +11,9 @@ its own.  The first half of the steps fits both to observed returns-to-go, from 
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +74,7 @@ class ReturnNet(nn.Module):
 
 
 class ReturnNets:
-    """Both nets, fitted by one thread on the CPU; the same histories and seed give the same nets."""
+    """Both nets, computed by one thread on the CPU; the same histories and seed give the same nets."""
 
     def __init__(self, spec: Spec, fourier: int, settings: Settings, tasks: int, seed: int) -> None:
         """``tasks``: number of training tasks."""
@@ -92,13 +93,9 @@ class ReturnNets:
         sizes = inputs[0].shape[-1], sum(part.shape[-1] for part in inputs)
         rng = generator(self._seed, RandomKey.RETURN_NETS, 0)
         with torch.random.fork_rng(()):  # torch's generator is that of the model
-            self._q1, self._q2 = (_drawn(ReturnNet(self._tasks, size, self._settings.width), rng) for size in sizes)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+            self._q1, self._q2 = (_initialized(ReturnNet(self._tasks, size, self._settings.width), rng) for size in sizes)
+        with _one_thread():
             self._take_steps(histories, np.asarray(tasks))
-        finally:
-            torch.set_num_threads(threads)
 
     def _take_steps(self, histories: Sequence[Histories], tasks: Int64[np.ndarray, " V"]) -> None:
         of = self._settings
@@ -134,9 +131,10 @@ class ReturnNets:
 
     @torch.inference_mode()
     def relabelled(self, task: int, history: Histories) -> Float32[np.ndarray, "E H"]:
-        """Q1 at every step of the episodes of one variation of this task."""
+        """Q1 at every step of the episodes of one variation of this task, by one thread, so that each call gives the same."""
         agent, _ = self._inputs(history, slice(None))
-        found: np.ndarray = self._q1(torch.full(history.rewards.shape, task), torch.from_numpy(agent)).numpy()
+        with _one_thread():
+            found: np.ndarray = self._q1(torch.full(history.rewards.shape, task), torch.from_numpy(agent)).numpy()
         return found * np.float32(self._scale)
 
     def _inputs(self, of: Histories, rows: slice) -> tuple[Float32[np.ndarray, "N H I"], Float32[np.ndarray, "N H B"]]:
@@ -150,7 +148,18 @@ class ReturnNets:
         return agent, (adversary / np.float32(self._strongest)).astype(np.float32)
 
 
-def _drawn(net: ReturnNet, rng: np.random.Generator) -> ReturnNet:
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch computes with one thread, so results do not depend on the threads of the process."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _initialized(net: ReturnNet, rng: np.random.Generator) -> ReturnNet:
     """The net with initial weights drawn by this generator."""
     with torch.no_grad():
         for name, parameter in net.named_parameters():

@@ -55,7 +55,7 @@ def test_each_number_that_misses_its_bound_is_named(seconds: dict[str, Any], tmp
         "a decision in 2 environments after 130 transitions: the kernel is 3.0 times as fast as torch, below 4",
         "rollouts in 20 environments: 1.9 times torch's decisions, below 2",
         "rollouts in 512 environments: 1.9 times torch's decisions, below 2",
-        "the demo's adaptation rounds take 0.61 of torch's time, above 0.6",
+        "rounds of ICAA take 0.61 of torch's time, above 0.6",
     ]
     assert result["reasons"] == incontext.describe(result).splitlines()[-4:]
 

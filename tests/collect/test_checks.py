@@ -107,9 +107,9 @@ LABELLINGS = [
 
 @pytest.mark.parametrize(("labelling", "counts"), LABELLINGS)
 def test_the_job_says_how_many_labels_its_trajectories_have(labelling: object, counts: LabelCounts) -> None:
-    assert LabelledRollouts(40, "paper", "auto", labelling).labels == counts
-    assert Rollouts(40, "paper", "auto").labels == LabelCounts(0, 0, "none")
-    assert LabelledRollouts(40, "paper", "auto", object()).labels is None
+    assert LabelledRollouts(40, "paper", "auto", 0.0, 0, labelling).labels == counts
+    assert Rollouts(40, "paper", "auto", 0.0, 0).labels == LabelCounts(0, 0, "none")
+    assert LabelledRollouts(40, "paper", "auto", 0.0, 0, object()).labels is None
 
 
 @pytest.mark.parametrize("count", [0, 3, 5, 8000])

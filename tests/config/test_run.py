@@ -98,6 +98,7 @@ def test_values_are_read_into_their_fields() -> None:
         ("[darkroom]\nlabel_slack = -0.1", ["darkroom.label_slack = -0.1"]),
         ("[darkroom]\nsplit_seed = -1", ["darkroom.split_seed = -1"]),
         ("[adversary]\np_max = 1.5", ["adversary.p_max = 1.5", "[0, 1]"]),
+        ("[adversary]\np_min = 0.3", ["adversary.p_min = 0.3", "use 0 to adversary.p_max, which is 0.2"]),
         ("[adversary]\ncount = 0\nnull = false", ["adversary.count = 0", "at least 1, or adversary.null = true"]),
         ("[adversary]\ncount = -1", ["adversary.count = -1", "0 or more disturbances"]),
         ("seed = -1", ["seed = -1", "a seed is a whole number from 0"]),

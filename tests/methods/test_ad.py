@@ -18,6 +18,7 @@ from icrl_dist.methods.ad import AD
 from icrl_dist.models.dpt import Transitions
 from icrl_dist.problems import registry as problems
 from icrl_dist.problems.darkroom.q_learning import QLearningHistories
+from icrl_dist.results.heldout import check_suite
 from icrl_dist.training.batches import TrainingBatch
 from icrl_dist.training.history_windows import HistoryWindows
 from icrl_dist.types import NULL, Trajectory
@@ -141,6 +142,13 @@ def test_the_compiled_kernel_fits_it_and_its_context_grows(ad_run: Run) -> None:
     method = AD()
     assert method.fits_by_kernel and method.deployment(ad_run) == "growing"
     assert [(p.stage, p.steps) for p in method.phases(ad_run)] == [("pretrain", ad_run.pretrain.steps)]
+
+
+def test_its_decisions_are_not_compared_with_the_exact_posterior(ad_run: Run) -> None:
+    """It imitates a learner, so a perfect model is far from the posterior."""
+    with pytest.raises(ConfigError, match="--suite posterior: darkroom with ad has no exact posterior; use --suite online"):
+        check_suite(ad_run, "posterior")
+    check_suite(dataclasses.replace(ad_run, method="dpt"), "posterior")
 
 
 @pytest.mark.parametrize(

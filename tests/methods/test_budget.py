@@ -103,6 +103,16 @@ def test_improved_trials_are_counted_as_at_most_all_later_ones(small_run: Run) -
     assert improved == later
 
 
+def test_labels_that_compare_actions_are_made_from_all_trials(small_run: Run) -> None:
+    later, compared = (
+        budget.of(dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, labels=name)))
+        for name in ("actions", "transitions")
+    )
+    assert compared.labelled_episodes == compared.training_episodes
+    assert later.labelled_episodes is not None and later.labelled_episodes < compared.training_episodes
+    assert compared.label_source == "optimal, own transitions"
+
+
 def test_demonstrations_of_experts_count_with_their_training() -> None:
     """Every expert's training in whole episodes, its window episodes, and those of the decoys."""
     windows = ["model.window=5", "pretrain.windows=2", "optim.windows=1"]

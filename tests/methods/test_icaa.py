@@ -17,6 +17,7 @@ from icrl_dist.methods import registry as methods
 from icrl_dist.methods.examples import self_labelled
 from icrl_dist.problems import registry as problems
 from icrl_dist.results import training_rows
+from icrl_dist.training import batches
 from icrl_dist.training.batches import Examples
 from icrl_dist.types import Trajectory
 from tests.jobs import InMemoryDataset, do
@@ -121,6 +122,41 @@ def test_each_round_learns_from_d0_and_all_rounds_so_far(small_run: Run, collect
     assert [len(pool.examples) for pool in second] == [len(first[0].examples), variations]
     assert [len(pool.examples) for pool in third] == [len(first[0].examples), 2 * variations]
     assert [pool.share for pool in third] == [1 - small_run.icaa.new_fraction, small_run.icaa.new_fraction]
+
+
+def test_contexts_are_1_to_all_of_trials_0_to_n_in_their_order(small_run: Run, collected: Collected, pools_of: PoolsOf) -> None:
+    """Algorithm 3, line 13, takes all N_ + 1 of them, also where ``optim.episodes``, for D^0, is fewer."""
+    icaa, optim = dataclasses.replace(small_run.icaa, context_trials=2), dataclasses.replace(small_run.optim, episodes=1)
+    run = dataclasses.replace(small_run, icaa=icaa, optim=optim)
+    method, data = methods.of(run), InMemoryDataset(collected.trajectories)
+    phase = method.phases(run)[1]
+    undisturbed, own = pools_of(method, run, phase, data)
+    assert undisturbed.episodes == 1
+    trials = [data.trials(key) for key in data.variations("adapt", 0)]
+    own_actions = [np.concatenate([t.actions for t in of]) for of in trials]
+    draw, lengths = method.data(run, phase, data), Counter[int]()
+    for seed in range(60):
+        batch = draw(np.random.default_rng(seed))
+        if any(len(batch.actions[0]) <= len(a) and (a[: len(batch.actions[0])] == batch.actions[0]).all() for a in own_actions):
+            for row in batch.actions:
+                assert any((a[: len(row)] == row).all() for a in own_actions), "trials 0 to n, in order"
+            lengths[batch.actions.shape[1] // 8] += 1
+    assert sorted(lengths) == [1, 2, 3]
+    assert own.episodes == 3
+
+
+def test_contexts_of_one_trial_are_any_of_trials_0_to_n(small_run: Run, collected: Collected, pools_of: PoolsOf) -> None:
+    """Algorithm 3, lines 13 and 15, word by word, whatever ``optim.episodes`` is for D^0."""
+    run = dataclasses.replace(small_run, icaa=dataclasses.replace(small_run.icaa, context="trial"))
+    assert run.optim.episodes > 1
+    method, data = methods.of(run), InMemoryDataset(collected.trajectories)
+    phase = method.phases(run)[1]
+    undisturbed, own = pools_of(method, run, phase, data)
+    drawn = [batches.draw(np.random.default_rng(seed), [own], 8, 4) for seed in range(20)]
+    assert undisturbed.episodes == run.optim.episodes and {batch.actions.shape[1] for batch in drawn} == {8}
+    firsts = [data.trials(key)[: run.icaa.context_trials + 1] for key in data.variations("adapt", 0)]
+    numbers = {n for trials in firsts for n, t in enumerate(trials) for b in drawn for a in b.actions if (a == t.actions).all()}
+    assert numbers == {0, 1}
 
 
 def test_each_variation_is_labelled_once_a_run(small_run: Run, collected: Collected, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,6 +118,8 @@ def test_a_batch_comes_from_d0_with_probability_kappa_else_from_the_histories_so
             r"pretrain.contexts = 42: use at least 49: 2 rounds of 3 episodes in 7 tasks leave none for D\^0",
         ),
         (["pretrain.steps=2"], "pretrain.steps = 2: too few for the early phase and every round: raise it, or lower"),
+        (["mix_dpt.early=1.0"], r"mix_dpt.early = 1.0: must lie between 0 and 1, so that no phase is without steps"),
+        (["mix_dpt.early=0.0"], r"mix_dpt.early = 0.0: must lie between 0 and 1, so that no phase is without steps"),
         (["mix_dpt.rounds=0"], "mix_dpt.rounds = 0: must be from 1 to 9000"),
     ],
 )

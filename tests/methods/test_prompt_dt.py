@@ -15,20 +15,16 @@ from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.launch import train
 from icrl_dist.methods import budget
 from icrl_dist.methods import registry as methods
-from icrl_dist.methods.ardt import ARDT, ARDTConfig
-from icrl_dist.methods.prompt_dt import PromptDT, PromptDTConfig
+from icrl_dist.methods.ardt import ARDTConfig
+from icrl_dist.methods.prompt_dt import PromptDTConfig
 from icrl_dist.models.segments import returns_to_go
 from icrl_dist.problems import registry as problems
+from icrl_dist.problems.darkroom.game import PlayGame
 from icrl_dist.types import NULL
 from learner import fitting
 from tests.jobs import InMemoryDataset, collect, in_problem
 
 NAMES = ("prompt_dt", "ardt")
-
-
-@pytest.fixture(autouse=True)
-def found(install: Any) -> None:
-    install(methods={"prompt_dt": PromptDT, "ardt": ARDT})
 
 
 def asked(run: Run, method: str, **fields: Any) -> Run:
@@ -155,3 +151,8 @@ def test_a_run_that_is_resumed_has_the_same_bytes_and_its_agent_the_same_target(
             agent.observe([obs], action, [reward], [following], [done])
             obs = following
     assert agent.distribution([obs]).sum() == pytest.approx(1.0, abs=1e-5)
+    assert len(agent.context()[1]) == 2 * run.section("darkroom").horizon
+    game = PlayGame(agent, run)
+    for _ in range(2 * game.horizon):
+        game.step()
+    assert game.belief().transitions == 2 * game.horizon

@@ -50,7 +50,7 @@ def test_the_labelling_of_a_payload_is_decoded_strictly(toy_run, labelling, mess
     problem = registry.of(toy_run())
     rest: dict[str, dict[str, Any]] = {
         "behavior_context": {"behaviors": ["random"]},
-        "adapt_labelled": {"context_max": 9, "deploy": "paper", "decoder": "auto"},
+        "adapt_labelled": {"context_max": 9, "deploy": "paper", "decoder": "auto", "explore": 0.0, "explore_from": 0},
     }
     for kind, fields in rest.items():
         payload = kinds.read_payload(kind, problem, {**fields, "labelling": {"cells": 5}})

@@ -140,7 +140,7 @@ def test_agents_that_are_fixed_within_an_episode_have_a_certified_return_and_oth
             np.testing.assert_allclose(certified[:, :, -1], known(one.optimum))
     text = rendered(returns_table(frame(*(one.block(run, "run", "evaluated") for one in found)), ""))
     assert text.count("estimated") == 1 + 6, "at p = 0.4 all evaluations are under the uniform adversary, which is no worst one"
-    assert "it covers neither wind nor permuted controls" in unwrapped(text)
+    assert "against the worst adversary that overrides actions with probability p (exact" in unwrapped(text)
 
 
 @pytest.mark.integration
@@ -154,7 +154,6 @@ def test_the_command_prints_one_table_and_stores_its_rows(folder, capsys):
         (key, number) for key in ("t0", *CERTIFIABLE) for number in (1, 2, 5, 6)
     ]
     assert "It certifies one episode given its context" in unwrapped(printed.err)
-    assert "where wind or permuted controls disturb, it does not cover them" in unwrapped(printed.err)
     assert "says nothing about other training seeds" in unwrapped(printed.err)
     stored = icrl_dist.read_results(folder)
     assert set(stored.suite) == {"attack"} and set(stored.prior) == {"", "uniform", "unseen"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -118,6 +119,29 @@ def test_with_keep_last_the_prompt_is_of_the_newest_episode() -> None:
     play(policy, first, None)
     play(policy, second, pieces(first, [0, 1, 2]))
     play(policy, episode(3), pieces(second, [0, 1, 2]))
+
+
+@pytest.mark.parametrize(("keep", "kept"), [("all", [2, 3]), ("last", [3])])
+def test_its_context_holds_the_newest_ended_episodes_as_those_of_other_policies_do(
+    keep: Literal["all", "last"], kept: list[int]
+) -> None:
+    """At most ``context.max`` transitions; a running episode is not in it, one that was appended is."""
+    policy = PromptedPolicy(model(), B, ContextConfig(max=2 * H, keep=keep))
+    assert [column.shape for column in policy.context(1)] == [(0, 2), (0,), (0, 2), (0,)]
+    episodes = {seed: episode(seed) for seed in (1, 2, 3)}
+    play(policy, episodes[1], None)
+    states, actions, rewards = episodes[2]
+    policy.append(states[:, :-1], actions, states[:, 1:], rewards)
+    states, actions, rewards = episodes[3]
+    for h in range(H):
+        assert len(policy.context()[1]) == (H if keep == "last" else 2 * H)
+        policy.act(states[:, h], np.full((B, 1), 0.5))
+        policy.observe(states[:, h], actions[:, h], rewards[:, h], states[:, h + 1], h == H - 1)
+    for row in range(B):
+        columns = [[s[row, :-1], a[row], s[row, 1:], r[row]] for s, a, r in (episodes[seed] for seed in kept)]
+        for found, expected in zip(policy.context(row), zip(*columns, strict=True), strict=True):
+            np.testing.assert_array_equal(found, np.concatenate(expected))
+        assert [column.dtype.kind for column in policy.context(row)] == ["f", "i", "f", "f"]
 
 
 def test_longer_and_shorter_episodes_than_in_training_can_be_played() -> None:

@@ -138,6 +138,22 @@ def test_equal_seeds_give_equal_nets_and_the_generator_of_torch_is_not_used() ->
     assert (fitted(short, seed=1) != one).any()
 
 
+def test_nets_are_fitted_and_asked_by_one_thread_so_a_resumed_run_relabels_alike() -> None:
+    """Returns-to-go that left the cache are computed again, during the fit of the transformer and with its threads."""
+    nets, one, seen = ReturnNets(SPEC, 0, replace(SETTINGS, steps=3), 1, 0), game(), []
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    hook = torch.nn.modules.module.register_module_forward_hook(lambda *_: seen.append(torch.get_num_threads()))
+    try:
+        nets.fit([one], [0])
+        nets.relabelled(0, one)
+        assert torch.get_num_threads() == 3
+    finally:
+        hook.remove()
+        torch.set_num_threads(before)
+    assert set(seen) == {1}
+
+
 def test_a_fit_that_diverges_says_what_to_lower() -> None:
     with pytest.raises(FloatingPointError, match=r"lower ardt\.learning_rate"):
         fitted(replace(SETTINGS, learning_rate=1e30, steps=50))

@@ -132,37 +132,42 @@ def override_distribution(adversary: Adversary, actions: int) -> tuple[float, Fl
     return p, argmax_distribution(alpha)
 
 
-def sample_dirichlet(rng: np.random.Generator, actions: int, p_max: float) -> Adversary:
-    """A random adversary phi^{i,k}: p ~ U(0, p_max) and alpha_b ~ U(0.05, 2) (appendix C.1)."""
-    p = float(rng.uniform(0.0, p_max))
+def sample_dirichlet(rng: np.random.Generator, actions: int, p_max: float, p_min: float = 0.0) -> Adversary:
+    """A random adversary phi^{i,k}: p ~ U(p_min, p_max) and alpha_b ~ U(0.05, 2) (appendix C.1)."""
+    p = float(rng.uniform(p_min, p_max))
     return Adversary.of("dirichlet", p=p, alpha=rng.uniform(*ALPHA_RANGE, size=actions))
 
 
-def sample(rng: np.random.Generator, disturbance: Disturbance, actions: int, p_max: float) -> Adversary:
-    """A random adversary: p ~ U(0, p_max); the rest uniform: alpha, one of four directions, one of ``SYMMETRIES``."""
+def sample(rng: np.random.Generator, disturbance: Disturbance, actions: int, p_max: float, p_min: float = 0.0) -> Adversary:
+    """A random adversary: p ~ U(p_min, p_max); the rest uniform: alpha, one of four directions, one of ``SYMMETRIES``."""
     if disturbance == "override":
-        return sample_dirichlet(rng, actions, p_max)
-    p = float(rng.uniform(0.0, p_max))
+        return sample_dirichlet(rng, actions, p_max, p_min)
+    p = float(rng.uniform(p_min, p_max))
     if disturbance == "wind":
         return Adversary.of("wind", p=p, direction=int(rng.integers(DIRECTIONS)))
     return Adversary.of("permuted", p=p, permutation=SYMMETRIES[int(rng.integers(len(SYMMETRIES)))])
 
 
 def adversary_set(
-    rng: np.random.Generator, count: int, actions: int, p_max: float, disturbance: Disturbance = "override"
+    rng: np.random.Generator,
+    count: int,
+    actions: int,
+    p_max: float,
+    disturbance: Disturbance = "override",
+    p_min: float = 0.0,
 ) -> tuple[Adversary, ...]:
     """The K disturbances of one task (section 4.1)."""
-    return tuple(sample(rng, disturbance, actions, p_max) for _ in range(count))
+    return tuple(sample(rng, disturbance, actions, p_max, p_min) for _ in range(count))
 
 
-def grid(disturbance: Disturbance, actions: int, p_max: float, levels: int) -> tuple[Adversary, ...]:
+def grid(disturbance: Disturbance, actions: int, p_max: float, levels: int, p_min: float = 0.0) -> tuple[Adversary, ...]:
     """Adversaries, all equally likely, that stand for the prior of ``sample``: about ``4 * levels`` or ``7 * levels`` of them.
 
-    A wind: every direction with each of ``levels`` values of p, the midpoints of equal parts of [0, p_max].  Permuted
+    A wind: every direction with each of ``levels`` values of p, the midpoints of equal parts of [p_min, p_max].  Permuted
     controls: every one of ``SYMMETRIES`` with each value.  Overrides: ``4 * levels`` draws of ``sample_dirichlet`` with
     those values of p and alphas that are always the same.
     """
-    values = [p_max * (level + 0.5) / levels for level in range(levels)]
+    values = [p_min + (p_max - p_min) * (level + 0.5) / levels for level in range(levels)]
     if disturbance == "wind":
         return tuple(Adversary.of("wind", p=p, direction=direction) for p in values for direction in range(DIRECTIONS))
     if disturbance == "permuted":

@@ -102,7 +102,7 @@ def hypotheses(run: Run, heldout: bool) -> tuple[Hypotheses, Hypotheses]:
     several = [a for _ in sets for a in registry.adversaries(run, rng)] or trained
     kind = registry.of(run).config.disturbance
     if kind != "override" and sets:
-        others = grid(kind, ACTIONS, run.adversary.p_max, _LEVELS)
+        others = grid(kind, ACTIONS, run.adversary.p_max, _LEVELS, run.adversary.p_min)
         share = trained.count(NULL) / len(trained)  # phi_0 keeps its share
         several = [*[NULL] * round(len(others) * share / (1 - share)), *others]
     own = [v for group in groups for v in group]
@@ -115,7 +115,7 @@ def divergences(
     """Compare T_theta with the exact posterior under each of ``PRIORS``, in contexts of every kind and p."""
     room, groups = config, training_variations(run, heldout)
     priors = hypotheses(run, heldout)
-    labels = [labels_of(h, room.labels, room.gamma, room.label_slack) for h in priors]
+    labels = [labels_of(of, room.labels, room.gamma, room.label_slack) for of in _labelled(run, priors)]
     for level, p in enumerate(levels(run)):
         for number, kind in enumerate(KINDS):
             rng = generator(run.seed, RandomKey.POSTERIOR_SUITE, int(heldout), level, number)
@@ -127,6 +127,16 @@ def divergences(
             exact = (exact_decisions(h, optimal, context, query) for h, optimal in zip(priors, labels, strict=True))
             one, other = (Divergence(kind, p, probs, decided, reached) for probs in exact)
             yield one, other
+
+
+def _labelled(run: Run, priors: Sequence[Hypotheses]) -> Sequence[Hypotheses]:
+    """The hypotheses that labels come from: those of the method ``dr`` have no disturbance."""
+    method = plugins.find("methods", run.method)()
+    payload = method.ask(run, method.phases(run)[0])[0].payload
+    if not getattr(getattr(payload, "labelling", None), "undisturbed", False):
+        return priors
+    q = np.full(ACTIONS, 1 / ACTIONS)
+    return [Hypotheses(h.size, h.horizon, h.goal, np.zeros(len(h.goal)), np.tile(q, (len(h.goal), 1))) for h in priors]
 
 
 def _disturbed(rng: np.random.Generator, group: tuple[Variation, ...], p: float) -> Variation:

@@ -62,7 +62,8 @@ def dpt_prior(room: DarkRoomConfig) -> Prior:
 
 def icag_prior(room: DarkRoomConfig, adversary: AdversaryConfig, levels: int | None = None) -> Prior:
     """The adversaries of training: phi_0 with its share, else ``adversaries.grid`` with ``levels``; None: ``LEVELS``."""
-    others = grid(room.disturbance, ACTIONS, adversary.p_max, levels or LEVELS[room.disturbance]) if adversary.count else ()
+    count = levels or LEVELS[room.disturbance]
+    others = grid(room.disturbance, ACTIONS, adversary.p_max, count, adversary.p_min) if adversary.count else ()
     weights = {NULL: 1.0 / adversary.variations} if adversary.null else {}
     share = adversary.count / adversary.variations
     for one in others:  # equal ones, which a p_max of 0 makes, add up

@@ -153,7 +153,7 @@ class DarkRoomProblem(Problem):
         return task.replace(start=(0, 0))
 
     def training_adversaries(self, rng: np.random.Generator, config: AdversaryConfig) -> tuple[Adversary, ...]:
-        return adversary_set(rng, config.count, room.ACTIONS, config.p_max, self.config.disturbance)
+        return adversary_set(rng, config.count, room.ACTIONS, config.p_max, self.config.disturbance, config.p_min)
 
     def test_adversary(self, rng: np.random.Generator, strength: float, prior: str) -> Adversary:
         """``uniform``: q_b = 1/5 (Figures 3c, 6c); ``unseen``: a newly drawn Dirichlet adversary (Figures 3d, 6d).
@@ -259,8 +259,9 @@ class DarkRoomProblem(Problem):
         return RoomPosteriorSuite(self.config)
 
     @property
-    def certify(self) -> RoomCertificate:
-        return RoomCertificate(self.config.size)
+    def certify(self) -> RoomCertificate | None:
+        """Only for overrides: the worst override adversary says nothing about winds and permuted controls."""
+        return RoomCertificate(self.config.size) if self.config.disturbance == "override" else None
 
     @property
     def game(self) -> MakeGame:

@@ -89,6 +89,9 @@ def test_priors_are_uniform(kind: Disturbance) -> None:
     counts = np.array([others.count(a) for a in set(others)])
     assert len(counts) == (4 if kind == "wind" else 7)
     assert (abs(counts - 2800 / len(counts)) < 4 * np.sqrt(2800 / len(counts))).all()
+    strong = [a.number("p") for a in adversary_set(np.random.default_rng(0), 400, ACTIONS, 0.6, kind, 0.4)]
+    assert 0.4 <= min(strong) < 0.41 and 0.59 < max(strong) <= 0.6
+    assert {a.number("p") for a in grid(kind, ACTIONS, 1.0, 2, 1.0)} == {1.0}
     levels = grid(kind, ACTIONS, 0.6, 3)
     assert sorted({a.number("p") for a in levels}) == pytest.approx([0.1, 0.3, 0.5])
     assert {a.replace(p=0.0) for a in levels} == set(others) and len(set(levels)) == 3 * len(counts)
@@ -125,6 +128,12 @@ def test_the_optimal_agent_earns_the_optimal_return(adversary: Adversary) -> Non
         assert abs(earned.mean() - promised) <= 4 * error + 0.02 * promised, (goal, earned.mean(), promised)
         expected = solver.expected_returns(policy, [variation])[0]
         assert abs(earned.mean() - expected) <= 4 * error + 1e-9 and expected <= promised + 1e-9
+
+
+@pytest.mark.parametrize("kind", ["override", "wind", "permuted"])
+def test_only_overrides_have_an_exact_worst_case(small_run: Run, kind: str) -> None:
+    problem = registry.of(override(small_run, [f"darkroom.disturbance={kind}"], "test"))
+    assert (problem.certify is not None) == (kind == "override")
 
 
 @pytest.mark.parametrize("kind", ["wind", "permuted"])

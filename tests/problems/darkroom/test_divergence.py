@@ -285,6 +285,20 @@ def test_a_model_that_is_the_exact_posterior_has_no_divergence(
     assert any(one.kl.mean() > 1e-3 for one in found[1 - prior]), "the two priors are equal"
 
 
+def test_a_perfect_dr_model_which_ignores_the_disturbance_in_its_labels_has_no_divergence(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And ICAG's model has one by the labels of ``dr``: the disturbance changes the optimum."""
+    monkeypatch.setattr(divergence, "CONTEXTS", 9)
+    run = dataclasses.replace(run, method="dr", adversary=AdversaryConfig(count=1, p_max=1.0))
+    model = Exact(registry.of(run).spec, run.model).eval()
+    model.set_hypotheses(run, divergence.hypotheses(run, heldout=False)[0])
+    assert any(one.kl.mean() > 1e-3 for one, _ in measured(run, model, heldout=False))
+    tasks = [v.task for group in divergence.training_variations(run, heldout=False) for v in group]
+    model.labels = soft_labels(Hypotheses.of([Variation(task) for task in tasks]), GAMMA, SLACK)
+    assert all(np.abs(one.kl).max() < 1e-6 for one, _ in measured(run, model, heldout=False))
+
+
 def test_the_divergence_of_a_uniform_model_equals_a_slow_loop(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(divergence, "CONTEXTS", 5)
     asked: list[RoomContext] = []

@@ -109,7 +109,7 @@ def test_no_transition_makes_an_agent_fail(rule: PriorRule, kind: Disturbance) -
 
 
 def test_dpts_agent_learns_the_goal_from_rewards_alone() -> None:
-    """A blown agent that found the goal goes there by the undisturbed optimum; ICAG's presses against the wind."""
+    """In a wind, an agent that found the goal goes there by the undisturbed optimum; ICAG's presses against the wind."""
     agents = [PriorAgent(prior, 1, "paper") for prior in (dpt_prior(room()), icag_prior(room(), AdversaryConfig(8, p_max=1.0)))]
     at = [np.array([[x, 1.0]], np.float32) for x in range(3)]
     for agent in agents:  # the agent stays, a wind in direction +x moves it; the goal is (1, 1)
