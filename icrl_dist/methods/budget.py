@@ -57,6 +57,46 @@ def of(run: Run) -> Budget:
     return Budget(source, episodes, known, env_steps, steps, steps * run.optim.batch)
 
 
+class LabelBytes(NamedTuple):
+    """What the labels of one training are made of and what is sent for them, as if no variation is left out.
+
+    Computed from the jobs, as the budget, and not counted in a dataset: arrays only, without names and headers.
+    """
+
+    labels: int
+    """Labelled states: query states of ``labelled_episodes``, or of a model's or a behavior policy's own actions every step."""
+    label_bytes: int
+    """Bytes of these states and their labels, with actions and rewards of action windows."""
+    sent_bytes: int
+    """Bytes of all episodes that workers send to the learner, with their labels."""
+
+
+@functools.lru_cache(maxsize=256)
+def label_bytes(run: Run) -> LabelBytes | None:
+    """Labels of a training and their bytes; None for a problem whose adversary's actions have no size that is known."""
+    method, problem = methods.of(run), problems.of(run)
+    spec = problem.spec_of(problem.split.train[0])
+    if not spec.discrete:
+        return None
+    horizon, observation, number = problem.horizon, _FLOAT * spec.observation, _FLOAT
+    episode = (horizon + 1) * observation + horizon * (_INT + number + _INT)  # observations, actions, rewards, adversary
+    found = np.zeros(3, int)
+    for phase in method.phases(run):
+        for job in method.ask(run, phase):
+            used, asked, count = method.used_labels(run, phase, job), job.payload.labels, len(job.variations)
+            if used is None or asked is None:
+                return None
+            answer = asked.queries * (observation + number * spec.actions) + asked.window_steps * (_INT + number)
+            own = asked.queries == 0 or used.source.endswith("actions")  # the actions of the episode itself
+            labels, size = (horizon, horizon * (observation + _INT)) if own else (asked.queries, answer)
+            found += count * np.array([used.trials * labels, used.trials * size, job.trials * (episode + answer)])
+    return LabelBytes(*map(int, found))
+
+
+_FLOAT, _INT = 4, 2
+"""Bytes of the numbers in trajectories (``types.ARRAYS``): observations, rewards and labels; actions."""
+
+
 def columns(run: Run) -> dict[str, object]:
     """The budget as columns of the result rows."""
     return {name: value for name, value in of(run)._asdict().items() if name != "contexts"}

@@ -81,7 +81,10 @@ class Certificate(Protocol):
     def worst(
         self, policies: Float[np.ndarray, "P C A"] | None, variations: Sequence[Variation], p: float
     ) -> Float64[np.ndarray, " B"]:
-        """Against the worst adversary of strength p in each variation's task; None: the policy that is best against it."""
+        """Against the worst override adversary of strength p in each variation's task, whatever the variation's own adversary.
+
+        ``policies`` None: the policy that is best against it.
+        """
         ...
 
     def expected(self, policies: Float[np.ndarray, "P C A"], variations: Sequence[Variation]) -> Float64[np.ndarray, " B"]:

@@ -176,11 +176,14 @@ def table(run: Run, found: Sequence[Mapping[str, Any]], title: str, draws: int) 
     caption = (
         "each cell: mean over goals / lowest goal, of the expected return of this one episode, given the context of the "
         f"episodes before it ({statistics.counted(tasks, 'task')}, {statistics.counted(seeds, 'context')} of each, collected "
-        f"under draws of the prior {run.evaluate.prior}).  worst sampled: of each goal the lowest of {draws} adversaries of "
-        "the unseen prior.  certified: against the worst adversary of strength p, which knows the policy and chooses by state "
-        "and step; exact.  It certifies one episode given its context, and not an adversary that also acts while the context "
-        "is collected.  estimated: the context grows within the episode, so nothing is exact and there is no certificate; "
-        "the worst of the sampled adversaries instead.  One training: it says nothing about other training seeds"
+        f"under draws of the prior {run.evaluate.prior}); the lowest of noisy means lies below the lowest true one.  worst "
+        f"sampled: of each goal the lowest of {draws} adversaries of "
+        "the unseen prior.  certified: against the worst adversary that overrides actions with probability p, knows the policy "
+        "and chooses by state and step; exact; the minimax oracle is the best policy against it.  It certifies one episode "
+        "given its context, and not an adversary that also acts while the context is collected.  "
+        "estimated: the context grows "
+        "within the episode, so nothing is exact and there is no certificate; the worst of the sampled adversaries instead.  "
+        "One training: it says nothing about other training seeds"
     )
     shown = NarrowTable(title=title, title_justify="left", caption=caption, caption_justify="left")
     shown.spare = ("uniform", "sampled")

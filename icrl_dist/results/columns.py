@@ -56,7 +56,11 @@ COLUMNS: dict[str, Column] = {
     "weights_digest": Column("string", "SHA-256 of the weights; empty for an agent without"),
     "ceiling": Column("bool", "whether the agent is given the task, so that other returns are shown as a share of its own"),
     "deployment": Column("string", "deployment rule of a model, `paper`, `committed` or `growing`; empty for other agents"),
-    "data": Column("string", "in suite `offline`: whose episode the context holds, `random` or `expert`; else empty"),
+    "data": Column(
+        "string",
+        "in suite `offline`: whose episode the context holds, `random` or `expert`; in suite `label_quality`: what the trial "
+        "became, `context`, or `labels` if labels come from it or from trials as late; else empty",
+    ),
     "prior": Column("string", "`evaluate.prior`: distribution of the test adversaries; empty if they are of training"),
     "task_index": Column("int64", "number of the task among `tasks`"),
     "task": Column("string", "parameters of the task, JSON"),

@@ -9,6 +9,13 @@ from typing import Any
 
 from icrl_dist.results.statistics import Interval
 
+CERTIFIED = (
+    "Certified: mean exact return of the last episodes, each given its context, against the worst adversary that overrides "
+    "actions with probability p; wind and permuted controls are not in it, nor an adversary that also acts while the context "
+    "is collected; - where it is not known, as where the context grows within an episode"
+)
+"""Caption of the column ``certified``."""
+
 
 @dataclass(frozen=True)
 class Sheet:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from icrl_dist.config.paths import path_of
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.toml import nearest
 from icrl_dist.results import page
-from icrl_dist.results.claims import costs, icaa, questions
+from icrl_dist.results.claims import costs, icaa, labels, questions
 from icrl_dist.results.claims import sheets as claim_sheets
 from icrl_dist.results.figures import budgets, catalog, sheets, styles
 from icrl_dist.results.figures.panels import data
@@ -81,7 +82,7 @@ def report(
 
     ``sources``: files of result rows, run folders, or folders of sweeps.  ``figure``: the name of one figure (``"2"``,
     ``"3a"``, ``"strength"``; ``catalog.NAMES`` has all), written to ``out`` as PNG with its numbers as CSV and JSON.
-    ``claims``: instead the paper's claims, and the table of ICAA.  Neither: all figures that the rows allow, with tables
+    ``claims``: instead the paper's claims, and the tables of ICAA.  Neither: all figures that the rows allow, with tables
     and claims, as one HTML page, ``out``/index.html.  ``out``: None for the folder ``report`` beside the first source's rows.
 
     ``setting``: the setting of the sweep; None for the only one (claims, the page and figure ``strength``: also those in
@@ -100,6 +101,11 @@ def report(
             raise ConfigError("report: --figure and --claims were given; choose one, or give neither for the whole report")
     files = files_of(sources)
     folder = path_of("out", out) if out is not None else _beside(files[0])
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"--out {folder}: is a file; name a folder, such as report")
+    path = None if markdown is None else path_of("markdown", markdown)
+    if path is not None and (path.is_dir() or not path.name):
+        raise ConfigError(f"--markdown {str(markdown)!r}: is a folder; name a file, such as report.md")
     rows, rules = Rows(files), Rules(common_seeds, _budgets(unequal_budgets), partial)
     if figure is not None:
         section, written = _figure(rows, setting, rules, figure, folder)
@@ -110,8 +116,7 @@ def report(
         found = Report(tuple(_joined(sections)), tuple(refused))
     else:
         found = _whole(rows, files, setting, rules, folder)
-    if markdown is not None:
-        path = path_of("markdown", markdown)
+    if path is not None:
         atomic_write(path, lambda file: file.write(found.markdown().encode()))
         found = Report(found.sections, found.refused, (*found.files, path))
     return found
@@ -164,12 +169,20 @@ def _tables(of: Study, ledger: costs.Ledger, refused: list[str]) -> list[Section
     """The claims and the table of ICAA in one setting."""
     found = questions.claims(of, ledger)
     claimed = Section("Claims", (claim_sheets.sheet(found),), claim_sheets.summary(found), data=claim_sheets.data(found))
-    try:
-        table = icaa.sheet(of)
-    except ConfigError as error:
-        refused.append(str(error))
-        return [claimed]
-    return [claimed, Section(table.title, (table,), data=table.data())]
+    sections = [claimed]
+    tables: tuple[Callable[[], Sheet], ...] = (
+        functools.partial(icaa.sheet, of),
+        functools.partial(labels.sheet, of),
+        functools.partial(costs.sheet, of, ledger),
+    )
+    for make in tables:
+        try:
+            table = make()
+        except ConfigError as error:
+            refused.append(str(error))
+            continue
+        sections += [Section(table.title, (table,), data=table.data())] if table.rows else []
+    return sections
 
 
 def _joined(sections: Sequence[Section]) -> list[Section]:

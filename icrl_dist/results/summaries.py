@@ -173,12 +173,12 @@ def experts(frame: pd.DataFrame) -> list[dict[str, Any]]:
     return answer
 
 
-def label_quality(frame: pd.DataFrame, context_trials: int) -> LabelQuality:
+def label_quality(frame: pd.DataFrame) -> LabelQuality:
     """Quality of the labels that T^j made in a round, from the rows of suite ``label_quality`` (Theorem E.5).
 
-    ``context_trials``: the first so many trials became contexts; labels come from later ones.
+    Returns are nan for rows of older versions, whose column ``data`` does not say which trials became contexts.
     """
-    early = frame["episode"] < context_trials
+    early, late = frame["data"] == "context", frame["data"] == "labels"
     by = ["task_index", "adversary_index"]
     variations = frame.groupby(by)[["agreement", "optimum"]].first()
     rated = variations["agreement"].dropna()
@@ -186,6 +186,6 @@ def label_quality(frame: pd.DataFrame, context_trials: int) -> LabelQuality:
         agreement=float(rated.mean()) if len(rated) else 0.0,
         labelling=len(rated) / len(variations),
         context_return=float(frame[early].groupby(by)["return"].mean().mean()),
-        label_return=float(frame[~early].groupby(by)["return"].mean().mean()),
+        label_return=float(frame[late].groupby(by)["return"].mean().mean()),
         optimum=float(variations["optimum"].mean()),
     )

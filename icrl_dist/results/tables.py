@@ -75,9 +75,10 @@ def returns_table(frame: pd.DataFrame, title: str) -> Table:
 
 
 CERTIFIED = (
-    "certified: mean expected return of these episodes, each given its context, against the worst adversary of strength p "
-    "(exact; it does not cover an adversary that also acted while the context was collected); estimated: no such value, the "
-    "worst of the sampled adversaries of each task instead"
+    "certified: mean expected return of these episodes, each given its context, against the worst adversary that overrides "
+    "actions with probability p (exact; it covers neither wind nor permuted controls, nor an adversary that also acted while "
+    "the context was collected); estimated: no such value, the worst of the sampled adversaries of each task instead; -: only "
+    "one was sampled"
 )
 """Caption of the column ``certified``."""
 
@@ -88,9 +89,11 @@ def any_certified(found: Sequence[Returns], last: int) -> bool:
 
 
 def worst_case(one: Returns, last: int) -> str:
-    """The certified return of an agent, or the worst of the sampled adversaries, labelled ``estimated``."""
+    """The certified return, or the worst of several sampled adversaries, labelled ``estimated``; ``-`` with a single one."""
     certified = one.certificate(last)
-    return f"{one.worst_sampled(last):.1f} estimated" if certified is None else f"{certified:.1f}"
+    if certified is not None:
+        return f"{certified:.1f}"
+    return f"{one.worst_sampled(last):.1f} estimated" if one.p == 0 or one.draws > 1 else "-"
 
 
 def _shape(found: Sequence[Returns]) -> tuple[int, ...]:

@@ -26,9 +26,9 @@ def rate_labels(
     Without trials nothing is written and the result is None.  If the rows cannot be written, ``note`` is called with the
     reason in one line and the result is None: training needs no rows, and after a resume the same error would come again.
     """
-    rule, blocks, context_trials = methods.of(run).deployment(run), [], 0
+    rule, blocks = methods.of(run).deployment(run), []
     for one in rated:
-        context_trials = one.context_trials
+        became = ["context" if trial.identity.trial < one.context_trials else "labels" for trial in one.trials]
         blocks.append(
             {
                 **_of_trials(run, folder.resolve().name, one.trials),
@@ -36,6 +36,7 @@ def rate_labels(
                 "policy_version": np.array([trial.policy_version for trial in one.trials]),
                 "weights_digest": np.array([trial.weights_digest for trial in one.trials], object),
                 "deployment": rule,
+                "data": np.array(became, object),
                 "optimum": one.optimum,
                 "agreement": one.agreement,
             }
@@ -44,7 +45,7 @@ def rate_labels(
         return None
     try:
         file = rows.append(folder / "results", "label_quality", {"round": phase.round}, blocks)
-        return summaries.label_quality(rows.read([file]), context_trials)
+        return summaries.label_quality(rows.read([file]))
     except Exception as error:
         note(f"round {phase.round}: its label quality is not stored, and training goes on: {' '.join(str(error).split())}")
         return None

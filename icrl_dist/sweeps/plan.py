@@ -88,8 +88,10 @@ def members(sweep: SweepFile, source: Path) -> tuple[Member, ...]:
             del keys["method"]
         for setting in only.settings or sweep.settings:
             changed = _changed(base, sweep.settings[setting], f"{source}: [settings.{setting}]")
+            _check_seeds(sweep, changed, sweep.settings[setting], f"{source}: [settings.{setting}]")
             place = f"{where} in setting {setting}"
             run = _changed(changed, keys, place)
+            _check_seeds(sweep, run, keys, where)
             wanted = {
                 name: one
                 for name, one in sweep.evaluations.items()
@@ -146,6 +148,17 @@ def _setting(key: str, value: object) -> str:
     return (
         f"{key}={tomli_w.dumps({'value': value}).partition('=')[2].strip()}" if not isinstance(value, dict) else f"{key}={{}}"
     )
+
+
+def _check_seeds(sweep: SweepFile, run: Run, table: Mapping[str, Any], where: str) -> None:
+    """Raises ConfigError for a key that ``seeds`` or ``split_seed`` of the file would replace in silence."""
+    if "seed" in table:
+        raise ConfigError(
+            f"{where}: seed = {show(table['seed'])}: training seeds are those of seeds; use only = {{seeds = ...}}"
+        )
+    section = plugins.find("problems", run.problem).section
+    if sweep.split_seed is not None and isinstance(table.get(section), dict) and "split_seed" in table[section]:
+        raise ConfigError(f"{where}: {section}.split_seed: split_seed of the file sets it; leave one of the two out")
 
 
 def _seeds(run: Run, seed: int, split_seed: str | int | None, source: str) -> dict[str, Any]:

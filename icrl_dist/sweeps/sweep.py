@@ -210,17 +210,20 @@ def _gather(made: Plan, show: Any) -> tuple[list[dict[str, Any]], int]:
         if found.done(one) and file.is_file():
             files.append(file)
             runs.append(_described(one, found))
-    write_json(made.out / "runs.json", runs)
-    return runs, rows.join(files, made.out / "rows.parquet")
+    count = rows.join(files, made.out / "rows.parquet")
+    write_json(made.out / "runs.json", runs)  # after the rows: a damaged file leaves both as they were
+    return runs, count
 
 
 def _described(member: Member, found: State) -> dict[str, Any]:
     named = {"run": member.name, "setting": member.setting, "variant": member.variant, "seed": member.seed}
+    labels = None if member.exact else budget.label_bytes(member.run)
     return {
         **named,
         **{name: found.training.get(name) for name in ("dataset_digest", "weights_digest")},
         "returns": found.returns,
         "budget": found.budget,
+        **{name: None if labels is None else getattr(labels, name) for name in budget.LabelBytes._fields},
         "seconds": round(found.seconds, 2),
         "cpu_seconds": {name: round(value, 2) for name, value in found.cpu.items()},
         "kept": found.kept,

@@ -69,8 +69,13 @@ def test_a_budget_is_what_the_training_takes(
     trajectories = [store.read(row.identity) for row in store.index]
     store.close()
     episodes, steps, labelled = 0, 0, 0
+    labels = label_bytes = sent = 0
     of_variation: dict[tuple[str, int, int, int], list[Any]] = {}
     for t in trajectories:
+        arrays = t.arrays()
+        sent += sum(array.nbytes for array in arrays.values())
+        labels += len(t.labels)
+        label_bytes += sum(arrays[name].nbytes for name in ("queries", "labels", "prev_actions", "prev_rewards"))
         episodes += 1
         steps += len(t.actions) + len(t.prev_actions)
         labelled += bool(len(t.labels))
@@ -79,8 +84,15 @@ def test_a_budget_is_what_the_training_takes(
         if trials[0].origin == "none":
             made = examples.self_labelled(run, sorted(trials, key=lambda t: t.identity.trial))
             labelled += 0 if made is None else len(made.queries) // len(trials[0].actions)
+            labels += 0 if made is None else len(made.queries)
+            label_bytes += 0 if made is None else len(made.queries) * (trials[0].observations[0].nbytes + 2)
     assert result["trajectories"] == episodes
+    assert budget.label_bytes(run) == (labels, label_bytes, sent)
     assert expected == (source, episodes, labelled, steps, len(drawn), sum(len(one.observations) for one in drawn))
+
+
+def test_bytes_of_labels_of_vectors_are_not_known() -> None:
+    assert budget.label_bytes(load("metaworld-laptop")) is None
 
 
 def test_improved_trials_are_counted_as_at_most_all_later_ones(small_run: Run) -> None:

@@ -53,6 +53,8 @@ def test_a_round_that_a_resumed_run_rates_again_is_read_once(small_run, tmp_path
     for trial in trajectories:
         row = by_key[trial.identity.task, trial.identity.variation, trial.identity.trial]
         assert row["return"] == trial.episode_return and row["agent"] == f"t{trial.policy_version}"
+        context = trial.identity.trial <= small_run.icaa.context_trials
+        assert row["data"] == ("context" if context else "labels")
         assert row["weights_digest"] == trial.weights_digest and row["tasks"] == "train"
         assert row["adversary_family"] == trial.variation.adversary.kind
         assert tuple(json.loads(row["task"])["goal"]) == trial.variation.task.vector("goal")

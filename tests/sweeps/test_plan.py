@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from icrl_dist.config.run import ConfigError
+from icrl_dist.storage.files import StoreError
 from icrl_dist.sweeps import file, plan, sweep
 from tests.sweeps.files import TEXT, written
 
@@ -67,6 +68,13 @@ def test_the_base_run_may_be_a_file_beside_the_sweep_file(tmp_path):
         ('run = "smoke"', 'run = "smok"', "did you mean 'smoke'?"),
         ('run = "smoke"', 'run = "smoke"\nsplits = 1', "unknown key splits"),
         ("split_seed = ", 'split_seed = "sed" # ', "split_seed = 'sed': use \"seed\""),
+        ('method = "dpt"', 'method = "dpt"\nseed = 7', "[methods.dpt]: seed = 7: training seeds are those of seeds"),
+        (
+            'method = "dpt"',
+            'method = "dpt"\ndarkroom.split_seed = 7',
+            "[methods.dpt]: darkroom.split_seed: split_seed of the file",
+        ),
+        ("[settings.strong]", "[settings.strong]\nseed = 3", "[settings.strong]: seed = 3"),
         ("[methods.icag-k2]", '[methods."a/b"]', "use letters, digits and . _ -"),
         ("[evaluations.unseen]", "[evaluations.training]", "[evaluations.training]"),
         ("[settings.override]", "[settings]\noverride = 3", "expected a table"),
@@ -160,3 +168,16 @@ def test_a_dry_run_lists_runs_and_budgets_and_writes_nothing(tmp_path):
     lines = sweep.describe(sweep.make_plan(written(tmp_path), tmp_path / "out"))
     assert "override/dpt/0  missing  2520 environment steps, 280 labelled episodes, 60 optimizer steps" in lines[0]
     assert "10 runs, 10 of them missing" in lines[-1] and not (tmp_path / "out").exists()
+
+
+def test_rows_that_cannot_be_joined_leave_the_list_of_runs_as_it_was(tmp_path, monkeypatch):
+    made = sweep.make_plan(written(tmp_path), tmp_path / "out")
+    made.out.mkdir()
+
+    def damaged(files, to):
+        raise StoreError("damaged")
+
+    monkeypatch.setattr("icrl_dist.sweeps.rows.join", damaged)
+    with pytest.raises(StoreError, match="damaged"):
+        sweep._gather(made, None)
+    assert not (made.out / "runs.json").exists()

@@ -13,12 +13,21 @@ import numpy as np
 from icrl_dist.results import statistics
 from icrl_dist.results.claims.findings import NOT_DECIDABLE, UNKNOWN, Finding, few, verdict
 from icrl_dist.results.figures.reading import Arm
-from icrl_dist.results.figures.selection import Study
+from icrl_dist.results.figures.selection import Study, listed
+from icrl_dist.results.markup import Sheet
 from icrl_dist.storage.files import StoreError
 
 Ledger = Mapping[tuple[str, str, int], Mapping[str, Any]]
 """Costs of a training by setting, variant and training seed."""
-COSTS = {"environment_steps": "environment steps", "cpu_seconds": "CPU-seconds", "label_bytes": "bytes of labels"}
+LABELS = "labels"
+COSTS = {
+    "environment_steps": ("environment steps per label", 1),
+    "cpu_seconds": ("CPU-seconds of training per 1000 labels", 1000),
+    "label_bytes": ("bytes of states and labels per label", 1),
+    "sent_bytes": ("bytes sent to the learner per label", 1),
+}
+"""Columns of costs, what each is divided by the labels, and of how many labels: totals are equal by design in a comparison
+with equal budgets, so they say nothing."""
 
 
 def ledger(files: Sequence[Path]) -> Ledger:
@@ -44,25 +53,59 @@ def ledger(files: Sequence[Path]) -> Ledger:
 
 
 def findings(study: Study, known: Ledger) -> Iterator[Finding]:
-    """What ICAG costs more than ICAA, in each kind of cost, paired over training seeds."""
+    """What a label of ICAG costs more than one of ICAA, in each kind of cost, paired over training seeds."""
     variants = {name: study.variant(name) for name in ("icag", "icaa")}
     arms = {name: study.model(variant, study.levels(variant)[0]) for name, variant in variants.items() if variant}
-    for column, text in COSTS.items():
-        if column == "label_bytes" and not any(column in run for run in known.values()):
-            continue  # a sweep that does not measure them
+    for column, (text, of) in COSTS.items():
         comparison = f"ICAG - ICAA, {text}"
-        values = {name: cost(arm, column, known) for name, arm in arms.items() if arm is not None}
+        values = {name: per_label(arm, column, known, of) for name, arm in arms.items() if arm is not None}
         seeds = sorted(set.intersection(*map(set, values.values()))) if len(values) == 2 else []
         if not seeds:
             missing = "; ".join(study.run(variants[name] or name) for name in variants if not values.get(name))
-            reason = f"{text} are not known of both; these runs make them: {missing or 'those of the sweep, with runs.json'}"
+            what = f"{missing or 'those of equal seeds'}, with the runs.json of their sweep beside the rows"
+            reason = f"{text} are not known of both; these runs make them: {what}"
             yield Finding(comparison, UNKNOWN, UNKNOWN, math.nan, 0, NOT_DECIDABLE, reason)
             continue
         scores = np.array([[[[values[name][seed]]] for seed in seeds] for name in ("icag", "icaa")], float)
         (effect,) = statistics.estimate(scores, lambda of: statistics.mean(of[:, :1] - of[:, 1:]))
         yield Finding(
-            comparison, effect, UNKNOWN, math.nan, len(seeds), verdict(effect, 1, len(seeds)), few(len(seeds)), "{:+,.0f}"
+            comparison, effect, UNKNOWN, math.nan, len(seeds), verdict(effect, 1, len(seeds)), few(len(seeds)), "{:+,.3g}"
         )
+
+
+def per_label(arm: Arm, column: str, known: Ledger, of: int = 1) -> dict[int, float]:
+    """One cost of so many labels by training seed, of those of which cost and labels are known."""
+    labels = cost(arm, LABELS, known)
+    return {seed: of * value / labels[seed] for seed, value in cost(arm, column, known).items() if labels.get(seed)}
+
+
+def sheet(study: Study, known: Ledger) -> Sheet:
+    """The ledger: what a training of ICAG and of ICAA cost, and what of it falls to a label; means over training seeds."""
+    rows = []
+    for name in ("icag", "icaa"):
+        variant = study.variant(name)
+        arm = study.model(variant, study.levels(variant)[0]) if variant and study.levels(variant) else None
+        if variant is None or arm is None:
+            continue
+        totals = [cost(arm, column, known) for column in (LABELS, *COSTS)]
+        shares = [per_label(arm, column, known, of) for column, (_, of) in COSTS.items()]
+        cells = [
+            _mean(found, form) for found, form in [*((one, "{:,.0f}") for one in totals), *((s, "{:,.3g}") for s in shares)]
+        ]
+        rows.append((variant, listed(arm.seeds), *cells))
+    columns = (LABELS, *(name.replace("_", " ") for name in COSTS), *(text for text, _ in COSTS.values()))
+    caption = (
+        "One training, mean over training seeds. Labels: labelled states whose labels the fits use, of ICAA also every step of "
+        "the trials that it takes as labels. Labels and bytes are computed from the run file (arrays, without names and "
+        "headers), and not counted in a dataset; CPU-seconds are measured, of collecting and fitting, and depend on the "
+        "machine and its load. Environment steps are equal by design where budgets are"
+    )
+    title = "Costs of ICAG and ICAA" + (f", setting {study.setting}" if study.setting else "")
+    return Sheet(title, ("variant", "seeds", *columns), tuple(rows), caption)
+
+
+def _mean(found: Mapping[int, float], form: str) -> str:
+    return form.format(float(np.mean(list(found.values())))) if found else "-"
 
 
 def cost(arm: Arm, column: str, known: Ledger) -> dict[int, float]:

@@ -14,7 +14,7 @@ from icrl_dist.results.figures.choices import Choice, Spot
 from icrl_dist.results.figures.panels import resampled
 from icrl_dist.results.figures.reading import Arm
 from icrl_dist.results.figures.selection import MissingError, Study
-from icrl_dist.results.markup import Sheet, interval, number
+from icrl_dist.results.markup import CERTIFIED, Sheet, interval, number
 from icrl_dist.results.statistics import Interval
 
 UNDEFINED = "not defined"
@@ -39,7 +39,8 @@ def sheet(study: Study) -> Sheet:
         for index, row in enumerate(_rows(arms, [agent.label for agent in agents])):
             rows.append((f"{spot.p:g}{f', {spot.prior}' if spot.p else ''}" if index == 0 else "", *row))
     title = "ICAA: T^0, each round, and ICAG" + (f", setting {study.setting}" if study.setting else "")
-    caption = f"Last episodes; {resampled(over)}. Closed: (T^j - T^0) / (ICAG - T^0), {UNDEFINED} if the gap's interval holds 0"
+    closing = f"Closed: (T^j - T^0) / (ICAG - T^0), {UNDEFINED} if the gap's interval holds 0 or lies below it"
+    caption = f"Last episodes; {resampled(over)}. {closing}. {CERTIFIED}"
     return Sheet(
         title, ("p", "agent", "return", "less T^0", "less the one before", "closed", "certified"), tuple(rows), caption
     )

@@ -8,7 +8,7 @@ from typing import Any
 from icrl_dist.results.claims.findings import HELD, NOT_DECIDABLE, NOT_HELD, NOT_SHOWN, Finding
 from icrl_dist.results.claims.questions import Claim
 from icrl_dist.results.figures.panels import plain
-from icrl_dist.results.markup import Sheet, interval, number
+from icrl_dist.results.markup import CERTIFIED, Sheet, interval, number
 from icrl_dist.results.statistics import Interval
 
 _ORDER = (NOT_HELD, NOT_SHOWN, NOT_DECIDABLE, HELD)
@@ -31,6 +31,7 @@ def summary(claims: Sequence[Claim]) -> str:
 def sheet(claims: Sequence[Claim]) -> Sheet:
     """One row for each comparison; the caption says what decides and, by number, what those that are not decidable lack."""
     notes: dict[str, int] = {}
+    count = sum(len(claim.findings) for claim in claims)
     rows: list[tuple[str, ...]] = []
     for claim in claims:
         name = f"{claim.number}. {claim.text}" + (f" ({claim.setting})" if claim.setting else "")
@@ -42,7 +43,9 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
         "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn with all "
         "their tasks where these are their own. The verdict is that of the last episodes: held, if the interval lies on the "
         "claimed side of 0; not held, if on the other; not shown, if it holds 0. A claim held only if each of its comparisons "
-        "did. Certified: the same difference of exact worst-case returns"
+        f"did, and did not hold if any did not. Intervals are not corrected for the number of comparisons ({count} here): "
+        "where all true differences are 0, each interval lies on the wrong side with probability 2.5%, so the more comparisons "
+        f"a claim has, the likelier is `not held` by chance. {CERTIFIED}; here the same sum of them"
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")
     return Sheet(

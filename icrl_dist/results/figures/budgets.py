@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from icrl_dist.results.figures.reading import BUDGETS, Arm
 from icrl_dist.results.figures.selection import EXACT, METHODS, MissingError, Study, listed, of_budget, unequal
-from icrl_dist.results.markup import Sheet, number
+from icrl_dist.results.markup import CERTIFIED, Sheet, number
 from icrl_dist.results.names import AgentKey
 
 TITLE = "Budgets"
@@ -22,7 +22,7 @@ def sheet(study: Study) -> Sheet:
     verdict = f"Budgets differ: {'; '.join(different)}" if different else f"Equal for all variants: {', '.join(BUDGETS)}"
     unknown = [column for column in BUDGETS if any(of_budget(arm, column) is None for arm in arms)]
     verdict += f". Not known of all: {', '.join(unknown)}" if unknown else ""
-    caption = f"{verdict}. Means over training seeds. Certified: the last episodes against the worst adversary of p = 0.2"
+    caption = f"{verdict}. Means over training seeds. {CERTIFIED}; here p = 0.2"
     title = TITLE + (f", setting {study.setting}" if study.setting else "")
     names = ("variant", "method", "K", "seeds", *(name.replace("_", " ") for name in COLUMNS), "labels", "certified")
     return Sheet(title, names, rows, caption)

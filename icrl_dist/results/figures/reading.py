@@ -231,7 +231,7 @@ class _Coded:
         self._known: dict[str, dict[tuple[Any, ...], int]] = {"group": {}, "task": {}, "adversary": {}}
         chunks: dict[str, list[np.ndarray]] = {}
         for path in files:
-            for batch in _batches(path):
+            for batch in batches(path, _COLUMNS, SUITES):
                 for name, values in self._numbers(path, batch).items():
                     chunks.setdefault(name, []).append(values)
         if not chunks:
@@ -272,16 +272,21 @@ class _Coded:
             yield values, order[start:stop]
 
 
-def _batches(path: Path) -> Iterator[pa.RecordBatch]:
+def batches(path: Path, columns: Sequence[str], suites: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """Columns of the rows of some suites in batches; of suites of evaluations only those with a p.
+
+    Raises StoreError for a file that is damaged or of another format.
+    """
     import pyarrow as pa
     import pyarrow.dataset
     import pyarrow.parquet
 
     try:
         former = rows.check_schema(path, pa.parquet.read_schema(path)) != str(FORMAT)
-        wanted = pa.dataset.field("suite").isin(SUITES) & pa.dataset.field("p").is_valid()
+        wanted = pa.dataset.field("suite").isin(suites)
+        wanted = wanted & pa.dataset.field("p").is_valid() if suites == SUITES else wanted
         data = pa.dataset.dataset(rows.read_table(path)) if former else pa.dataset.dataset(path, format="parquet")
-        scanner = data.scanner(list(_COLUMNS), filter=wanted, batch_size=_BATCH, batch_readahead=2, fragment_readahead=1)
+        scanner = data.scanner(list(columns), filter=wanted, batch_size=_BATCH, batch_readahead=2, fragment_readahead=1)
         yield from (batch for batch in scanner.to_batches() if len(batch))
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())

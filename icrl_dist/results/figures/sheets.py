@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from icrl_dist.results.figures.panels import Panel, Series
-from icrl_dist.results.markup import Sheet, interval, number
+from icrl_dist.results.markup import CERTIFIED, Sheet, interval, number
 
 _COLUMNS = 8
 """Values of a curve that a table shows."""
@@ -18,7 +18,7 @@ def sheet(panel: Panel) -> Sheet:
     names = [f"ep {value}" if panel.x_label == "online episode" else _named(panel, value) for value in x]
     columns = ("agent", *names, f"certified, {names[x.index(at)]}")
     rows = tuple(_row(series, x, at) for series in panel.series)
-    return Sheet(f"{panel.name}: {panel.title}", columns, rows, panel.caption)
+    return Sheet(f"{panel.name}: {panel.title}", columns, rows, f"{panel.caption}. {CERTIFIED}")
 
 
 def _named(panel: Panel, value: float | str) -> str:
