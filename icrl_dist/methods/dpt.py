@@ -130,7 +130,7 @@ class DPT(Method):
     ) -> InContextPolicy:
         from icrl_dist.rollout.deployment import in_context
 
-        return in_context(model, batch, context, deploy or self.rule(model.config), watch)
+        return in_context(model, batch, context, self.rule(model.config) if deploy is None else deploy, watch)
 
     def distributions(
         self,

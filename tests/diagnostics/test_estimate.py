@@ -133,7 +133,7 @@ def test_the_demo_takes_the_estimated_time(tmp_path):
     def estimated():
         given = [sys.executable, "-c", MEASURE, *settings]  # in another process, without the shape checks of the tests
         found = json.loads(subprocess.run(given, check=True, capture_output=True, text=True).stdout)
-        assert len(found["phases"]) == 3 and found["phases"][1]["trajectories"] == 39 * 8 * 6
+        assert len(found["phases"]) == 4 and found["phases"][1]["trajectories"] == 18 * 9 * 6
         rates = Rates(**{**found, "phases": tuple(PhaseRates(**phase) for phase in found["phases"])})
         return 3600 * estimate(rates, nodes=1, cores=1, gbit_per_s=1.0)["hours"]
 

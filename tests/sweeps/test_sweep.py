@@ -55,7 +55,12 @@ def when(condition, action):
 
 
 def children():
-    return [one for one in psutil.Process().children() if "icrl_dist.sweeps.one" in " ".join(one.cmdline())]
+    found = []
+    for child in psutil.Process().children():
+        with contextlib.suppress(psutil.NoSuchProcess):  # it has ended, as that of another test
+            if "icrl_dist.sweeps.one" in " ".join(child.cmdline()):
+                found.append(child)
+    return found
 
 
 def table(path):
