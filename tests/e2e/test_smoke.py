@@ -16,7 +16,7 @@ import pytest
 from icrl_dist.agent.loading import load_agent
 from icrl_dist.config.run import load
 from icrl_dist.methods import registry as methods
-from icrl_dist.problems.darkroom.exact_agents import RULES
+from icrl_dist.problems.darkroom.problem import DarkRoomProblem
 from icrl_dist.storage.checkpoint import version_file
 from icrl_dist.storage.dataset import Dataset
 from icrl_dist.stream.link import Refused
@@ -96,7 +96,9 @@ def test_the_result_is_on_the_last_line_and_in_the_folder(undisturbed):
     result = json.loads(output.splitlines()[-1])
     assert result["rows"] == result_of(folder)["rows"]
     assert {(row["agent"], row["p"]) for row in result["rows"]} == {
-        (agent, p) for agent in ("T^2 (icaa)", "T^0", "random", *RULES.values(), "oracle") for p in (0.0, 0.2)
+        (agent, p)
+        for agent in ("T^2 (icaa)", "T^0", "random", *DarkRoomProblem.agent_names.values(), "oracle")
+        for p in (0.0, 0.2)
     }
     assert Path(result["figure"]).read_bytes().startswith(b"\x89PNG")
 
@@ -138,7 +140,7 @@ def test_evaluate_prints_returns_and_those_of_the_oracle(undisturbed):
     output = finish(process)
     assert process.returncode == 0, output
     rows = json.loads(output.splitlines()[-1])["rows"]
-    agents = 4 + len(RULES)
+    agents = 4 + len(DarkRoomProblem.agent_names)
     assert [row["p"] for row in rows] == [0.0] * agents + [0.4] * agents
     assert all(len(row["episodes"]) == 2 for row in rows)
     assert next(row for row in rows if row["agent"] == "oracle")["episodes"] == [9.0, 9.0]
