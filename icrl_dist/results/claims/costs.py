@@ -69,7 +69,15 @@ def findings(study: Study, known: Ledger) -> Iterator[Finding]:
         scores = np.array([[[[values[name][seed]]] for seed in seeds] for name in ("icag", "icaa")], float)
         (effect,) = statistics.estimate(scores, lambda of: statistics.mean(of[:, :1] - of[:, 1:]))
         yield Finding(
-            comparison, effect, UNKNOWN, math.nan, len(seeds), verdict(effect, 1, len(seeds)), few(len(seeds)), "{:+,.3g}"
+            comparison,
+            effect,
+            UNKNOWN,
+            math.nan,
+            len(seeds),
+            verdict(effect, 1, len(seeds)),
+            few(len(seeds)),
+            "{:+,.3g}",
+            main=True,
         )
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from icrl_dist.results.claims.findings import HELD, NOT_DECIDABLE, NOT_HELD, NOT_SHOWN, Finding
+from icrl_dist.results.claims.findings import HELD, MAIN_SEEDS, MARGIN, NOT_DECIDABLE, NOT_HELD, NOT_SHOWN, Finding
 from icrl_dist.results.claims.questions import Claim
 from icrl_dist.results.figures.panels import plain
 from icrl_dist.results.markup import CERTIFIED, Sheet, interval, number
-from icrl_dist.results.statistics import Interval
+from icrl_dist.results.statistics import Interval, counted
 
 _ORDER = (NOT_HELD, NOT_SHOWN, NOT_DECIDABLE, HELD)
 
@@ -38,14 +38,16 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
         rows.append((name, "", "", "", "", "", claim.verdict))
         for one in claim.findings:
             mark = f" [{notes.setdefault(one.reason, len(notes) + 1)}]" if one.reason else ""
-            rows.append(("", *_cells(one), str(one.seeds), f"{one.verdict}{mark}"))
+            rows.append(("", *_cells(one), str(one.seeds), f"{one.verdict}{'' if one.needed else ', beside'}{mark}"))
     caption = (
         "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn with all "
         "their tasks where these are their own. The verdict is that of the last episodes: held, if the interval lies on the "
-        "claimed side of 0; not held, if on the other; not shown, if it holds 0. A claim held only if each of its comparisons "
-        f"did, and did not hold if any did not. Intervals are not corrected for the number of comparisons ({count} here): "
-        "where all true differences are 0, each interval lies on the wrong side with probability 2.5%, so the more comparisons "
-        f"a claim has, the likelier is `not held` by chance. {CERTIFIED}; here the same sum of them"
+        "claimed side of 0; not held, if on the other; not shown, if it holds 0. Where a margin is named it takes the place of "
+        f"0: {MARGIN:.0%} of the oracle's return at that p. A claim held only if each of its comparisons did, and did not hold "
+        "if any did not; those marked `beside` are shown with it and decide nothing. Intervals are not corrected for the number "
+        f"of comparisons ({count} here): where all true differences are 0, each interval lies on the wrong side with probability "
+        "2.5%, so the more comparisons a claim has, the likelier is `not held` by chance. "
+        f"{CERTIFIED}; here the same sum of them{_few([one for claim in claims for one in claim.findings])}"
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")
     return Sheet(
@@ -53,8 +55,26 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
     )
 
 
+def _few(findings: Sequence[Finding]) -> str:
+    """What the caption adds about comparisons of fewer training seeds than are wanted, and of trainings with one split."""
+    text = ""
+    few = [one for one in findings if one.seeds and one.main and one.seeds < MAIN_SEEDS]
+    if few:
+        text += (
+            f". Note: {counted(len(few), 'comparison')} of DPT, ICAG and ICAA with each other "
+            f"{'has' if len(few) == 1 else 'have'} fewer than the {MAIN_SEEDS} training seeds that are wanted (column seeds)"
+        )
+    if shared := [one for one in findings if one.shared_splits]:
+        text += (
+            f". Warning: in {counted(len(shared), 'comparison')} trainings share a split of the tasks, so the intervals say too "
+            'little about other splits; give each training its own (split_seed = "seed" in the sweep file)'
+        )
+    return text
+
+
 def _cells(one: Finding) -> tuple[str, ...]:
-    return one.comparison, interval(one.effect, one.form), interval(one.overall, one.form), number(one.certified, one.form)
+    name = one.comparison + (f", margin {one.margin:.2f}" if one.margin else "")
+    return name, interval(one.effect, one.form), interval(one.overall, one.form), number(one.certified, one.form)
 
 
 def data(claims: Sequence[Claim]) -> list[dict[str, Any]]:
@@ -71,6 +91,8 @@ def data(claims: Sequence[Claim]) -> list[dict[str, Any]]:
                     "effect": _numbers(one.effect),
                     "all_episodes": _numbers(one.overall),
                     "certified": plain(one.certified),
+                    "margin": one.margin,
+                    "needed": one.needed,
                     "seeds": one.seeds,
                     "verdict": one.verdict,
                     "reason": one.reason,

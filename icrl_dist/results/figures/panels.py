@@ -144,7 +144,9 @@ def resampled(arms: Sequence[Arm], last: int = LAST) -> str:
     whole = "" if arm.crossed else "; each training is drawn with all its tasks, which are its own"
     splits = len({part.split_seed for part in arm.parts})
     each = f"{draws} adversary draw{'' if draws == 1 else 's'} a task"
-    return f"{over}; training seeds {listed(arm.seeds)}, {splits} split{'' if splits == 1 else 's'} of the tasks, {each}{whole}"
+    shared = " (shared by trainings; each should have its own)" if arm.shared_splits else ""
+    text = f"{over}; training seeds {listed(arm.seeds)}, {statistics.counted(splits, 'split')} of the tasks{shared}, "
+    return f"{text}{each}{whole}"
 
 
 def with_note(panel: Panel, note: str) -> Panel:

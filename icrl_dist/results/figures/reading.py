@@ -95,6 +95,12 @@ class Arm:
         """Whether all trainings were evaluated on the same tasks."""
         return bool((self.tasks == self.tasks[:1]).all())
 
+    @property
+    def shared_splits(self) -> bool:
+        """Whether trainings have the same split of the tasks, as far as their splits are known."""
+        known = [part.split_seed for part in self.parts if part.split_seed is not None]
+        return len(set(known)) < len(known)
+
     def scores(self, episodes: int = LAST) -> Float64[np.ndarray, "S C E"]:
         """Mean return over the last episodes of each evaluation."""
         return np.asarray(self.returns[..., -episodes:].mean(axis=-1))
