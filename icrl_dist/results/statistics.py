@@ -129,22 +129,26 @@ def resamples(
 ) -> Iterator[Resample]:
     """Indices of ``count`` resamples of S trainings, C cells and E evaluations, in chunks; draws are with replacement.
 
-    First the trainings are drawn, then the cells, then the evaluations within each drawn cell.  ``crossed``: all
+    First the trainings are drawn, then the cells, then the evaluations within each drawn cell, as follows.  ``crossed``: all
     trainings were evaluated in the same cells, so a resample has the same cells in all of its trainings (Owen 2007).
     Otherwise each of several trainings has cells of its own: it is drawn with all its cells and evaluations, because
     training means already vary by them, and to draw them again would count their variance twice (Davison and
-    Hinkley 1997, section 3.8).  ``fixed_cells``: every resample has all cells once.
+    Hinkley 1997, section 3.8).  For the same reason the cells of a single training are drawn with all their evaluations.
+    ``fixed_cells``: every resample has all cells once.
     """
     s, c, e = shape
     step = max(1, _CHUNK // (s * c * e))
     for first in range(0, count, step):
         r = min(step, count - first)
-        trainings, every = rng.integers(0, s, size=(r, s, 1, 1)), np.arange(c).reshape(1, 1, c, 1)
-        if s > 1 and not crossed:
-            yield Resample(trainings, every, np.arange(e).reshape(1, 1, 1, e))
-        else:
-            cells = every if fixed_cells else rng.integers(0, c, size=(r, 1, c, 1))
-            yield Resample(trainings, cells, rng.integers(0, e, size=(r, s, c, e)))
+        trainings, cells = rng.integers(0, s, size=(r, s, 1, 1)), np.arange(c).reshape(1, 1, c, 1)
+        evaluations = np.arange(e).reshape(1, 1, 1, e)
+        whole_trainings = s > 1 and not crossed
+        whole_cells = s == 1 and c > 1 and not fixed_cells
+        if not (whole_trainings or fixed_cells):
+            cells = rng.integers(0, c, size=(r, 1, c, 1))
+        if not (whole_trainings or whole_cells):
+            evaluations = rng.integers(0, e, size=(r, s, c, e))
+        yield Resample(trainings, cells, evaluations)
 
 
 def bootstrap(

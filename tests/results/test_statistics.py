@@ -274,8 +274,23 @@ def test_a_caption_says_what_was_resampled():
 
 
 def test_one_training_draws_nothing_for_the_level_of_trainings():
-    """So intervals of a single training are those of a bootstrap over its tasks and evaluations alone."""
+    """So intervals of a single training are those of a bootstrap over its tasks, or over the evaluations of fixed tasks."""
     one, two = (generator(0, RandomKey.RESULTS) for _ in range(2))
     (chosen,) = statistics.resamples(one, (1, 4, 2), 10, crossed=True)
     np.testing.assert_array_equal(chosen.cells[:, 0, :, 0], two.integers(0, 4, size=(10, 4)))
-    np.testing.assert_array_equal(chosen.evaluations[:, 0], two.integers(0, 2, size=(10, 4, 2)))
+    assert chosen.evaluations.ravel().tolist() == [0, 1]
+    for shape, fixed in (((1, 4, 2), True), ((1, 1, 2), False)):
+        (chosen,) = statistics.resamples(one, shape, 10, crossed=True, fixed_cells=fixed)
+        assert chosen.evaluations.shape == (10, *shape) and set(chosen.evaluations.ravel()) == {0, 1}
+
+
+@pytest.mark.parametrize(("of_task", "of_evaluation"), [(1.0, 1.0), (0.3, 2.0), (0.0, 1.0)])
+def test_intervals_of_one_training_count_the_noise_of_evaluations_once(monkeypatch, of_task, of_evaluation):
+    """With evaluations drawn again in each drawn task, intervals covered up to 98.7% and were up to 35% too wide."""
+    monkeypatch.setattr(statistics, "RESAMPLES", 200)
+    rng, covered, runs = np.random.default_rng(0), 0, 600
+    for _ in range(runs):
+        scores = of_task * rng.normal(size=(1, 20, 1)) + of_evaluation * rng.normal(size=(1, 20, 4))
+        (found,) = statistics.estimate(scores[None], statistics.mean)
+        covered += found.low <= 0 <= found.high
+    assert 0.925 < covered / runs < 0.965

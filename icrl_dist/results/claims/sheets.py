@@ -42,9 +42,9 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
     caption = (
         "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn with all "
         "their tasks where these are their own. The verdict is that of the last episodes: held, if the interval lies on the "
-        "claimed side of 0; not held, if on the other; not shown, if it holds 0. Where a margin is named it takes the place of "
-        f"0: {MARGIN:.0%} of the oracle's return at that p. A claim held only if each of its comparisons did, and did not hold "
-        "if any did not; those marked `beside` are shown with it and decide nothing. Intervals are not corrected for the number "
+        "claimed side of 0; not held, if on the other; not shown, if it holds 0. Where a margin is named it takes the place "
+        f"of 0: {MARGIN:.0%} of the oracle's return at that p. A claim held only if each of its comparisons did, and did not "
+        "hold if any did not; those marked `beside` are shown with it and decide nothing. Intervals are not corrected for the number "
         f"of comparisons ({count} here): where all true differences are 0, each interval lies on the wrong side with probability "
         "2.5%, so the more comparisons a claim has, the likelier is `not held` by chance. "
         f"{CERTIFIED}; here the same sum of them{_few([one for claim in claims for one in claim.findings])}"
@@ -66,8 +66,8 @@ def _few(findings: Sequence[Finding]) -> str:
         )
     if shared := [one for one in findings if one.shared_splits]:
         text += (
-            f". Warning: in {counted(len(shared), 'comparison')} trainings share a split of the tasks, so the intervals say too "
-            'little about other splits; give each training its own (split_seed = "seed" in the sweep file)'
+            f". Warning: in {counted(len(shared), 'comparison')} trainings share a split of the tasks, so the intervals say "
+            'too little about other splits; give each training its own (split_seed = "seed" in the sweep file)'
         )
     return text
 
