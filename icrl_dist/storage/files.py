@@ -149,14 +149,16 @@ def unwritten(path: Path, error: OSError) -> StoreError:
     return StoreError(f"{path}: could not be written ({error.strerror}): {remedy}")
 
 
-_SPACE = "free space, then use --resume"
+RESUME = "use --resume"
+"""The end of remedies for what a training could not write."""
+_SPACE = f"free space, then {RESUME}"
 _REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
-    errno.EROFS: "this file system is read-only: use another folder, or mount it writable and use --resume",
-    errno.EIO: "its disk fails: copy the folder to another disk, then use --resume there",
-    errno.EMFILE: "raise the limit of open files, as in ulimit -n 65536, then use --resume",
-    errno.ENFILE: "this machine has too many open files: end other programs, then use --resume",
+    errno.EROFS: f"this file system is read-only: use another folder, or mount it writable and {RESUME}",
+    errno.EIO: f"its disk fails: copy the folder to another disk, then {RESUME} there",
+    errno.EMFILE: f"raise the limit of open files, as in ulimit -n 65536, then {RESUME}",
+    errno.ENFILE: f"this machine has too many open files: end other programs, then {RESUME}",
     errno.ENAMETOOLONG: "use a folder with a shorter name",
 }
 """What to do about errors of the machine, by number.  They are no errors of this program, so no traceback is shown."""

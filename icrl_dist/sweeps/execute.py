@@ -11,7 +11,7 @@ from pathlib import Path
 from icrl_dist.console.display import ReportEvent
 from icrl_dist.console.stage_rows import duration
 from icrl_dist.sweeps import state
-from icrl_dist.sweeps.one import DONE, FAILED, Keep, Work
+from icrl_dist.sweeps.one import DONE, FAILED, Keep, Work, ended_unwritten
 from icrl_dist.sweeps.plan import Member
 from icrl_dist.sweeps.processes import Process, Start
 
@@ -73,7 +73,11 @@ class Execution:
                 self._done += 1
                 text = f"{name}: done in {duration(found.seconds)}{_returns(found.returns)}"
             else:
-                cause = found.failed if code == FAILED and found.failed else process.error or _ended(code)
+                cause = (
+                    found.failed
+                    if code == FAILED and found.failed
+                    else process.error or ended_unwritten(code, folder) or _ended(code)
+                )
                 self.failures.append(Failure(member, cause, state.log_of(folder)))
                 text = f"{name}: failed: {cause}"
             show({"event": "note", "text": text})

@@ -124,6 +124,10 @@ def read(file: str | Path) -> SweepFile:
 
 
 def _check(sweep: SweepFile, source: str) -> None:
+    if not sweep.run.strip():
+        raise ConfigError(
+            f'{source}: run = {show(sweep.run)}: names no run; name a packaged one, as in run = "demo", or a file'
+        )
     if sweep.split_seed not in ("seed", None) and not isinstance(sweep.split_seed, int):
         raise ConfigError(f'{source}: split_seed = {show(sweep.split_seed)}: use "seed", a number, or leave it out')
     for kind in ("settings", "methods", "evaluations"):

@@ -6,6 +6,8 @@ checkpoint at a signal, and when its standard input is closed, because then the 
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import shutil
@@ -24,7 +26,7 @@ from icrl_dist.launch import train as launch
 from icrl_dist.launch.learner_process import TrainFailed
 from icrl_dist.methods import budget
 from icrl_dist.methods import registry as methods
-from icrl_dist.storage.files import StoreError, explained, hold, write_json
+from icrl_dist.storage.files import RESUME, StoreError, explained, hold, unwritten, write_json
 from icrl_dist.stream import schema
 from icrl_dist.stream.excerpts import plain
 from icrl_dist.sweeps import rows, state
@@ -34,6 +36,10 @@ from icrl_dist.sweeps.state import Meter, State
 from icrl_dist.telemetry import provenance
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130
+UNWRITTEN = 64
+"""Plus the number of an error, such as ENOSPC: exit code of a run that failed and could not write its state for that reason."""
+REPEAT = "repeat the command of the sweep"
+"""In place of ``--resume``, which a sweep does not have."""
 
 Keep = Literal["all", "weights", "rows"]
 """What is kept of a run that is done: everything, all but the dataset, or only its result rows."""
@@ -91,8 +97,11 @@ def do(work: Work) -> None:
         with interruptible():
             _evaluate(work, folder, found, meter, 2 * phases)
             _free(work, folder, found)
-    finally:
-        meter.save()
+    except BaseException:
+        with contextlib.suppress(StoreError):  # it must not hide why the run failed
+            meter.save()
+        raise
+    meter.save()
 
 
 def _train(work: Work, folder: Path, found: State, meter: Meter) -> None:
@@ -166,17 +175,37 @@ def main() -> int:
     except (launch.TrainInterrupted, KeyboardInterrupt):
         return INTERRUPTED
     except Exception as error:
-        cause = explained(error)
-        if not isinstance(cause, ConfigError | TrainFailed | StoreError):
-            traceback.print_exc()
-        text = plain(" ".join(str(cause).split()), 2_000) or type(cause).__name__
-        known = isinstance(cause, ConfigError | TrainFailed | StoreError)
-        found = state.read(folder)
-        found.failed = text if known else f"{type(cause).__name__}: {text}"
-        print(found.failed, flush=True)
-        write_json(state.file_of(folder), vars(found))
-        return FAILED
+        return _failed(folder, explained(error))
     return DONE
+
+
+def _failed(folder: Path, cause: Exception) -> int:
+    """Write why a run failed into its log and its state.  Returns the exit code."""
+    known = isinstance(cause, ConfigError | TrainFailed | StoreError)
+    text = plain(" ".join(str(cause).split()), 2_000).replace(RESUME, REPEAT) or type(cause).__name__
+    text = text if known else f"{type(cause).__name__}: {text}"
+    try:
+        if not known:
+            traceback.print_exception(cause)
+        print(text, flush=True)
+    except OSError:  # the log's disk is full; what is left in the buffer would change the exit code
+        sys.stdout = sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115
+    try:
+        found = state.read(folder)
+        found.failed = text
+        write_json(state.file_of(folder), vars(found))
+    except StoreError as error:
+        number = getattr(error.__cause__, "errno", None)
+        return FAILED if number is None else UNWRITTEN + number
+    return FAILED
+
+
+def ended_unwritten(code: int, folder: Path) -> str:
+    """The cause of a run that ended with an exit code of ``UNWRITTEN``; empty for another code."""
+    number = code - UNWRITTEN
+    if number not in errno.errorcode:
+        return ""
+    return str(unwritten(state.file_of(folder), OSError(number, os.strerror(number)))).replace(RESUME, REPEAT)
 
 
 def _end_with_the_sweep() -> None:

@@ -20,12 +20,12 @@ from icrl_dist.console.stage_rows import duration
 from icrl_dist.launch import run_folder
 from icrl_dist.launch.train import TrainInterrupted
 from icrl_dist.methods import budget
-from icrl_dist.storage.files import StoreError, hold, write_json
+from icrl_dist.storage.files import RESUME, StoreError, explained, hold, write_json
 from icrl_dist.sweeps import file as sweep_file
 from icrl_dist.sweeps import plan, rows, state
 from icrl_dist.sweeps.execute import Execution
 from icrl_dist.sweeps.file import SweepFile
-from icrl_dist.sweeps.one import Keep
+from icrl_dist.sweeps.one import REPEAT, Keep
 from icrl_dist.sweeps.plan import Member
 from icrl_dist.sweeps.processes import COMMAND, ENVIRONMENT, Child, Start
 from icrl_dist.sweeps.state import State
@@ -124,7 +124,13 @@ def sweep(
         raise ConfigError(f"--jobs {jobs}: at least 1 run at a time")
     made = make_plan(file, out, only, settings, seeds)
     began, stop = time.monotonic(), threading.Event()
-    with on_signals(stop.set), reporting(progress) as show, _locked(made), contextlib.ExitStack() as stack:
+    with (
+        _with_own_remedy(),
+        on_signals(stop.set),
+        reporting(progress) as show,
+        _locked(made),
+        contextlib.ExitStack() as stack,
+    ):
         missing = [one for one in made.chosen if not _finished(made, one)]
         start, cores = _starter(address, made.out, stack) if missing else (Child, 1)
         execution = Execution(missing, len(made.chosen) - len(missing), made.out, keep, jobs or cores, start)
@@ -144,6 +150,17 @@ def sweep(
         "cpu_seconds": round(sum(sum(one["cpu_seconds"].values()) for one in runs), 1),
     }
     return SweepResult(made.out, runs, failed, summary)
+
+
+@contextlib.contextmanager
+def _with_own_remedy() -> Iterator[None]:
+    """Errors of files name the command of the sweep, which has no ``--resume``."""
+    try:
+        yield
+    except Exception as error:
+        if RESUME not in str(cause := explained(error)):
+            raise
+        raise StoreError(str(cause).replace(RESUME, REPEAT)) from error
 
 
 def _finished(made: Plan, member: Member) -> bool:

@@ -398,6 +398,12 @@ def test_a_figure_with_some_panels_names_the_others(tmp_path):
     assert "Left out: figure 3a: rows are missing; these runs make them: room/dpt, seeds 0 to 5 (evaluated at offline" in text
 
 
+def test_the_budgets_of_a_single_variant_are_called_equal_to_nothing(tmp_path):
+    path = write(tmp_path, small(tmp_path, agents={"dpt": ("t0",)}), offline=False)
+    (section,) = report(path, figure="budgets", out=tmp_path / "report").sections
+    assert "A single variant: nothing is compared." in section.sheets[0].caption and "Equal" not in section.sheets[0].caption
+
+
 def test_small_differences_of_budgets_are_named(tmp_path):
     columns = {"icag": {"environment_steps": 1950}}
     path = write(tmp_path, small(tmp_path, columns=columns), offline=False)

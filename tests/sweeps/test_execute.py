@@ -1,13 +1,17 @@
 """Runs side by side, with processes that only pretend to work."""
 
+import errno
 import json
+import os
 import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from icrl_dist.sweeps import execute, file, plan, state
+from icrl_dist.launch.learner_process import TrainFailed
+from icrl_dist.storage.files import StoreError
+from icrl_dist.sweeps import execute, file, one, plan, processes, state, sweep
 from icrl_dist.sweeps.execute import Execution
 from icrl_dist.sweeps.one import Work
 from icrl_dist.sweeps.state import State
@@ -82,6 +86,58 @@ def test_at_most_so_many_runs_at_a_time_and_one_that_fails_is_listed_with_its_ca
     notes = [event["text"] for event in events if event["event"] == "note"]
     assert len(notes) == 10 and any(note == "strong/exact/1: done in 0:00, return 5.00 (p = 0)" for note in notes)
     assert events[-1]["step"] == events[-1]["steps"] and events[-1]["text"] == "10/10 runs"
+
+
+FULL = """
+import errno, os, sys
+def full(_): raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+os.fsync = full
+from icrl_dist.sweeps import one
+sys.exit(one.main())
+"""
+
+
+@pytest.mark.integration
+def test_a_full_disk_is_named_with_the_command_of_the_sweep(tmp_path, members, monkeypatch):
+    """Neither the state nor the log of the run can be written."""
+    monkeypatch.setattr(processes, "COMMAND", ("-c", FULL))
+    folder = members[0].place(tmp_path)
+    folder.parent.mkdir(parents=True)
+    state.log_of(folder).symlink_to("/dev/full")
+    execution = Execution(members[:1], 0, tmp_path, "weights", 1, processes.Child)
+    notes: list[dict[str, Any]] = []
+    assert execution.run(notes.append, lambda: False)
+    expected = (
+        f"{state.file_of(folder)}: could not be written (No space left on device): "
+        "free space, then repeat the command of the sweep"
+    )
+    assert [one.cause for one in execution.failures] == [expected]
+    assert any(expected in str(note["text"]) for note in notes)
+
+
+def test_the_sweeps_own_files_on_a_full_disk_name_its_command(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = written(tmp_path)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(
+        StoreError, match=r"sweep.json: could not be written .*: free space, then repeat the command of the sweep"
+    ):
+        sweep.sweep(path, tmp_path / "out")
+
+
+def test_why_a_run_failed_is_not_hidden_by_its_state(tmp_path, members, monkeypatch):
+    def fails(*_):
+        monkeypatch.setattr(os, "fsync", full)
+        raise TrainFailed("all workers died")
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(one, "_train", fails)
+    with pytest.raises(TrainFailed, match="all workers died"):
+        one.do(Work(members[0], tmp_path, "weights"))
 
 
 def test_a_stop_ends_every_running_process_and_kills_one_that_does_not_end(tmp_path, members, monkeypatch):

@@ -65,6 +65,7 @@ def test_the_base_run_may_be_a_file_beside_the_sweep_file(tmp_path):
         ("seeds = [0, 1]", "seeds = []", "name at least one training seed"),
         ("seeds = [0, 1]", "seeds = [0, 1, 0]", "two runs of one name: override/dpt/0 and override/dpt/0"),
         ("seeds = [0, 1]", "", "seeds"),
+        ('run = "smoke"', 'run = ""', "run = '': names no run"),
         ('run = "smoke"', 'run = "smok"', "did you mean 'smoke'?"),
         ('run = "smoke"', 'run = "smoke"\nsplits = 1', "unknown key splits"),
         ("split_seed = ", 'split_seed = "sed" # ', "split_seed = 'sed': use \"seed\""),

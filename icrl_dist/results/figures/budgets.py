@@ -19,7 +19,10 @@ def sheet(study: Study) -> Sheet:
         raise MissingError("figure budgets", [study.run(method) for method in METHODS])
     rows = tuple(_row(study, arm) for arm in arms)
     different = [f"{column} ({one.key.variant}, {two.key.variant})" for column, one, two in unequal(arms)]
-    verdict = f"Budgets differ: {'; '.join(different)}" if different else f"Equal for all variants: {', '.join(BUDGETS)}"
+    if len(arms) == 1:
+        verdict = "A single variant: nothing is compared"
+    else:
+        verdict = f"Budgets differ: {'; '.join(different)}" if different else f"Equal for all variants: {', '.join(BUDGETS)}"
     unknown = [column for column in BUDGETS if any(of_budget(arm, column) is None for arm in arms)]
     verdict += f". Not known of all: {', '.join(unknown)}" if unknown else ""
     caption = f"{verdict}. Means over training seeds. {CERTIFIED}; here p = 0.2"
