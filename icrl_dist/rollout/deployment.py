@@ -151,9 +151,13 @@ class InContextPolicy(CopiedWhole):
         kept = with_episode(self._episodes, episode, self._config)
         dropped, self._episodes = len(kept) <= len(self._episodes), kept
         if dropped:
-            self._deployed.clear()
-            self._deployed.append(Columns(*(np.concatenate(columns, axis=1) for columns in zip(*self._episodes, strict=True))))
+            self._encode_again()
         return dropped
+
+    def _encode_again(self) -> None:
+        """Encode the ended episodes of the context, and nothing else."""
+        self._deployed.clear()
+        self._deployed.append(Columns(*(np.concatenate(columns, axis=1) for columns in zip(*self._episodes, strict=True))))
 
 
 class GrowingPolicy(InContextPolicy):
@@ -187,6 +191,13 @@ class GrowingPolicy(InContextPolicy):
 
     def _one(self, step: tuple[np.ndarray, ...]) -> Columns:
         return Columns(*(column[:, None] for column in step))
+
+    def _add(self, episode: Columns) -> None:
+        """In mid-episode the running episode is encoded again, because it comes after the ended ones."""
+        super()._add(episode)
+        if self._encoded:
+            self._encode_again()
+            self._encoded = 0
 
     def _add_own(self, episode: Columns) -> None:
         encoded, self._encoded = self._encoded, 0

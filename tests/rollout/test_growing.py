@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
-from icrl_dist.config.sections import ContextConfig
+from icrl_dist.config.sections import ContextConfig, ModelConfig
+from icrl_dist.models.dpt import PretrainedTransformer
 from icrl_dist.models.sampling import sample
 from icrl_dist.problems import registry
 from icrl_dist.rollout import deployment
@@ -57,6 +59,52 @@ def test_episodes_of_other_policies_come_before_its_own(model, variations):
             for e in data
         ]
         assert ran.actions[row].tolist() == slow(model, variation, row, 1, 1000, given)[0]
+
+
+@pytest.mark.parametrize("rule", ["growing", "committed"])
+@pytest.mark.parametrize("decided", [True, False])
+@pytest.mark.parametrize("most", [HORIZON, 3 * HORIZON])
+def test_an_episode_that_is_appended_in_mid_episode_comes_before_the_running_one(variations, rule, decided, most):
+    """Where it drops an older episode, the policy then has the context of one that never saw the dropped one."""
+    torch.manual_seed(1)
+    settings = ModelConfig(layers=2, width=16, window=3 if rule == "committed" else 1)
+    model = PretrainedTransformer(registry.spec(variations[0].task), settings).eval()
+    for parameter in model.parameters():
+        parameter.data *= 3
+    rng = np.random.default_rng(0)
+
+    def made(count):
+        states = rng.normal(size=(3, count + 1, 2)).astype(np.float32)
+        actions, rewards = rng.integers(0, 5, (3, count)), rng.random((3, count)).astype(np.float32)
+        return states[:, :-1], actions, states[:, 1:], rewards
+
+    old, given, own = made(HORIZON), made(HORIZON), made(HORIZON)
+    full, fresh = (deployment.in_context(model, 3, ContextConfig(max=most), rule) for _ in range(2))
+    u = np.full((3, 1), 0.5)
+    full.append(*old)
+    if most > HORIZON:
+        fresh.append(*old)
+    for step in range(HORIZON):
+        if step == 4:
+            full.append(*given)
+        now = [column[:, step] for column in own]
+        if decided or step > 4:
+            full.act(now[0], u)
+        observed(full, now, step)
+        if step == 3:
+            fresh.append(*given)
+            for before in range(4):
+                observed(fresh, [column[:, before] for column in own], before)
+        elif step > 3:
+            observed(fresh, now, step)
+            np.testing.assert_allclose(full.distribution(now[2][:1], 1), fresh.distribution(now[2][:1], 1), atol=1e-5)
+    assert full.length == fresh.length == most
+
+
+def observed(policy, transition, step):
+    """Let a policy observe (s, a, s', r) of a step."""
+    state, action, following, reward = transition
+    policy.observe(state, action, reward, following, step == HORIZON - 1)
 
 
 def test_every_transition_joins_the_context_at_once(model, variations):
