@@ -571,6 +571,10 @@ class Method(abc.ABC):
     def phases(self, run: Run) -> tuple[Phase, ...]:
         """The phases of the run, in order."""
 
+    def extra_steps(self, run: Run) -> int:
+        """Optimizer steps of other nets than the in-context model, beside those of the phases."""
+        return 0
+
     @abc.abstractmethod
     def ask(self, run: Run, phase: Phase) -> tuple[Job, ...]:
         """The jobs that collect the data of a phase."""

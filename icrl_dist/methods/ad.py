@@ -15,7 +15,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.config.sections import Deployment, ModelConfig
 from icrl_dist.interfaces import Draw, LearningHistories, Method, Phase, TrajectoryDataset, UsedLabels
 from icrl_dist.methods import jobs
-from icrl_dist.methods.dpt import DPT, pretrain_phase
+from icrl_dist.methods.dpt import DPT, no_dagger, pretrain_phase
 from icrl_dist.problems import registry
 from icrl_dist.types import Job, Task, Trajectory, Variation
 
@@ -50,6 +50,7 @@ class AD(DPT):
     distributions = Method.distributions  # type: ignore[assignment]  # a perfect model is far from the exact posterior
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        yield from no_dagger(run)
         if run.model.window > 1:
             yield "model.window", run.model.window, "use 1: histories of ad have no action windows"
         found, of = self._histories(run), run.section(self.section)

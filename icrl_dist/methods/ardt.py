@@ -58,6 +58,10 @@ class ARDT(PromptDT):
         """The K variations of ICAG."""
         return registry.training_variations(run, index, task, round)
 
+    def extra_steps(self, run: Run) -> int:
+        """Those of the return nets."""
+        return int(run.section("ardt").steps)
+
     def _histories(self, run: Run, dataset: TrajectoryDataset) -> Sequence[Histories]:
         """Fits the return nets, whose draws depend on the seed of the run only, so a resumed run has the same ones."""
         from icrl_dist.training.return_nets import ReturnNets, Settings

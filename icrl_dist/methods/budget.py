@@ -14,7 +14,7 @@ from icrl_dist.problems import registry as problems
 
 
 class Budget(NamedTuple):
-    """The cost of one training, of all phases together.  The fields but ``contexts`` are columns of the result rows."""
+    """The cost of one training, of all phases together.  The fields but the last two are columns of the result rows."""
 
     label_source: str | None
     """What the labels come from, as ``UsedLabels.source``; several in the order of the phases, with commas."""
@@ -25,9 +25,11 @@ class Budget(NamedTuple):
     environment_steps: int
     """Environment steps: of the episodes, of action windows, and of the training of experts that give demonstrations."""
     optimizer_steps: int
-    """Those of the in-context model; ARDT's return nets take ``ardt.steps`` smaller ones beside these."""
+    """Those of the in-context model."""
     contexts: int
     """Contexts in all training batches; at most so many if ``optim.transitions`` limits them."""
+    extra_steps: int
+    """Smaller optimizer steps of other nets beside these: ``ardt.steps`` of ARDT's return nets, else 0."""
 
 
 @functools.lru_cache(maxsize=256)
@@ -54,7 +56,7 @@ def of(run: Run) -> Budget:
                     sources.append(used.source)
     source = None if sources is None else ", ".join(dict.fromkeys(sources)) or "none"
     known = None if sources is None else labelled
-    return Budget(source, episodes, known, env_steps, steps, steps * run.optim.batch)
+    return Budget(source, episodes, known, env_steps, steps, steps * run.optim.batch, method.extra_steps(run))
 
 
 class LabelBytes(NamedTuple):
@@ -99,7 +101,7 @@ _FLOAT, _INT = 4, 2
 
 def columns(run: Run) -> dict[str, object]:
     """The budget as columns of the result rows."""
-    return {name: value for name, value in of(run)._asdict().items() if name != "contexts"}
+    return {name: value for name, value in of(run)._asdict().items() if name not in ("contexts", "extra_steps")}
 
 
 def split_seed(run: Run) -> int | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 def pretrain_phase(run: Run) -> Phase:
     """The fit to D_pre."""
     return Phase("pretrain", 0, run.pretrain.steps, run.optim.learning_rate)
+
+
+def no_dagger(run: Run) -> Iterator[tuple[str, object, str]]:
+    """The objection of a method without DAgger rounds."""
+    if run.dagger.rounds:
+        yield "dagger.rounds", run.dagger.rounds, f"{run.method} has no such rounds: use 0"
 
 
 class OwnHistories(NamedTuple):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from icrl_dist.config.run import Run
 from icrl_dist.interfaces import Draw, Phase, RatedVariation, TrajectoryDataset, UsedLabels, VariationKey
 from icrl_dist.methods import jobs
-from icrl_dist.methods.dpt import DPT, pretrain_phase
+from icrl_dist.methods.dpt import DPT, no_dagger, pretrain_phase
 from icrl_dist.problems import registry
 from icrl_dist.types import Job, Task, Trajectory, Variation
 
@@ -32,6 +32,7 @@ class ICAA(DPT):
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
         """Labels that compare actions need the same state again, and no labels along action windows."""
+        yield from no_dagger(run)
         icaa, problem = run.icaa, registry.of(run)
         if icaa.explore and not problem.spec.discrete:
             yield "icaa.explore", icaa.explore, "only discrete actions can be random ones; use 0"

@@ -35,7 +35,9 @@ class MixDPTConfig:
     early: Annotated[float, Gt(0), Lt(1), Remedy("must lie between 0 and 1, so that no phase is without steps")] = 0.4
     """Share of the optimizer steps in the early phase (appendix B.1: 40%); the rounds divide the others evenly."""
     learning_rate: Rate = 1e-3
-    """Peak learning rate of a round."""
+    """Peak learning rate of a round.  Tune it together with ``optim.learning_rate``: the default was not tuned.  In
+    darkroom-7x7 (split seed 100, one training seed each) the return at p = 0 was 20.7 with 1e-3, 22.6 with 3e-3 and 20.9
+    with 6e-3."""
 
 
 class MixDPT(DPT):

@@ -12,7 +12,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.config.sections import ContextConfig, Deployment
 from icrl_dist.interfaces import Draw, Method, Phase, TrajectoryDataset, UsedLabels, Watch
 from icrl_dist.methods import jobs
-from icrl_dist.methods.dpt import pretrain_phase
+from icrl_dist.methods.dpt import no_dagger, pretrain_phase
 from icrl_dist.problems import registry
 from icrl_dist.types import Job, Spec, Task, Trajectory, Variation
 
@@ -52,6 +52,10 @@ class PromptDT(Method):
     Config: ClassVar[type | None] = PromptDTConfig
 
     def objections(self, run: Run) -> Iterator[tuple[str, object, str]]:
+        yield from no_dagger(run)
+        if run.pretrain.windows:  # the worker would collect them, and nothing would read them
+            advice = f"{run.method} reads no action windows: use 0, and optim.windows = 0 and model.window = 1"
+            yield "pretrain.windows", run.pretrain.windows, advice
         horizon, config = registry.of(run).horizon, run.section("prompt_dt")
         for key in ("window", "prompt"):
             if (value := getattr(config, key)) > horizon:

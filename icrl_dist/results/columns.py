@@ -48,7 +48,7 @@ COLUMNS: dict[str, Column] = {
     "training_episodes": Column("int64", "episodes that the training collected; null if not known", True),
     "labelled_episodes": Column("int64", "those of them whose labels the fits used; null if not known", True),
     "environment_steps": Column("int64", "environment steps of the training, of demonstrations too; null if not known", True),
-    "optimizer_steps": Column("int64", "optimizer steps of the training; null if not known", True),
+    "optimizer_steps": Column("int64", "optimizer steps of the in-context model; null if not known", True),
     "suite": Column("string", "`online`, `offline`, `posterior`, `attack`, `label_quality` or `experts`"),
     "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
     "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),

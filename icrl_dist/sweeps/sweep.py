@@ -280,4 +280,5 @@ def _like(made: Plan, one: Member, other: Member) -> bool:
 
 def _budget(member: Member) -> str:
     found = budget.of(member.run)._asdict()
-    return ", ".join(f"{found[name]} {budget.COMPARED[name]}" for name in plan.QUANTITIES if found[name] is not None)
+    extra = f" (and {found['extra_steps']} of other nets)" if found["extra_steps"] else ""
+    return ", ".join(f"{found[name]} {budget.COMPARED[name]}" for name in plan.QUANTITIES if found[name] is not None) + extra

@@ -157,6 +157,7 @@ def test_its_decisions_are_not_compared_with_the_exact_posterior(ad_run: Run) ->
         (["ad.skip=4"], "ad.window_episodes = 3: a window takes every 4th of 9 episodes, and a history has 7; use fewer"),
         (["ad.window_episodes=8", "ad.skip=1"], "ad.window_episodes = 8: a window takes 8 episodes, and a history has 7"),
         (["model.window=2", "pretrain.windows=1", "optim.windows=1"], "model.window = 2: use 1"),
+        (["dagger.rounds=1"], "dagger.rounds = 1: ad has no such rounds: use 0"),
         (["ad.step=0"], "ad.step = 0.0: a learning rate of Q-learning lies in (0, 1]"),
         (["ad.discount=1"], "ad.discount = 1.0: a discount of Q-learning lies in [0, 1)"),
     ],

@@ -88,7 +88,7 @@ def test_a_budget_is_what_the_training_takes(
             label_bytes += 0 if made is None else len(made.queries) * (trials[0].observations[0].nbytes + 2)
     assert result["trajectories"] == episodes
     assert budget.label_bytes(run) == (labels, label_bytes, sent)
-    assert expected == (source, episodes, labelled, steps, len(drawn), sum(len(one.observations) for one in drawn))
+    assert expected == (source, episodes, labelled, steps, len(drawn), sum(len(one.observations) for one in drawn), 0)
 
 
 def test_bytes_of_labels_of_vectors_are_not_known() -> None:

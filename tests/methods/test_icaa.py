@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrl_dist.config.run import Run
+from icrl_dist.config.run import ConfigError, Run, validate
 from icrl_dist.interfaces import VariationKey
 from icrl_dist.methods import examples
 from icrl_dist.methods import registry as methods
@@ -39,6 +39,12 @@ def test_icaa_rolls_out_version_j_in_round_j_and_produces_j_plus_1(small_run: Ru
             assert job.policy_version == phase.round
             assert job.trials == run.icaa.trials + 1
             assert all(v.task.vector("start") == (0, 0) for v in job.variations)
+
+
+def test_dagger_rounds_are_refused_because_icaa_has_its_own(small_run: Run) -> None:
+    run = dataclasses.replace(small_run, dagger=dataclasses.replace(small_run.dagger, rounds=1))
+    with pytest.raises(ConfigError, match=r"dagger.rounds = 1: icaa has no such rounds: use 0$"):
+        validate(run, "test")
 
 
 def test_every_round_has_new_adversaries(small_run: Run) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import icrl_dist
-from icrl_dist.config.run import ConfigError, Run, validate
+from icrl_dist.config.run import ConfigError, Run, override, validate
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.launch import train
 from icrl_dist.methods import budget
@@ -88,10 +88,35 @@ def test_a_window_or_a_prompt_beyond_the_horizon_is_refused(small_run: Run) -> N
             validate(run, "test")
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (["dagger.rounds=2"], "dagger.rounds = 2: {} has no such rounds: use 0"),
+        (
+            ["model.window=2", "pretrain.windows=1", "optim.windows=1"],
+            "pretrain.windows = 1: {} reads no action windows: use 0, and optim.windows = 0 and model.window = 1",
+        ),
+    ],
+)
+def test_settings_that_they_ignore_are_refused_in_one_line(
+    small_run: Run, name: str, settings: list[str], expected: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        validate(override(asked(small_run, name), settings, "x"), "test")
+    assert expected.format(name) in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_their_budgets_are_those_of_dpt_with_logged_actions_as_labels(small_run: Run) -> None:
     of = {name: asked(small_run, name, adversary=AdversaryConfig(count=2)) for name in ("dpt", *NAMES)}
     assert not budget.differences({name: [run] for name, run in of.items()})
     assert [budget.of(of[name]).label_source for name in NAMES] == ["logged actions"] * 2
+
+
+def test_the_steps_of_the_return_nets_are_beside_the_optimizer_steps(small_run: Run) -> None:
+    runs = {name: asked(small_run, name, adversary=AdversaryConfig(count=2)) for name in ("dpt", *NAMES)}
+    assert [budget.of(runs[name]).extra_steps for name in runs] == [0, 0, 20]
+    assert budget.of(runs["ardt"]).optimizer_steps == budget.of(runs["prompt_dt"]).optimizer_steps
 
 
 def test_ardt_without_adversaries_is_refused(small_run: Run) -> None:

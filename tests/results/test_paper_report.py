@@ -404,6 +404,20 @@ def test_the_budgets_of_a_single_variant_are_called_equal_to_nothing(tmp_path):
     assert "A single variant: nothing is compared." in section.sheets[0].caption and "Equal" not in section.sheets[0].caption
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_the_budgets_name_the_steps_of_ardts_return_nets(tmp_path, known):
+    path = write(tmp_path, small(tmp_path, agents={"dpt": ("t0",), "ardt": ("t0",)}), offline=False)
+    if known:
+        runs = [
+            {"setting": "room", "variant": "ardt", "seed": seed, "budget": {"extra_steps": 2500, "optimizer_steps": 300}}
+            for seed in range(6)
+        ]
+        (tmp_path / "runs.json").write_text(json.dumps(runs))
+    (section,) = report(path, figure="budgets", out=tmp_path / "report").sections
+    number = "2,500" if known else "ardt.steps"
+    assert f"the return nets of ardt take {number} smaller steps beside its optimizer steps" in section.sheets[0].caption
+
+
 def test_small_differences_of_budgets_are_named(tmp_path):
     columns = {"icag": {"environment_steps": 1950}}
     path = write(tmp_path, small(tmp_path, columns=columns), offline=False)

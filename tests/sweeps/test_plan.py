@@ -171,6 +171,13 @@ def test_a_dry_run_lists_runs_and_budgets_and_writes_nothing(tmp_path):
     assert "10 runs, 10 of them missing" in lines[-1] and not (tmp_path / "out").exists()
 
 
+def test_a_dry_run_names_the_steps_of_ardts_return_nets(tmp_path):
+    path = written(tmp_path, 'method = "dpt"', 'method = "ardt"\nardt.steps = 70\nadversary.count = 1\nprompt_dt.window = 4')
+    path.write_text(path.read_text() + "[equal]\nlabelled_episodes = 1\nenvironment_steps = 1\n")
+    (line, *_) = (one for one in sweep.describe(sweep.make_plan(path, tmp_path / "out")) if "/dpt/" in one)
+    assert "60 optimizer steps (and 70 of other nets)" in line
+
+
 def test_rows_that_cannot_be_joined_leave_the_list_of_runs_as_it_was(tmp_path, monkeypatch):
     made = sweep.make_plan(written(tmp_path), tmp_path / "out")
     made.out.mkdir()

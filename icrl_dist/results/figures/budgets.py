@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from icrl_dist.results.claims import costs
 from icrl_dist.results.figures.reading import BUDGETS, Arm
 from icrl_dist.results.figures.selection import EXACT, METHODS, MissingError, Study, listed, of_budget, unequal
 from icrl_dist.results.markup import CERTIFIED, Sheet, number
@@ -25,10 +28,24 @@ def sheet(study: Study) -> Sheet:
         verdict = f"Budgets differ: {'; '.join(different)}" if different else f"Equal for all variants: {', '.join(BUDGETS)}"
     unknown = [column for column in BUDGETS if any(of_budget(arm, column) is None for arm in arms)]
     verdict += f". Not known of all: {', '.join(unknown)}" if unknown else ""
+    verdict += _return_nets(study, arms)
     caption = f"{verdict}. Means over training seeds. {CERTIFIED}; here p = 0.2"
     title = TITLE + (f", setting {study.setting}" if study.setting else "")
     names = ("variant", "method", "K", "seeds", *(name.replace("_", " ") for name in COLUMNS), "labels", "certified")
     return Sheet(title, names, rows, caption)
+
+
+def _return_nets(study: Study, arms: Sequence[Arm]) -> str:
+    """What the caption adds about ARDT, whose return nets take optimizer steps that no column counts."""
+    text = ""
+    known = costs.ledger(study.rows.files)
+    for arm in arms:
+        if arm.key.method == "ardt":
+            entries = (known.get((study.setting, arm.key.variant, seed), {}) for seed in arm.seeds)
+            steps = sorted({one["budget"]["extra_steps"] for one in entries if "extra_steps" in one.get("budget", {})})
+            counts = " to ".join(f"{n:,}" for n in dict.fromkeys([*steps[:1], *steps[-1:]])) or "ardt.steps"
+            text += f". Not counted: the return nets of {arm.key.variant} take {counts} smaller steps beside its optimizer steps"
+    return text
 
 
 def newest(study: Study) -> list[Arm]:
