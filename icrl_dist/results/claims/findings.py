@@ -61,7 +61,7 @@ class Finding:
 
 
 def verdict(effect: Interval, sign: int, seeds: int) -> str:
-    """Whether the interval lies on the claimed side of 0, on the other, or holds 0; of too few seeds, not decidable."""
+    """Whether the interval lies on the claimed side of 0, on the other, or contains 0; of too few seeds, not decidable."""
     if seeds < SEEDS or math.isnan(effect.low):
         return NOT_DECIDABLE
     side = {"higher": 1, "lower": -1}.get(effect.verdict(), 0)
@@ -69,7 +69,7 @@ def verdict(effect: Interval, sign: int, seeds: int) -> str:
 
 
 def few(seeds: int) -> str:
-    """Why so many training seeds decide nothing; empty for enough."""
+    """Why this number of training seeds is too small for a verdict; empty if it is not."""
     return "" if seeds >= SEEDS else f"{statistics.counted(seeds, 'training seed')}, and at least {SEEDS} are needed"
 
 
