@@ -43,9 +43,10 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
         "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn with all "
         "their tasks where these are their own. The verdict is that of the last episodes: held, if the interval lies on the "
         "claimed side of 0; not held, if on the other; not shown, if it contains 0. A claim held only if each of its "
-        f"comparisons did, and did not hold if any did not. Intervals are not corrected for the number of comparisons ({count} here): "
-        "where all true differences are 0, each interval lies on the wrong side with probability 2.5%, so the more comparisons "
-        f"a claim has, the likelier is `not held` by chance. {CERTIFIED}; here the same sum of them"
+        f"comparisons did, and did not hold if any did not. Intervals are not corrected for the number of "
+        f"comparisons ({count} here): where all true differences are 0, each interval lies on the wrong side with "
+        f"probability 2.5%, so the more comparisons a claim has, the more likely it is `not held` by "
+        f"chance. {CERTIFIED}; here the same sum of them"
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")
     return Sheet(
