@@ -145,7 +145,7 @@ class LearningHistories:
     trials: int
     """Episodes of each variation."""
     count: int = 1
-    """Histories of each variation, one after another; each begins with an agent that knows nothing.
+    """Histories of each variation, one after another; each begins with an untrained agent.
 
     History h holds the trials from ``trials * h // count`` to before ``trials * (h + 1) // count``.
     """

@@ -1,7 +1,7 @@
-"""What could be gained at all: exact agents without a network, by disturbance and strength.
+"""What training could reach at most: exact agents without a network, by disturbance and strength.
 
-The exact agent with DPT's prior supposes no disturbance, the one with ICAG's has the prior of training, and the oracle is
-given goal and adversary: what a perfect DPT, a perfect ICAG and no agent at all could exceed.
+The exact agent with DPT's prior supposes no disturbance: a perfect DPT.  The one with ICAG's has the prior of training: a
+perfect ICAG.  The oracle is given goal and adversary, so no agent exceeds its expected return.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ AGENTS = ("random", "exact:dpt", "exact:dpt-committed", "exact:icag", "exact:ica
 ROOMS = ((7, 35), (10, 100))
 """Size and horizon of the rooms of darkroom-7x7 and of the paper."""
 LAST = 5
-"""Episodes at the end that the mean is over."""
+"""Number of last episodes that a mean is over."""
 
 
 def run(quick: bool = False, report: Callable[[str], None] = lambda text: None) -> dict[str, Any]:

@@ -37,13 +37,13 @@ class SweepArguments:
     seeds: tuple[int, ...] = ()
     """Only these training seeds of the file."""
     jobs: int | None = None
-    """Runs at a time, each in a process with one thread.  Default: one for each core."""
+    """Number of runs at a time, each in a process with one thread.  Default: one for each core."""
     address: str | None = None
     """Address of a Ray cluster whose nodes share OUT, such as ``auto``; runs are then tasks of one core each."""
     keep: Literal["all", "weights", "rows"] = "weights"
     """What is kept of a run that is done: ``all``; ``weights``, all but its dataset; or only its result ``rows``."""
     dry_run: bool = False
-    """List the runs with their budgets and what is done, and do nothing."""
+    """Only list the runs, with their budgets and what is done."""
     json: bool = False
     """Print a summary as one JSON object on the last line."""
 

@@ -1,4 +1,4 @@
-"""Algorithm Distillation (Laskin et al. 2022): imitates a learning agent, whose learning then happens in the context."""
+"""Algorithm Distillation (Laskin et al. 2022): imitates a learning agent, so that the model learns in its context."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class LabelBytes(NamedTuple):
     """
 
     labels: int
-    """Labelled states: query states of ``labelled_episodes``, or of a model's or a behavior policy's own actions every step."""
+    """Labelled states: query states of ``labelled_episodes``; every step where labels are own actions of a model or policy."""
     label_bytes: int
     """Bytes of these states and their labels, with actions and rewards of action windows."""
     sent_bytes: int

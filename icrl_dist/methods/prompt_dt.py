@@ -44,7 +44,7 @@ class PromptDT(Method):
     """Trained on the actions of DPT's contexts, without labels, and deployed with the largest return of these as target.
 
     It repeats the actions in its data.  Dark Room's contexts are walks of behavior policies that do not know the goal (the
-    paper's are random), so there it learns to repeat these walks, as far as their returns-to-go do not say more.
+    paper's are random), so there it learns to repeat these walks, except where returns-to-go are informative.
     """
 
     name = "prompt_dt"

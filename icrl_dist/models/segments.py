@@ -28,7 +28,7 @@ class PromptBatch(NamedTuple):
     """A row without a valid step has no prompt."""
     window: Segments
     target: float
-    """Return that a deployed agent asks for: the largest return-to-go of a first step in the dataset."""
+    """Return-to-go of a deployed agent's first step: the largest return-to-go of a first step in the dataset."""
     scale: float
     """Largest size of a return-to-go in the dataset."""
 

@@ -227,7 +227,7 @@ def check_suite(run: Run, suite: str) -> None:
             f"--suite attack: {run.problem} with these adversaries has no exact worst case; use --suite online --prior unseen"
         )
     if suite == "attack" and min(run.evaluate.p) <= 0:
-        raise ConfigError("--suite attack: at p = 0 nothing attacks; name strengths above 0, as in --p 0.2 0.4")
+        raise ConfigError("--suite attack: at p = 0 there is no adversary; name strengths above 0, as in --p 0.2 0.4")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
     if suite == "posterior" and problem.exact is None:

@@ -41,7 +41,7 @@ def evaluate(
     ``what``: a run folder, a checkpoint file, or the name of an agent of the package (``"darkroom"``; ``"./darkroom"``
     is a folder of that name).  The new rows are also written to ``results/`` of the run, the numbers and the figure to
     its ``report/``; for an agent of the package to runs/NAME-pretrained.  If a file cannot be written, for example in a
-    folder that can only be read, the result is returned all the same, and one of its ``notes`` says so.
+    folder that can only be read, the result is returned anyway, and one of its ``notes`` says so.
 
     ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
     of a random or an expert episode; ``posterior`` for the distance to the exact posterior; ``attack`` for one episode,

@@ -125,7 +125,7 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
 
     ``frames``: result rows, each of the trainings of one method (``icrl_dist.read_results``); ``names``: what the table
     calls them, by default the names of their models; ``last``: the last episodes of an evaluation, whose mean return is
-    compared.  A notebook shows the table, and so does ``rich.print``.  An effect whose 95% interval holds the value of
+    compared.  A notebook shows the table, and so does ``rich.print``.  An effect whose 95% interval contains the value of
     equal agents is worded "not shown".  Raises ConfigError for rows that cannot be paired (``comparison.compare``).
     """
     if len(frames) < 2:
@@ -142,7 +142,7 @@ def compare(*frames: pd.DataFrame, names: Sequence[str] = (), last: int = LAST) 
         title=f"Return of the last {min(last, episodes)} episodes, compared with {called[0]}",
         title_justify="left",
         caption=f"{over}; the same resamples for both; for the minimum, tasks are not resampled.  `not shown`: the interval "
-        "holds the value of equal agents, or there is none",
+        "contains the value of equal agents, or there is none",
         caption_justify="left",
     )
     for name in ("p", "statistic", called[0], "compared", "its value", "effect", "95%", "verdict"):

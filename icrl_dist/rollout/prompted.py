@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class PromptedPolicy(CopiedWhole):
-    """Asks for the target return of the model; its prompt comes from the best episode in the context.
+    """Acts given the target return of the model; its prompt comes from the best episode in the context.
 
     The return-to-go at a step is the target less the rewards of this episode so far.  The window holds the last steps of
     this episode.  The prompt is empty until the first episode has ended, or ``append`` has added one.  It changes only

@@ -137,7 +137,8 @@ def _check(sweep: SweepFile, source: str) -> None:
         for name, value in named.items():
             if not _NAME.fullmatch(name):
                 raise ConfigError(
-                    f"{source}: [{kind}.{show(name)}]: use letters, digits and . _ - in a name, at most 60, the first no sign"
+                    f"{source}: [{kind}.{show(name)}]: use letters, digits and . _ - in a name, at most 60; begin with a "
+                    "letter or a digit"
                 )
             if not isinstance(value, dict):
                 raise ConfigError(f"{source}: {kind}.{name} = {show(value)}: expected a table, as in [{kind}.{name}]")

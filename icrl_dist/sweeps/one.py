@@ -121,7 +121,7 @@ def _train(work: Work, folder: Path, found: State, meter: Meter) -> None:
         result = launch.train_inline(run, folder, report)
     if result["quarantined"]:
         causes = "; ".join(f"{one['variation']}: {one['cause']}" for one in result["quarantined"])
-        raise TrainFailed(f"the training left out variations, so it is no part of a comparison: {causes}")
+        raise TrainFailed(f"the training left out variations, so it cannot be compared: {causes}")
     write_json(folder / "result.json", {**result, "folder": str(folder), "seconds": round(found.seconds, 1)})
     found.training = {name: result[name] for name in ("dataset_digest", "weights_digest", "version", "trajectories")}
     meter.save()

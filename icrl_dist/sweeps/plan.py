@@ -218,7 +218,7 @@ def chosen(
         and one.seed in (seeds or (one.seed,))
     )
     if not found:
-        raise ConfigError("--only, --settings and --seeds leave no run; leave one of them out")
+        raise ConfigError("--only, --settings and --seeds select no run; leave one of them out")
     return found
 
 

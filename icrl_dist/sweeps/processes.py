@@ -61,7 +61,7 @@ class Child:
             self._process.stdin.write(message)
             self._process.stdin.flush()
         except BrokenPipeError:
-            pass  # it has died; ``poll`` says how
+            pass  # it has ended; ``poll`` says how
         except BaseException:
             self.kill()
             raise

@@ -89,7 +89,8 @@ def check(state: State, member: Member, folder: Path) -> None:
     remedy = f"use another --out, or delete {file_of(folder) if state.kept == 'rows' else folder}"
     if state.run:
         if state.exact != member.exact:
-            raise ConfigError(f"{folder}: method 'exact' there or here, but not both; {remedy}")
+            here, there = ("has" if exact else "has not" for exact in (member.exact, state.exact))
+            raise ConfigError(f"{folder}: the run there {there} method 'exact', and the one in the sweep file {here}; {remedy}")
         before = parse_written(state.run, str(file_of(folder)))
         if changed := differences(before, member.run):
             named = ", ".join(f"{name} = {old!r} there and {new!r} here" for name, old, new in changed)

@@ -177,7 +177,7 @@ def test_for_a_context_that_grows_within_the_episode_the_worst_sampled_adversary
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"p": [0.0, 0.2]}, "--suite attack: at p = 0 nothing attacks; name strengths above 0, as in --p 0.2 0.4"),
+        ({"p": [0.0, 0.2]}, "--suite attack: at p = 0 there is no adversary; name strengths above 0, as in --p 0.2 0.4"),
         ({"draws": 0}, "--draws 0: at least 1 sampled adversary is needed"),
     ],
 )

@@ -171,7 +171,7 @@ def test_changed_settings_of_a_run_that_exists_are_refused(tmp_path, members):
         state.check(other, one, folder)
     with pytest.raises(ConfigError, match="evaluation unseen there has other settings; give this one another name"):
         state.check(State(evaluations=evaluations | {"unseen": {"settings": "", "files": []}}), one, folder)
-    with pytest.raises(ConfigError, match="'exact' there or here"):
+    with pytest.raises(ConfigError, match="has method 'exact', and the one in the sweep file has not"):
         state.check(State(run=dumps(one.run), exact=True), one, folder)
     with pytest.raises(ConfigError, match="evaluation unseen is new, and --keep rows has deleted the weights"):
         state.check(State(evaluations={"online": evaluations["online"]}, collected=["online"], kept="rows"), one, folder)

@@ -141,7 +141,7 @@ def test_parts_of_a_sweep_are_chosen_by_name(tmp_path):
     for wrong in ({"only": ["dtp"]}, {"settings": ["string"]}, {"seeds": [7]}):
         with pytest.raises(ConfigError, match="there are"):
             plan.chosen(every, **wrong)
-    with pytest.raises(ConfigError, match="leave no run"):
+    with pytest.raises(ConfigError, match="select no run"):
         plan.chosen(every, ["icag-k2"], ["strong"])
 
 

@@ -71,8 +71,8 @@ def is_override(adversary: Adversary) -> bool:
 def disturbed_moves(adversary: Adversary, actions: int) -> tuple[float, Int[np.ndarray, " A"]]:
     """``(p, moves)`` of a wind or of permuted controls: with probability p action a makes the move ``moves[a]``.
 
-    The moves are numbered as in ``room.next_move``.  Raises ValueError for a p, a direction or a permutation that
-    there cannot be.
+    The moves are numbered as in ``room.next_move``.  Raises ValueError for an impossible p, direction or
+    permutation.
     """
     check_parameters(adversary, _PARAMETERS[adversary.kind])
     p = adversary.number("p")
@@ -94,7 +94,7 @@ def disturbed_moves(adversary: Adversary, actions: int) -> tuple[float, Int[np.n
 def move_distribution(adversary: Adversary, actions: int) -> Float64[np.ndarray, "A X"]:
     """P(move | action) under any adversary; the moves are numbered as in ``room.next_move``.
 
-    Raises ValueError for an adversary that there cannot be.
+    Raises ValueError for an impossible adversary.
     """
     result = np.zeros((actions, actions * (1 + DIRECTIONS)))
     action = np.arange(actions)

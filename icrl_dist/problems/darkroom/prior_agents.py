@@ -25,9 +25,9 @@ from icrl_dist.types import NULL, Adversary, Variation
 
 PriorRule = Literal["paper", "committed"]
 LEVELS: dict[Disturbance, int] = {"override": 8, "wind": 8, "permuted": 8}
-"""Strengths p in ICAG's prior: 32 overrides, 32 winds or 56 permuted controls.  Twice as many show no other return
-(docs/results/ceilings.md).  The numbers are even: of an odd number one would be p_max / 2, and at p = 1/2 the controls
-are mirrored as often as not, so that no action is better than its opposite."""
+"""Strengths p in ICAG's prior: 32 overrides, 32 winds or 56 permuted controls.  With twice as many no other return was shown
+(docs/results/ceilings.md).  The numbers are even: of an odd number one would be p_max / 2, and at p = 1/2 a mirrored move
+goes either way with equal probability, so no action is better than its opposite."""
 _LEAST = 1e-9
 """Least probability of a transition under a hypothesis, so no transition refutes all of them."""
 

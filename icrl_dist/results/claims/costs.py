@@ -88,7 +88,7 @@ def per_label(arm: Arm, column: str, known: Ledger, of: int = 1) -> dict[int, fl
 
 
 def sheet(study: Study, known: Ledger) -> Sheet:
-    """The ledger: what a training of ICAG and of ICAA cost, and what of it falls to a label; means over training seeds."""
+    """What a training of ICAG and of ICAA cost, in total and for each label; means over training seeds."""
     rows = []
     for name in ("icag", "icaa"):
         variant = study.variant(name)

@@ -39,7 +39,7 @@ def sheet(study: Study) -> Sheet:
         for index, row in enumerate(_rows(arms, [agent.label for agent in agents])):
             rows.append((f"{spot.p:g}{f', {spot.prior}' if spot.p else ''}" if index == 0 else "", *row))
     title = "ICAA: T^0, each round, and ICAG" + (f", setting {study.setting}" if study.setting else "")
-    closing = f"Closed: (T^j - T^0) / (ICAG - T^0), {UNDEFINED} if the gap's interval holds 0 or lies below it"
+    closing = f"Closed: (T^j - T^0) / (ICAG - T^0), {UNDEFINED} if the gap's interval contains 0 or lies below it"
     caption = f"Last episodes; {resampled(over)}. {closing}. {CERTIFIED}"
     return Sheet(
         title, ("p", "agent", "return", "less T^0", "less the one before", "closed", "certified"), tuple(rows), caption

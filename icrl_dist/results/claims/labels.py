@@ -46,10 +46,10 @@ def sheet(study: Study) -> Sheet:
     title = "ICAA: the labels of each round" + (f", setting {study.setting}" if study.setting else "")
     caption = (
         "In round j T^j acts in the training variations: its first trials become contexts, and labels come from its own "
-        "actions in later ones. Agreement: share of the labels that are optimal in their variation, mean over the variations "
-        "that gave labels; labelling: share of the variations that gave labels. Returns: mean over all variations, of the "
-        "trials that became contexts and of the later ones. 95% intervals over training seeds; each seed is one number, and "
-        "the gain is in pairs"
+        "trials, as icaa.labels says. Agreement: share of the labels that are optimal in their variation, mean over the "
+        "variations that gave labels; labelling: share of the variations that gave labels. Returns: mean over all "
+        "variations, of the trials that became contexts and of the later ones. 95% intervals over training seeds; each seed "
+        "is one number, and the gain is in pairs"
     )
     columns = ("round", "policy", "seeds", "agreement", "labelling", "return, contexts", "return, later trials", "gain")
     return Sheet(title, columns, tuple(lines), caption)

@@ -42,11 +42,12 @@ def sheet(claims: Sequence[Claim]) -> Sheet:
     caption = (
         "Effects are differences of mean returns in pairs, with 95% intervals over training seeds, which are drawn with "
         "all their tasks where these are their own. The verdict is that of the last episodes: held, if the interval lies "
-        "on the claimed side of 0; not held, if on the other; not shown, if it holds 0. Where a margin is named it takes "
-        f"the place of 0: {MARGIN:.0%} of the oracle's return at that p. A claim held only if each of its comparisons did, "
-        "and did not hold if any did not; those marked `beside` are shown with it and decide nothing. Intervals are not "
-        f"corrected for the number of comparisons ({count} here): where all true differences are 0, each interval lies on "
-        "the wrong side with probability 2.5%, so the more comparisons a claim has, the likelier is `not held` by chance. "
+        "on the claimed side of 0; not held, if on the other; not shown, if it contains 0. Where a margin is named it "
+        f"takes the place of 0: {MARGIN:.0%} of the oracle's return at that p. A claim held only if each of its comparisons "
+        "did, and did not hold if any did not; those marked `beside` are shown with it and decide nothing. Intervals are "
+        f"not corrected for the number of comparisons ({count} here): where all true differences are 0, each interval lies "
+        "on the wrong side with probability 2.5%, so the more comparisons a claim has, the more likely it is `not held` by "
+        "chance. "
         f"{CERTIFIED}; here the same sum of them{_few([one for claim in claims for one in claim.findings])}"
     )
     columns = ("claim", "comparison", "effect, last episodes", "effect, all episodes", "certified", "seeds", "verdict")

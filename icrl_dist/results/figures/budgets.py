@@ -44,7 +44,9 @@ def _return_nets(study: Study, arms: Sequence[Arm]) -> str:
             entries = (known.get((study.setting, arm.key.variant, seed), {}) for seed in arm.seeds)
             steps = sorted({one["budget"]["extra_steps"] for one in entries if "extra_steps" in one.get("budget", {})})
             counts = " to ".join(f"{n:,}" for n in dict.fromkeys([*steps[:1], *steps[-1:]])) or "ardt.steps"
-            text += f". Not counted: the return nets of {arm.key.variant} take {counts} smaller steps beside its optimizer steps"
+            text += (
+                f". Not counted: the return nets of {arm.key.variant} take {counts} smaller steps beside its optimizer steps"
+            )
     return text
 
 

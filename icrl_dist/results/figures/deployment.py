@@ -1,4 +1,4 @@
-"""Every method by its own deployment rule beside Algorithm 1."""
+"""Every method by each of its deployment rules, such as ``committed`` beside Algorithm 1."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ class Study:
                 continue
             raise ConfigError(
                 f"{what}: {column} is {of_budget(one, column):.12g} of {_who(one)} and {of_budget(two, column):.12g} of "
-                f"{_who(two)}: train both with equal budgets, or compare them all the same with --unequal-budgets {column}"
+                f"{_who(two)}: train both with equal budgets, or compare them anyway with --unequal-budgets {column}"
             )
 
 
