@@ -79,7 +79,7 @@ class Finding:
 
 
 def verdict(effect: Interval, sign: int, seeds: int, margin: float = 0.0) -> str:
-    """Whether the interval lies on the claimed side of the margin, on the other, or contains it; of few seeds, not decidable."""
+    """Whether the interval lies on the claimed side of the margin, on the other, or contains it; few seeds: not decidable."""
     if seeds < SEEDS or math.isnan(effect.low):
         return NOT_DECIDABLE
     side = {"higher": 1, "lower": -1}.get(effect.verdict(margin), 0)
