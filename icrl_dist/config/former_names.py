@@ -49,6 +49,14 @@ def _disturbances_counted(tables: dict[str, Any]) -> dict[str, Any]:
     return {**tables, "adversary": {**adversary, "count": adversary["count"] - 1, "null": True}}
 
 
+def _ignored(tables: dict[str, Any]) -> dict[str, Any]:
+    """Method icaa ignored ``dagger.rounds``, which is refused now."""
+    dagger = tables.get("dagger")
+    if tables.get("method") != "icaa" or not isinstance(dagger, dict):
+        return tables
+    return {**tables, "dagger": {**dagger, "rounds": 0}}
+
+
 def _owners(section: str) -> str:
     owners = [name for name, owner in plugins.importable("problems").items() if owner.section == section]
     return owners[0] + (f" and {len(owners) - 1} other problems" if len(owners) > 1 else "")
@@ -65,7 +73,7 @@ def translated(tables: dict[str, Any], sections: Set[str], owner: Any) -> dict[s
         holder = found.get(section) if key else found
         if isinstance(holder, dict) and (key or section) in holder:
             holder[new.rpartition(".")[2]] = holder.pop(key or section)
-    found = owner.translated(_disturbances_counted(found))
+    found = owner.translated(_disturbances_counted(_ignored(found)))
     unknown = found.keys() - sections
     foreign = unknown & plugins.sections(None).keys() if unknown else set()  # they take the import of every problem
     return {name: table for name, table in found.items() if name not in foreign}

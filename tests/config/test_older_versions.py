@@ -49,6 +49,18 @@ def test_the_settings_of_an_old_run_folder_are_read(tmp_path: Path) -> None:
     assert load(str(folder / "run.toml")) == load_folder(folder), "a user may name the file of a run folder"
 
 
+def test_dagger_rounds_that_icaa_ignored_are_left_out() -> None:
+    """An older version allowed them; a user's file with them is refused."""
+    old = ICAG
+    for before, after in (('"icag"', '"icaa"'), ("stretches = 2", "stretches = 0"), ("stretch = 3", "stretch = 1")):
+        old = old.replace(before, after)
+    assert parse_written(old, "x").dagger.rounds == 0 and parse_written(old, "x").dagger.trials == 3
+    now = dumps(parse_written(old, "x")).replace("[dagger]\nrounds = 0", "[dagger]\nrounds = 1")
+    with pytest.raises(ConfigError, match=r"dagger.rounds = 1: icaa has no such rounds"):
+        parse(now, "x")
+    assert parse_written(now, "x").dagger.rounds == 0
+
+
 def test_each_former_name_is_in_the_old_file_and_keeps_its_value() -> None:
     before, after = tomllib.loads(ICAG), tomllib.loads(dumps(parse_written(ICAG, "x")))
     for old, new in former_names.RENAMED.items():
