@@ -47,7 +47,7 @@ Keep = Literal["all", "weights", "rows"]
 
 @dataclass(frozen=True)
 class Work:
-    """A run that is to be done, as the child process is told."""
+    """A run of the sweep and how to do it: what the parent sends to the child process."""
 
     member: Member
     out: Path

@@ -140,7 +140,7 @@ def worst_case(policy: Float[np.ndarray, "C A"] | None, variation: Variation, p:
     It says nothing about how an adversary that acts while the context is collected changes D, and nothing about winds
     and permuted controls, which no override of the same strength can imitate.
 
-    ``policy``: pi(a | s) by cell number (x * size + y) and action, as ``InContextAgent.law`` gives it; None: the
+    ``policy``: pi(a | s) by cell number (x * size + y) and action, as ``InContextAgent.distribution`` gives it; None: the
     policy that maximizes V against this adversary (the minimax oracle).  The adversary of the variation is not used.
 
     Raises ValueError for a p outside [0, 1] and for a policy of another shape or with rows that are no distributions.
