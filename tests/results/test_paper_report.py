@@ -124,6 +124,26 @@ def test_true_effects_and_equality_within_the_margin_are_held(sweep):
     assert [claim.number for claim in questions.claims(study(rows, "wind", Rules()), {})] == [1, 2, 3, 4, 6, 8]
 
 
+def test_claims_are_read_at_the_strong_disturbances_that_must_be_inferred(tmp_path):
+    levels = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+    file = write(
+        tmp_path,
+        Sweep(plain, WIND, "wind", levels=levels, goals=2, evaluations=1, episodes=2),
+        Sweep(plain, WIND, "room", levels=levels, goals=2, evaluations=1, episodes=2),
+    )
+    for setting, strengths in (("wind", (0.2, 0.4, 0.6, 0.8, 1.0)), ("room", (0.2, 0.4, 0.6))):
+        found = {claim.number: claim for claim in questions.claims(study(Rows([file]), setting, Rules()), {})}
+        names = [one.comparison for one in found[2].findings if one.comparison.endswith("uniform")]
+        assert names == [f"{pair}, p = {p:g}, uniform" for p in strengths for pair in ("ICAG - ICAA", "ICAA - DPT")]
+    (table,) = [
+        sheet
+        for part in report(file, setting="wind", claims=True, out=tmp_path / "out").sections
+        for sheet in part.sheets
+        if "each round" in sheet.title
+    ]
+    assert [row[0] for row in table.rows if row[0]] == ["0", *(f"{p:g}, uniform" for p in levels[1:]), "0.2, unseen"]
+
+
 def test_a_null_effect_is_not_shown_and_an_opposite_one_not_held(tmp_path):
     def mean(variant, agent, p):
         return 70.0 - 60.0 * p - (4.0 if variant == "icaa" else 0.0)

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.results import statistics
 from icrl_dist.results.claims.findings import Term, arms_of
+from icrl_dist.results.claims.questions import disturbed
 from icrl_dist.results.figures.choices import Choice, Spot
 from icrl_dist.results.figures.panels import resampled
 from icrl_dist.results.figures.reading import Arm
@@ -28,7 +29,7 @@ def sheet(study: Study) -> Sheet:
         raise MissingError("table of ICAA", [f"{study.run(variant or 'icaa')}, evaluated after each round"])
     agents = [Choice("icaa", variant, f"T^{version}", version) for version in versions]
     agents.append(Choice("icag", study.variant("icag")))
-    spots = [Spot(p) for p in study.levels(variant) if p in (0.0, 0.2, 0.4, 0.6)] + [
+    spots = [Spot(p) for p in study.levels(variant) if p in (0.0, *disturbed(study))] + [
         Spot(p, "unseen") for p in study.levels(variant, "unseen") if p
     ]
     rows: list[tuple[str, ...]] = []

@@ -15,6 +15,7 @@ from icrl_dist.results.figures.choices import Choice, Spot
 from icrl_dist.results.figures.selection import METHODS, Study, is_inferred
 
 DISTURBED = (0.2, 0.4, 0.6)
+"""The strengths p of the paper's comparisons under disturbance."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +48,20 @@ def _method(study: Study, name: str) -> Choice:
     return Choice(name, study.variant(name))
 
 
+def disturbed(study: Study) -> tuple[float, ...]:
+    """The strengths at which claims are read: the paper's, and stronger ones with rows where disturbances are inferred."""
+    if not is_inferred(study.setting):
+        return DISTURBED
+    stronger = {key.p for key in study.keys if key.suite == "online" and key.p > DISTURBED[-1]}
+    return (*DISTURBED, *sorted(stronger))
+
+
 def _spots(study: Study) -> list[Spot]:
     """The disturbed places: the uniform adversary, and unseen priors at 0.2 and wherever there are rows."""
-    unseen = {p for key in study.keys if key.prior == "unseen" and key.suite == "online" for p in (key.p,) if p in DISTURBED}
+    strengths = disturbed(study)
+    unseen = {key.p for key in study.keys if key.prior == "unseen" and key.suite == "online" and key.p in strengths}
     unseen |= set() if is_inferred(study.setting) else {0.2}
-    return [Spot(p) for p in DISTURBED] + [Spot(p, "unseen") for p in sorted(unseen)]
+    return [Spot(p) for p in strengths] + [Spot(p, "unseen") for p in sorted(unseen)]
 
 
 def _place(spot: Spot) -> str:
@@ -82,7 +92,7 @@ def _grows(study: Study) -> Iterator[Question]:
     shared = [set(study.levels(choice.variant)) for choice in (icag, dpt) if choice.variant]
     levels = sorted(set.intersection(*shared)) if shared else []
     if len(levels) < 2:
-        levels = [0.0, *DISTURBED]
+        levels = [0.0, *disturbed(study)]
     weights = np.array(levels) - np.mean(levels)
     weights /= (weights**2).sum()
     pairs = [(Spot(p), float(weight)) for p, weight in zip(levels, weights, strict=True)]
