@@ -387,18 +387,23 @@ def test_the_page_needs_no_other_file_and_no_network(tmp_path):
 
 def test_deployment_rules_are_shown_beside_each_other(tmp_path):
     agents = {"dpt": ("t0",), "icag": ("t0",)}
+    exact = {"exact": ("exact:dpt", "exact:dpt-committed")}
 
     def mean(variant, agent, p):
         return 50.0 - 10.0 * p
 
-    paper = small(tmp_path, agents=agents, mean=mean)
-    own = small(
+    frozen = small(tmp_path, agents={**agents, **exact}, mean=mean)
+    growing = small(
         tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns={name: {"deployment": "committed"} for name in agents}
     )
-    rows = Rows([write(tmp_path, paper, own, offline=False)])
+    rows = Rows([write(tmp_path, frozen, growing, offline=False)])
     panels = catalog.numbers("deployment", rows, None, Rules())
-    found = {name: point(panels, "deployment", f"ICAG, {name}", "p = 0.2").value.value for name in ("Algorithm 1", "committed")}
-    assert found["committed"] - found["Algorithm 1"] == pytest.approx(7, abs=0.1)
+    for panel in ("deployment", "deployment (all)"):
+        paper, own = (point(panels, panel, f"ICAG, {rule}", "p = 0.2").value.value for rule in ("Algorithm 1", "committed"))
+        assert own - paper == pytest.approx(7, abs=0.1)
+    ranks = {one.name: one.rank for one in panels[0].series}
+    assert (ranks["ICAG, Algorithm 1"], ranks["ICAG, committed"]) == (0, 1), "two shades of one colour"
+    assert (ranks["exact, DPT's prior"], ranks["exact, DPT's prior, committed"]) == (0, 1)
     shown = study(rows, None, Rules()).model("icag", 0.2)
     assert shown is not None and shown.key.deployment == "paper", "other figures show Algorithm 1"
 
