@@ -81,6 +81,7 @@ def _above(study: Study) -> Iterator[Question]:
     for spot in _spots(study):
         yield difference(f"ICAG - ICAA, {_place(spot)}", icag, icaa, spot)
         yield difference(f"ICAA - DPT, {_place(spot)}", icaa, dpt, spot)
+        yield difference(f"ICAG - DPT, {_place(spot)}", icag, dpt, spot)._replace(needed=False)
 
 
 def _undisturbed(study: Study) -> Iterator[Question]:
