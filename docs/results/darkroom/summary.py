@@ -15,7 +15,6 @@ PLACES = [
     ("p = 0.2", "override", 0.2),
     ("p = 0.4", "override", 0.4),
     ("permuted controls, p = 1", "permuted", 1.0),
-    ("wind, p = 0.8", "wind", 0.8),
 ]
 AGENTS = [("DPT", "dpt", "t0"), ("ICAG", "icag", "t0"), ("ICAA, T^3", "icaa", "t3")]
 EXACT = [("exact agent, DPT's prior", "exact:dpt"), ("exact agent, ICAG's prior", "exact:icag"), ("oracle", "oracle")]
@@ -56,7 +55,39 @@ def difference(setting: str, one: tuple[str, str, str], two: tuple[str, str, str
         print(f"  p = {p:g}: {interval((found[p][one] - found[p][two]).dropna())}")
 
 
+def shares(episodes: int = 10) -> None:
+    """Return of the first episodes as a share of the oracle's, by both deployment rules."""
+    rows = pd.read_parquet(FOLDER / "committed" / "rows.parquet", columns=COLUMNS)
+    rows = rows[rows["episode"] < episodes]
+    found = rows.groupby(["variant", "agent", "deployment", "p", "training_seed"])["return"].mean()
+    oracle = found["exact", "oracle"].groupby(level=[1, 2]).mean()
+    print(f"share of the oracle's return, first {episodes} episodes")
+    for variant, agent in (("dpt", "t0"), ("icag", "t0"), *(("exact", one) for one in ("exact:icag", "exact:icag-committed"))):
+        for rule, values in found[variant, agent].groupby(level=0):
+            share = (values.droplevel(0) / oracle).groupby(level=0)
+            texts = (f"p = {p:g}: {interval(100 * one)}%;" for p, one in share)
+            print(f"  {variant} {agent} {rule}:", *texts)
+
+
+def never_found(agent: str, variant: str, rule: str) -> None:
+    """Share of the evaluations at p = 0 with return 0 in all episodes; what the others lose to the exact agent at the end."""
+    columns = [*COLUMNS, "task_index", "evaluation_seed"]
+    rows = pd.read_parquet(FOLDER / "override" / "rows.parquet", columns=columns)
+    rows = rows[(rows["suite"] == "online") & (rows["p"] == 0)]
+    place = ["training_seed", "task_index", "evaluation_seed"]
+    one = rows[(rows["variant"] == variant) & (rows["agent"] == agent) & (rows["deployment"] == rule)]
+    exact = rows[(rows["variant"] == "exact") & (rows["agent"] == "exact:dpt")]
+    lost = one.groupby(place)["return"].max() == 0
+    ends = (of[of["episode"] >= 15].groupby(place)["return"].mean() for of in (exact, one))
+    less = next(ends) - next(ends)
+    found = less.reindex(lost.index)[~lost]
+    print(f"{variant} {agent} {rule}: return 0 throughout {lost.mean():.1%} of {len(lost)}; the others lose {found.mean():.2f}")
+
+
 summary()
+shares()
+for variant, agent, rule in (("dpt", "t0", "paper"), ("icag", "t0", "paper"), ("icaa", "t3", "paper"), ("ad", "t0", "paper")):
+    never_found(agent, variant, rule)
 for first in (0, 15):
     for variant in ("dpt", "icag"):
         difference("committed", ("committed", variant, "t0"), ("paper", variant, "t0"), first)
@@ -64,3 +95,4 @@ for first in (0, 15):
 difference("override", ("paper", "icaa-paper", "t3"), ("paper", "icaa", "t3"))
 difference("override", ("paper", "ad", "t0"), ("paper", "dpt", "t0"))
 difference("override", ("paper", "dr", "t0"), ("paper", "icag", "t0"))
+difference("committed", ("paper", "icag", "t0"), ("paper", "dpt", "t0"))
