@@ -45,5 +45,11 @@ class SACConfig:
     """Environment steps per update (QARL's code)."""
     steps: WholeAboveZero = 200_000
     """Environment steps of an expert's training."""
+    checkpoints: WholeAboveZero = 1
+    """Checkpoints of which the best one acts and labels as the expert: the parameters at the end of a training and at evenly
+    spaced earlier episodes of its last fifth.  1: those at the end.  ``checkpoint_episodes`` has no effect then."""
+    checkpoint_episodes: WholeAboveZero = 5
+    """Episodes of the mean action by which each checkpoint of an expert is evaluated.  All take checkpoints x episodes x
+    horizon environment steps more, without updates: 5,000 at 5 x 5 x 200."""
     cache: str = "~/.cache/icrl-dist/experts"
     """Folder that stores histories and experts for later runs; empty: they are not stored."""

@@ -48,6 +48,8 @@ _LIBRARIES: dict[Trainer, tuple[str, ...]] = {
 """The distributions that decide the bytes of a training; those of the environments are ``Problem.libraries``."""
 _NOT_IN_TRAINING = frozenset({"cache"})
 """Settings of the section ``[sac]`` that do not change a history."""
+_OF_CHECKPOINTS = frozenset({"checkpoints", "checkpoint_episodes"})
+"""Settings that change a history only if there are several checkpoints."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,11 +103,12 @@ def key(variation: Variation, horizon: int, config: SACConfig, seed: int, traine
     task, adversary = variation.task, variation.adversary
     libraries = {*_LIBRARIES[trainer], *plugins.find("problems", task.kind).libraries}
     source = plugins.sources().get(f"problems/{task.kind}")
+    left_out = _NOT_IN_TRAINING | (_OF_CHECKPOINTS if config.checkpoints == 1 else frozenset())
     parts = {
         "experts_version": EXPERTS_VERSION,
         "task": [task.kind, dict(task.params)],
         "adversary": [adversary.kind, dict(adversary.params)],
-        "sac": {name: value for name, value in as_data(config).items() if name not in _NOT_IN_TRAINING},
+        "sac": {name: value for name, value in as_data(config).items() if name not in left_out},
         "seed": seed,
         "trainer": trainer,
         "horizon": horizon,

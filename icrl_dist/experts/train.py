@@ -24,6 +24,7 @@ from jaxtyping import Float32
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts import cache
 from icrl_dist.experts.cache import History, Trainer, expert_seed
+from icrl_dist.experts.checkpoints import Checkpoints
 from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.experts.trajectories import Act, history_trajectories, scripted_actions, window_episodes, with_labels
 from icrl_dist.interfaces import Batch, Problem, Progress, no_progress
@@ -115,16 +116,19 @@ def _train(
     env, seeds = problem.batch(variations), [expert_seed(variation, job.seed) for variation in variations]
     episodes = cache.training_episodes(horizon, config)
     recorder = Recorder(env, episodes, cache.recorded_episodes(horizon, config, job.trials))
-    state = _load_training(part, recorder) if part is not None and part.exists() else None
+    checkpoints = Checkpoints(config, episodes)
+    state = _load_training(part, recorder, checkpoints) if part is not None and part.exists() else None
     saved = time.monotonic()
 
     def report(experts: SACBatch, returns: np.ndarray) -> None:
         nonlocal saved
+        checkpoints.keep(experts.steps // horizon, experts.arrays["actor"].cpu().numpy())
         mean = f"mean return {returns.mean():.0f}"
         progress(f"{len(keys)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
         if part is not None and time.monotonic() - saved >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}
+            arrays |= {f"checkpoints/{name}": value for name, value in checkpoints.state().items()}
             saved = time.monotonic()
             try:
                 save_checkpoint(part, Checkpoint(arrays, {}))
@@ -132,6 +136,7 @@ def _train(
                 _log.warning("no checkpoint of this training: %s", error)
 
     experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, backend=backend)
+    checkpoints.choose(env, seeds, experts, lambda text: progress(f"{job.label}: {text}", reached=experts.steps))
     columns = with_labels(recorder.columns(), problem, experts.act)
     windows = window_episodes(env, problem, experts.act, seeds, range(env.batch))
     histories = make_histories(job, variations, columns, windows, experts.arrays["actor"].cpu().numpy(), progress)
@@ -174,11 +179,12 @@ def make_histories(
     return histories
 
 
-def _load_training(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
+def _load_training(part: Path, recorder: Recorder, checkpoints: Checkpoints) -> dict[str, np.ndarray] | None:
     """The checkpoint of a training that was not finished; None if it cannot be read."""
     try:
         stored = load_checkpoint(part)
         recorder.load(stored.part("episodes"))
+        checkpoints.load(stored.part("checkpoints"))
         return stored.part("state")
     except (StoreError, KeyError) as error:
         _log.warning("the training starts again from step 0: %s", error)
