@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts import cache
+from icrl_dist.experts import cache, standing
 from icrl_dist.experts.cache import History, Trainer, expert_seed
 from icrl_dist.experts.checkpoints import Checkpoints
 from icrl_dist.experts.payloads import ExpertHistories
@@ -49,11 +49,18 @@ def train_expert(job: Job, problem: Problem, worker: str, progress: Progress = n
     """Histories D^{i,k} of SAC experts of each variation, with query states and labels (Algorithm 2, lines 8 to 12).
 
     All experts of a job train together, so the first trajectory is ready after the last training step.
-    Raises RuntimeError for a variation whose simulation diverges in every episode.
+    Raises RuntimeError for a variation whose simulation diverges in every episode, EndsRun for experts that return less
+    than ``sac.least_return`` (docs/commands.md).
     """
     payload = job.payload
     assert isinstance(payload, ExpertHistories)
     found = _histories(job, problem, payload.sac, progress)
+    if standing.labels_come_from_experts(problem):
+        standings = standing.of(job.rows(), job.variations, found, payload.sac)
+        if payload.sac.failed_experts == "refuse":
+            standing.require(standings)
+        elif text := standing.listed(standings):
+            progress(f"{job.label}: labels are made although {text}", note=True)
     yield from history_trajectories(job, problem, payload.labelling, found, worker, _mean_actions(found, payload.sac))
 
 
@@ -122,6 +129,8 @@ def _train(
 
     def report(experts: SACBatch, returns: np.ndarray) -> None:
         nonlocal saved
+        if state:
+            state.clear()  # it is loaded: a second replay would stay in memory until the end
         checkpoints.keep(experts.steps // horizon, experts.arrays["actor"].cpu().numpy())
         mean = f"mean return {returns.mean():.0f}"
         progress(f"{len(keys)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)

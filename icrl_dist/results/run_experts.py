@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,10 @@ import numpy as np
 import icrl_dist
 from icrl_dist.config.run import ConfigError, Run, load_folder
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts import cache
+from icrl_dist.experts import cache, standing
 from icrl_dist.experts.cache import History, expert_seed
 from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.experts.standing import Standing
 from icrl_dist.interfaces import Problem
 from icrl_dist.methods import registry as methods
 from icrl_dist.problems import registry as problems
@@ -28,9 +29,9 @@ EPISODES = 10
 """Episodes of an expert's evaluation."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Wanted:
-    """One expert that a run's jobs train, and what the cache of this node holds of it."""
+    """One expert that a run's jobs train."""
 
     task: int
     """Number of its task."""
@@ -40,36 +41,61 @@ class Wanted:
     seed: int
     """Seed of the run."""
     sac: SACConfig
-    history: History | None
-    """None: this node's cache does not hold it."""
+    horizon: int
+    trials: int
+    """Episodes of its training that its job delivers."""
 
     @property
     def name(self) -> str:
         """``task3-variation0``; variation 0 has no adversary, unless ``adversary.null`` is false."""
-        return f"task{self.task}-variation{self.number}"
+        return standing.label_of(self.task, self.number)
+
+    @property
+    def stored(self) -> bool:
+        """Whether the cache of this node has a file of it."""
+        return cache.stored(self.variation, self.horizon, self.sac, self.seed)
+
+    def load(self) -> History | None:
+        """Its history from the cache of this node; None if it is missing or damaged."""
+        return cache.load_any(self.variation, self.horizon, self.sac, self.seed)
+
+    def history(self) -> History:
+        """The same, after ``kept`` has found it."""
+        found = self.load()
+        assert found is not None, f"{self.name} was removed from {self.sac.cache} meanwhile"
+        return found
 
 
 def wanted(run: Run) -> list[list[Wanted]]:
     """The experts of each job of a run; no job if the run needs none."""
     problem, method = problems.of(run), methods.of(run)
     asked = method.ask(run, method.phases(run)[0])
-    return [list(_of(job, problem, job.payload.sac)) for job in asked if isinstance(job.payload, ExpertHistories)]
+    return [list(_of(job, problem, run.sac)) for job in asked if isinstance(job.payload, ExpertHistories)]
 
 
 def _of(job: Job, problem: Problem, sac: SACConfig) -> Iterator[Wanted]:
     for (task, number), variation in zip(job.rows(), job.variations, strict=True):
-        history = cache.load_any(variation, problem.spec_of(variation.task).horizon, sac, job.seed)
-        yield Wanted(task, number, variation, job.seed, sac, history)
+        yield Wanted(task, number, variation, job.seed, sac, problem.spec_of(variation.task).horizon, job.trials)
 
 
-def known(one: Wanted) -> History:
-    """The history of an expert that ``kept`` returned."""
-    assert one.history is not None, "`kept` refuses a run without it"
-    return one.history
+def standings(run: Run, jobs: Sequence[Sequence[Wanted]]) -> list[Standing]:
+    """What those experts earn that the cache of this node holds; none if the run asks for no return of them."""
+    asks = run.sac.least_return or run.sac.least_return_disturbed
+    if not asks or not standing.labels_come_from_experts(problems.of(run)):
+        return []
+    found = ((one, one.load()) for job in jobs for one in job)
+    each = ((one, history) for one, history in found if history is not None)
+    return [standing.of([(one.task, one.number)], [one.variation], [history], run.sac)[0] for one, history in each]
+
+
+def failures(run: Run) -> tuple[str, ...]:
+    """A line about the experts of a run in this node's cache that return less than it asks for, if there are any."""
+    text = standing.listed(standings(run, wanted(run)))
+    return (f"{text}; a method that trains refuses them: {standing.REMEDY}",) if text else ()
 
 
 def kept(run: Run, what: str) -> list[list[Wanted]]:
-    """The experts of each job of a run, all with a history; ``what``: the run folder, for messages.
+    """The experts of each job of a run, all of them in the cache; ``what``: the run folder, for messages.
 
     Raises ConfigError, with the command that trains them, if the run needs no SAC experts or if some were not kept.
     """
@@ -83,7 +109,7 @@ def kept(run: Run, what: str) -> list[list[Wanted]]:
         )
         raise ConfigError(f"{what}: its experts were not kept (sac.cache = ''): {remedy}")
     everyone = [one for job in jobs for one in job]
-    if missing := sum(one.history is None for one in everyone):
+    if missing := sum(one.load() is None for one in everyone):
         where = f"{missing} of its {len(everyone)} experts are not in {run.sac.cache} on this node"
         raise ConfigError(f"{what}: {where}: {train} --out OTHER` trains the missing ones")
     return jobs
@@ -118,13 +144,13 @@ def export(folder: Path, out: Path, progress: Callable[[int, int], None] = lambd
     (out / MANIFEST).unlink(missing_ok=True)
     for job in jobs:
         env = problem.batch([one.variation for one in job])
-        policy = ExpertPolicy([known(one) for one in job], job[0].sac)
+        policy = ExpertPolicy([one.history() for one in job], job[0].sac)
         unused, seeds = np.zeros((len(job), env.spec.actions)), [expert_seed(one.variation, one.seed) for one in job]
         act = lambda observation, policy=policy, unused=unused: policy.act(observation, unused)  # noqa: E731
         returns = evaluate(env, act, seeds, draws.EVALUATION, EPISODES)
         for row, (one, seed) in enumerate(zip(job, seeds, strict=True)):
             expert = SACBatch([seed], env.spec, one.sac, "cpu", capacity=1)
-            expert.arrays["actor"].copy_(torch.from_numpy(known(one).actor))
+            expert.arrays["actor"].copy_(torch.from_numpy(one.history().actor))
             expert.save_sb3(0, out / f"{one.name}.zip")
             entries.append(_entry(one, env.spec, returns[:, row]))
             progress(len(entries), sum(map(len, jobs)))
@@ -149,7 +175,7 @@ def _require_free(out: Path) -> None:
 def _require_shape(one: Wanted, spec: Spec) -> None:
     from icrl_dist.experts.sac.stacked import Shape
 
-    history, needed = known(one), Shape((spec.observation, *one.sac.hidden, 2 * spec.actions)).parameters
+    history, needed = one.history(), Shape((spec.observation, *one.sac.hidden, 2 * spec.actions)).parameters
     found = len(history.actor), history.observations.shape[-1], history.actions.shape[-1]
     if found != (needed, spec.observation, spec.actions):
         raise ConfigError(
