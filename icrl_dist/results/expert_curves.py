@@ -73,8 +73,16 @@ def panel(curves: Sequence[Curve], caption: str) -> Panel:
             numbers = over(values[:, filled], axis=0)
             points = zip(chosen[0].steps[filled].tolist(), numbers.tolist(), strict=True)
             known = [Point(step, Interval(value, np.nan, np.nan), np.nan) for step, value in points]
-            series.append(Series(f"{style}, {name} of {len(chosen)}", style, 0, known))
-    return Panel("experts", TITLE, "lines", "environment steps", "return of a training episode", ranked(series), caption)
+            series.append(Series(f"{style}, {name}", style, 0, known))
+    return Panel(
+        "experts",
+        f"{len(curves)} experts",
+        "lines",
+        "environment steps",
+        "return of a training episode",
+        ranked(series),
+        caption,
+    )
 
 
 def sheet(curves: Sequence[Curve], caption: str) -> Sheet:

@@ -50,7 +50,7 @@ def slow_choice(kept, episodes):
     """The parameters of every expert, one expert, checkpoint and episode after another."""
     chosen = []
     for row, seed in enumerate(SEEDS):
-        best, most = None, -np.inf
+        best, most = kept[0][row], -np.inf
         for actors in kept:
             alone, total = SACBatch([0], Line(1).spec, LINE, "cpu"), 0.0
             alone.arrays["actor"].copy_(torch.from_numpy(actors[row : row + 1]))

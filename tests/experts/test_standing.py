@@ -1,6 +1,7 @@
 """Experts below the return that a run asks for are named, and end the run, before labels are made of them."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 
@@ -77,7 +78,7 @@ def test_the_returns_are_those_of_the_expert_after_its_training(run):
 def test_a_run_ends_with_the_list_and_goes_on_where_the_flag_says_so(run, trained, tmp_path):
     few = dataclasses.replace(run, method="dpt", pretrain=dataclasses.replace(run.pretrain, contexts=4 * 3, steps=2))
     few = dataclasses.replace(few, evaluate=dataclasses.replace(few.evaluate, episodes=1, seeds=1, p=(0.0,)))
-    asked, folder, events = asking(few, least_return=NEVER), tmp_path / "run", list[dict]()
+    asked, folder, events = asking(few, least_return=NEVER), tmp_path / "run", list[dict[str, Any]]()
     with pytest.raises(TrainFailed, match=r"pretrain/0/0.*: 2 of 2 experts \(100%\) .* --sac.failed-experts teach"):
         icrl_dist.train(asked, folder, engine="inline", progress=events.append)
     data = Dataset(folder / "dataset", readonly=True)

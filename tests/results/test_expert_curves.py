@@ -67,7 +67,7 @@ def test_curves_figure_and_table_are_those_of_the_recorded_episodes(run, folder,
     (panel,) = answer["sections"][0]["numbers"]
     expected = [over(by_kind[kind], axis=0) for kind in (True, False) for over in (np.mean, np.min)]
     assert [one["name"] for one in panel["series"]] == [
-        f"{kind}, {name} of 2" for kind in ("undisturbed", "disturbed") for name in ("mean", "minimum")
+        f"{kind}, {name}" for kind in ("undisturbed", "disturbed") for name in ("mean", "minimum")
     ]
     for one, values in zip(panel["series"], expected, strict=True):
         np.testing.assert_allclose([point["value"] for point in one["points"]], values, atol=1e-4)
