@@ -69,6 +69,8 @@ class Wanted:
 def wanted(run: Run) -> list[list[Wanted]]:
     """The experts of each job of a run; no job if the run needs none."""
     problem, method = problems.of(run), methods.of(run)
+    if not isinstance(problem.contexts(run).payload, ExpertHistories):
+        return []  # without asking for the jobs of a large run
     asked = method.ask(run, method.phases(run)[0])
     return [list(_of(job, problem, run.sac)) for job in asked if isinstance(job.payload, ExpertHistories)]
 
