@@ -23,7 +23,7 @@ from icrl_dist import version as code
 from icrl_dist.collect import kinds
 from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, parse
-from icrl_dist.interfaces import Problem
+from icrl_dist.interfaces import EndsRun, Problem
 from icrl_dist.methods import registry as methods
 from icrl_dist.models.kernel import require_kernel
 from icrl_dist.problems import registry as problems
@@ -142,12 +142,12 @@ class Worker:
             current = None if refused else next((identity for identity in job.identities() if identity not in made), None)
             record = crash_reports.raised(self.name, job.label, error, job, current)
             _drain(sender, drain_s)
-            self._fail(job.name, record)
+            self._fail(job.name, record, plain(str(error), messages.LINE) if isinstance(error, EndsRun) else "")
         finally:
             self._job, self._doing, self._reached = "", "", 0
 
-    def _fail(self, name: tuple[str, int, int, int], record: dict[str, Any]) -> None:
-        self._request("failed", job=list(name), record=record, file=self._write(record))
+    def _fail(self, name: tuple[str, int, int, int], record: dict[str, Any], ends_run: str = "") -> None:
+        self._request("failed", job=list(name), record=record, file=self._write(record), ends_run=ends_run)
 
     def _report(self, text: str, note: bool = False, reached: int = 0) -> None:
         """Send a note to the learner at once; other texts are part of the next heartbeat."""

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from icrl_dist.problems.benchmarks import Benchmarks
     from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite
 
-__all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
+__all__ = ["Batch", "EndsRun", "Link", "Method", "Policy", "Problem"]
 
 Actions = Int64[np.ndarray, " B"] | Float32[np.ndarray, "B A"]
 """Actions in B environments: integers for discrete actions, else vectors in [-1, 1]."""
@@ -63,6 +63,10 @@ its repetition of the work gets further than before, the crash does not count as
 
 def no_progress(text: str, note: bool = False, reached: int = 0) -> None:
     """A ``Progress`` that does nothing."""
+
+
+class EndsRun(Exception):  # noqa: N818
+    """Raised by a job: a person must decide before the run can go on, so it ends with this line instead of being repeated."""
 
 
 class Batch(Protocol):

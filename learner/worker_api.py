@@ -239,7 +239,7 @@ class WorkerAPI:
                 self._count(request, fields)
                 return self._lease(worker)
             case messages.Failed():
-                self._failed(worker, request.job, request.record, request.file)
+                self._failed(worker, request)
             case messages.Note():
                 self._report_of_worker({"event": "note", "text": f"worker {worker}: {plain(request.text)}"})
         return wire.encode_message("noted")
@@ -276,13 +276,16 @@ class WorkerAPI:
         job = lease.job
         return wire.encode_message("job", name=list(job.name), job=wire.encode_job(job), deadline_s=lease.deadline_s)
 
-    def _failed(self, worker: str, name: tuple[str, int, int, int], record: messages.CrashRecord, file: str) -> None:
+    def _failed(self, worker: str, failed: messages.Failed) -> None:
         """Record the failure of a job that the worker holds; a report about another job changes nothing."""
+        record, file = failed.record, failed.file
         cause = plain(record.exception, messages.LINE)
         with self._lock:
-            if not self._scheduler.job_failed(worker, name, cause):
+            if not self._scheduler.job_failed(worker, failed.job, cause):
                 return
             self._jobs.pop(worker, None)
+        if failed.ends_run:
+            self._fail(f"{plain(record.job)}: {plain(failed.ends_run, messages.LINE)}")
         text = f"worker {worker}: job {plain(record.job)} failed: {cause}"
         kept = crash_reports.folder_of(self._folder) / file
         if file and kept.is_file():

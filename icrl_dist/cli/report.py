@@ -17,8 +17,8 @@ from icrl_dist.cli.exit_codes import OK
 class ReportArguments:
     """Make the paper's figures, tables and claims from result rows of several trainings.
 
-    Without ``--figure`` and ``--claims`` it makes all figures that the rows allow, with tables and claims, as one
-    HTML page: ``icrl-dist report runs/sweep``.  It refuses, in one line, to compare trainings whose seeds, splits,
+    Without ``--figure``, ``--claims`` and ``--experts`` it makes all figures that the rows allow, with tables and claims, as
+    one HTML page: ``icrl-dist report runs/sweep``.  It refuses, in one line, to compare trainings whose seeds, splits,
     evaluations or budgets differ, and lists the runs that make missing rows.
     """
 
@@ -33,6 +33,9 @@ class ReportArguments:
     claims: bool = False
     """Print the paper's claims one by one, with effect sizes, intervals over training seeds and verdicts, and the table of
     ICAA's rounds."""
+    experts: bool = False
+    """Show the learning curves of the SAC experts of one run folder, from the cache of this node: a figure of mean and
+    minimum, a table of all experts with those below ``sac.least_return``, and all curves as rows (CSV)."""
     setting: str | None = None
     """A setting of the sweep.  Default: the only one; with claims and the page also wind and permuted."""
     out: Path | None = None
@@ -55,7 +58,7 @@ def report(arguments: ReportArguments, console: Console) -> int:
     """Make the report and print its tables.  Returns the exit code."""
     from icrl_dist.results import paper_report
 
-    options = ("figure", "claims", "setting", "out", "markdown", "common_seeds", "unequal_budgets", "partial")
+    options = ("figure", "claims", "experts", "setting", "out", "markdown", "common_seeds", "unequal_budgets", "partial")
     chosen = {name: getattr(arguments, name) for name in options}
     found = paper_report.report(list(arguments.sources), **chosen)
     console.print(str(found), highlight=False, markup=False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from icrl_dist.config.run import Run
+from icrl_dist.config.sac import NOT_IN_TRAINING
 from icrl_dist.config.sections import AlertsConfig, EvaluateConfig
 
 
@@ -18,7 +19,7 @@ FREE: Mapping[str, frozenset[str]] = {
     "alerts": _fields(AlertsConfig),
     "evaluate": _fields(EvaluateConfig),
     "learner": frozenset({"cache_mb", "device", "prometheus", "restarts"}),
-    "sac": frozenset({"cache"}),
+    "sac": NOT_IN_TRAINING,
     "stream": frozenset({"certificates", "connect", "credits", "endpoint", "lease_s", "max_message_bytes", "reply_timeout_s"}),
 }
 """The numbers, by section, on which neither the dataset nor the weights depend, so that a resume may change them.

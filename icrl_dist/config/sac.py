@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
@@ -45,5 +45,23 @@ class SACConfig:
     """Environment steps per update (QARL's code)."""
     steps: WholeAboveZero = 200_000
     """Environment steps of an expert's training."""
+    checkpoints: WholeAboveZero = 1
+    """Checkpoints of which the best one acts and labels as the expert: the parameters at the end of a training and at evenly
+    spaced earlier episodes of its last fifth.  1: those at the end.  ``checkpoint_episodes`` has no effect then."""
+    checkpoint_episodes: WholeAboveZero = 5
+    """Episodes of the mean action by which each checkpoint of an expert is evaluated.  All take checkpoints x episodes x
+    horizon environment steps more, without updates: 5,000 at 5 x 5 x 200."""
+    least_return: Annotated[float, Ge(-1e6), Le(1e6), Remedy("must be from -1e6 to 1e6")] = 0.0
+    """Return per episode that an undisturbed expert must reach by its mean action, such as 80% of what a long training
+    reaches; 0: any.  Experts that do not are named before labels are made of them, and end the run; see
+    ``failed_experts``."""
+    least_return_disturbed: Annotated[float, Ge(-1e6), Le(1e6), Remedy("must be from -1e6 to 1e6")] = 0.0
+    """The same for experts of variations with an adversary."""
+    failed_experts: Literal["refuse", "teach"] = "refuse"
+    """``teach``: go on with experts below ``least_return``; a note names them."""
     cache: str = "~/.cache/icrl-dist/experts"
     """Folder that stores histories and experts for later runs; empty: they are not stored."""
+
+
+NOT_IN_TRAINING = frozenset({"cache", "least_return", "least_return_disturbed", "failed_experts"})
+"""Keys that change neither an expert nor its history."""

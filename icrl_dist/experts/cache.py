@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config import plugins
-from icrl_dist.config.sac import SACConfig
+from icrl_dist.config.sac import NOT_IN_TRAINING, SACConfig
 from icrl_dist.experts.payloads import WINDOW_EPISODES
 from icrl_dist.storage.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from icrl_dist.storage.files import StoreError
@@ -46,8 +46,8 @@ _LIBRARIES: dict[Trainer, tuple[str, ...]] = {
     "stable-baselines3": ("numpy", "torch", "stable-baselines3"),
 }
 """The distributions that decide the bytes of a training; those of the environments are ``Problem.libraries``."""
-_NOT_IN_TRAINING = frozenset({"cache"})
-"""Settings of the section ``[sac]`` that do not change a history."""
+_OF_CHECKPOINTS = frozenset({"checkpoints", "checkpoint_episodes"})
+"""Settings that change a history only if there are several checkpoints."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,11 +101,12 @@ def key(variation: Variation, horizon: int, config: SACConfig, seed: int, traine
     task, adversary = variation.task, variation.adversary
     libraries = {*_LIBRARIES[trainer], *plugins.find("problems", task.kind).libraries}
     source = plugins.sources().get(f"problems/{task.kind}")
+    left_out = NOT_IN_TRAINING | (_OF_CHECKPOINTS if config.checkpoints == 1 else frozenset())
     parts = {
         "experts_version": EXPERTS_VERSION,
         "task": [task.kind, dict(task.params)],
         "adversary": [adversary.kind, dict(adversary.params)],
-        "sac": {name: value for name, value in as_data(config).items() if name not in _NOT_IN_TRAINING},
+        "sac": {name: value for name, value in as_data(config).items() if name not in left_out},
         "seed": seed,
         "trainer": trainer,
         "horizon": horizon,
@@ -134,6 +135,14 @@ def load_any(variation: Variation, horizon: int, config: SACConfig, seed: int) -
     keys = ((trainer, trials) for trainer in get_args(Trainer) for trials in (1, RECORDED_EPISODES + 1))
     found = (load(variation, horizon, config, seed, trainer, trials) for trainer, trials in keys)
     return next((history for history in found if history is not None), None)
+
+
+def stored(variation: Variation, horizon: int, config: SACConfig, seed: int) -> bool:
+    """Whether ``load_any`` finds a file; it is not read."""
+    if not config.cache:
+        return False
+    keys = ((trainer, trials) for trainer in get_args(Trainer) for trials in (1, RECORDED_EPISODES + 1))
+    return any(file(config, key(variation, horizon, config, seed, trainer, trials)).exists() for trainer, trials in keys)
 
 
 def file(config: SACConfig, name: str) -> Path:

@@ -11,6 +11,18 @@ from icrl_dist.types import LabelCounts, Payload
 
 WINDOW_EPISODES = 8
 """Episodes after training in which the expert acts, from which action windows are cut."""
+_LAST_SHARE = 5
+"""Checkpoints are kept in the last 1 / ``_LAST_SHARE`` of a training."""
+
+
+def checkpoint_numbers(config: SACConfig, episodes: int) -> list[int]:
+    """After which of a training's ``episodes`` (from 1) its checkpoints are taken, the last one at its end.
+
+    There are fewer than ``config.checkpoints`` if the last fifth of the training has fewer episodes.
+    """
+    span = min(episodes - 1, episodes // _LAST_SHARE)
+    count = min(config.checkpoints, span + 1)
+    return [episodes - round(span * number / max(1, count - 1)) for number in reversed(range(count))]
 
 
 @dataclass(frozen=True)
@@ -47,12 +59,15 @@ class ExpertHistories(Payload):
     labelling: ExpertLabelling
 
     def env_steps(self, trials: int, horizon: int) -> int:
-        """The steps of an expert's training in whole episodes, which the trials are taken from, and of its window episodes.
+        """The steps of an expert's training in whole episodes, which the trials are taken from, those by which its
+        checkpoints are compared, and those of its window episodes.
 
         An expert acts in ``WINDOW_EPISODES`` episodes also if no action windows are cut from them.
         """
         training = max(1, self.sac.steps // horizon)
-        return (training + max(WINDOW_EPISODES, self.labelling.window_episodes)) * horizon
+        checkpoints = len(checkpoint_numbers(self.sac, training))
+        compared = checkpoints * self.sac.checkpoint_episodes if checkpoints > 1 else 0
+        return (training + compared + max(WINDOW_EPISODES, self.labelling.window_episodes)) * horizon
 
 
 @dataclass(frozen=True)

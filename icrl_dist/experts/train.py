@@ -22,8 +22,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts import cache
+from icrl_dist.experts import cache, standing
 from icrl_dist.experts.cache import History, Trainer, expert_seed
+from icrl_dist.experts.checkpoints import Checkpoints
 from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.experts.trajectories import Act, history_trajectories, scripted_actions, window_episodes, with_labels
 from icrl_dist.interfaces import Batch, Problem, Progress, no_progress
@@ -48,11 +49,18 @@ def train_expert(job: Job, problem: Problem, worker: str, progress: Progress = n
     """Histories D^{i,k} of SAC experts of each variation, with query states and labels (Algorithm 2, lines 8 to 12).
 
     All experts of a job train together, so the first trajectory is ready after the last training step.
-    Raises RuntimeError for a variation whose simulation diverges in every episode.
+    Raises RuntimeError for a variation whose simulation diverges in every episode, EndsRun for experts that return less
+    than ``sac.least_return`` (docs/commands.md).
     """
     payload = job.payload
     assert isinstance(payload, ExpertHistories)
     found = _histories(job, problem, payload.sac, progress)
+    if standing.labels_come_from_experts(problem):
+        standings = standing.of(job.rows(), job.variations, found, payload.sac)
+        if payload.sac.failed_experts == "refuse":
+            standing.require(standings)
+        elif text := standing.listed(standings):
+            progress(f"{job.label}: labels are made although {text}", note=True)
     yield from history_trajectories(job, problem, payload.labelling, found, worker, _mean_actions(found, payload.sac))
 
 
@@ -115,16 +123,21 @@ def _train(
     env, seeds = problem.batch(variations), [expert_seed(variation, job.seed) for variation in variations]
     episodes = cache.training_episodes(horizon, config)
     recorder = Recorder(env, episodes, cache.recorded_episodes(horizon, config, job.trials))
-    state = _load_training(part, recorder) if part is not None and part.exists() else None
+    checkpoints = Checkpoints(config, episodes)
+    state = _load_training(part, recorder, checkpoints) if part is not None and part.exists() else None
     saved = time.monotonic()
 
     def report(experts: SACBatch, returns: np.ndarray) -> None:
         nonlocal saved
+        if state:
+            state.clear()  # it is loaded: a second replay would stay in memory until the end
+        checkpoints.keep(experts.steps // horizon, experts.arrays["actor"].cpu().numpy())
         mean = f"mean return {returns.mean():.0f}"
         progress(f"{len(keys)} experts at {experts.steps:,} of {config.steps:,} steps, {mean}", reached=experts.steps)
         if part is not None and time.monotonic() - saved >= CHECKPOINT_S:
             arrays = {f"state/{name}": value for name, value in experts.state().items()}
             arrays |= {f"episodes/{name}": value for name, value in recorder.state().items()}
+            arrays |= {f"checkpoints/{name}": value for name, value in checkpoints.state().items()}
             saved = time.monotonic()
             try:
                 save_checkpoint(part, Checkpoint(arrays, {}))
@@ -132,6 +145,7 @@ def _train(
                 _log.warning("no checkpoint of this training: %s", error)
 
     experts = train(recorder, config, recorder.episodes * recorder.spec.horizon, seeds, report, state=state, backend=backend)
+    checkpoints.choose(env, seeds, experts, lambda text: progress(f"{job.label}: {text}", reached=experts.steps))
     columns = with_labels(recorder.columns(), problem, experts.act)
     windows = window_episodes(env, problem, experts.act, seeds, range(env.batch))
     histories = make_histories(job, variations, columns, windows, experts.arrays["actor"].cpu().numpy(), progress)
@@ -174,11 +188,12 @@ def make_histories(
     return histories
 
 
-def _load_training(part: Path, recorder: Recorder) -> dict[str, np.ndarray] | None:
+def _load_training(part: Path, recorder: Recorder, checkpoints: Checkpoints) -> dict[str, np.ndarray] | None:
     """The checkpoint of a training that was not finished; None if it cannot be read."""
     try:
         stored = load_checkpoint(part)
         recorder.load(stored.part("episodes"))
+        checkpoints.load(stored.part("checkpoints"))
         return stored.part("state")
     except (StoreError, KeyError) as error:
         _log.warning("the training starts again from step 0: %s", error)

@@ -15,7 +15,7 @@ from icrl_dist.config import plugins
 from icrl_dist.config.run import ConfigError, Run, load_folder, load_run, override, run_folder_of
 from icrl_dist.console.display import ReportEvent, Show, reporting
 from icrl_dist.console.signals import interruptible
-from icrl_dist.launch import auto
+from icrl_dist.launch import auto, expert_checks
 from icrl_dist.launch import train as launch
 from icrl_dist.launch.holdings import holdings, remove_if_empty
 from icrl_dist.launch.learner_process import TrainFailed
@@ -107,6 +107,8 @@ def train(
     try:
         with interruptible(), reporting(progress) as show, contextlib.ExitStack() as locks:
             settings = auto.without_auto(settings, folder, going_on, lambda text: show({"event": "note", "text": text}))
+            for note in expert_checks.notes(settings):
+                show({"event": "note", "text": note})
             transaction = launch.prepare(settings, folder, resume, overwrite, parent, resume_or_begin)
             started = time.monotonic()
             if warning := without_locks(folder):
@@ -153,10 +155,10 @@ def _folder(run: Run | str | Path | None, out: str | Path | None, source: str | 
 
 def _evaluate(run: Run, folder: Path, show: ReportEvent) -> Evaluation:
     import_torch()
-    from icrl_dist.results import heldout, reports  # they import torch, so they come after the training
+    from icrl_dist.results import heldout, reports, run_experts  # they import torch, so they come after the training
 
     if not plugins.find("methods", run.method).trains:
-        return reports.experts(heldout.experts(run, folder))
+        return reports.experts(heldout.experts(run, folder), run_experts.failures(run))
     heldout.save_calibrated(folder, show)
     frame = heldout.online(run, folder, folder / "results", show)
     return reports.online(run, folder / "report" / heldout.report_name(run, folder), frame)

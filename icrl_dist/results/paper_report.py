@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from icrl_dist.config.paths import path_of
-from icrl_dist.config.run import ConfigError
+from icrl_dist.config.run import ConfigError, load_folder
 from icrl_dist.config.toml import nearest
-from icrl_dist.results import page
+from icrl_dist.results import expert_curves, page
 from icrl_dist.results.claims import costs, icaa, labels, questions
 from icrl_dist.results.claims import sheets as claim_sheets
 from icrl_dist.results.figures import catalog, sheets, styles
@@ -71,6 +71,7 @@ def report(
     *,
     figure: str | None = None,
     claims: bool = False,
+    experts: bool = False,
     setting: str | None = None,
     out: str | Path | None = None,
     markdown: str | Path | None = None,
@@ -82,8 +83,10 @@ def report(
 
     ``sources``: files of result rows, run folders, or folders of sweeps.  ``figure``: the name of one figure (``"2"``,
     ``"3a"``, ``"strength"``; ``catalog.NAMES`` has all), written to ``out`` as PNG with its numbers as CSV and JSON.
-    ``claims``: instead the paper's claims, and the tables of ICAA.  Neither: all figures that the rows allow, with tables
-    and claims, as one HTML page, ``out``/index.html.  ``out``: None for the folder ``report`` beside the first source's rows.
+    ``claims``: instead the paper's claims, and the tables of ICAA.  ``experts``: instead the learning curves of the SAC
+    experts of one run folder, from the cache of this node, as figure, table and rows.  None of them: all figures that the rows
+    allow, with tables and claims, as one HTML page, ``out``/index.html.  ``out``: None for the folder ``report`` beside the
+    first source's rows.
 
     ``setting``: the setting of the sweep; None for the only one (claims, the page and figure ``strength``: also those in
     which the disturbance must be inferred).  ``markdown``: a file for the text of the report.
@@ -95,31 +98,58 @@ def report(
     them), and for seeds, splits, evaluation settings or budgets that differ; StoreError for rows of another format,
     and for a file that cannot be written.
     """
+    if (figure is not None) + claims + experts > 1:
+        raise ConfigError("report: choose one of --figure, --claims and --experts, or give none for the whole report")
     if figure is not None:
         catalog.check(figure)
-        if claims:
-            raise ConfigError("report: --figure and --claims were given; choose one, or give neither for the whole report")
-    files = files_of(sources)
-    folder = path_of("out", out) if out is not None else _beside(files[0])
+    run_folder = _run_folder(sources) if experts else None
+    files = [] if run_folder else files_of(sources)
+    default = run_folder / "report" if run_folder else _beside(files[0])
+    folder = default if out is None else path_of("out", out)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"--out {folder}: is a file; name a folder, such as report")
     path = None if markdown is None else path_of("markdown", markdown)
     if path is not None and (path.is_dir() or not path.name):
         raise ConfigError(f"--markdown {str(markdown)!r}: is a folder; name a file, such as report.md")
-    rows, rules = Rows(files), Rules(common_seeds, _budgets(unequal_budgets), partial)
-    if figure is not None:
-        section, written = _figure(rows, setting, rules, figure, folder)
+    rules = Rules(common_seeds, _budgets(unequal_budgets), partial)
+    if run_folder is not None:
+        found = _experts(run_folder, folder)
+    elif figure is not None:
+        section, written = _figure(Rows(files), setting, rules, figure, folder)
         found = Report((section,), (), tuple(written))
     elif claims:
         refused: list[str] = []
-        sections = [part for one in _studies(rows, setting, rules) for part in _tables(one, costs.ledger(files), refused)]
+        sections = [
+            part for one in _studies(Rows(files), setting, rules) for part in _tables(one, costs.ledger(files), refused)
+        ]
         found = Report(tuple(_joined(sections)), tuple(refused))
     else:
-        found = _whole(rows, files, setting, rules, folder)
+        found = _whole(Rows(files), files, setting, rules, folder)
     if path is not None:
         atomic_write(path, lambda file: file.write(found.markdown().encode()))
         found = Report(found.sections, found.refused, (*found.files, path))
     return found
+
+
+def _run_folder(sources: str | Path | Sequence[str | Path]) -> Path:
+    """The only source, a run folder."""
+    given = [sources] if isinstance(sources, str | Path) else list(sources)
+    if len(given) != 1:
+        raise ConfigError(f"report --experts: {len(given)} folders were given; name one run folder")
+    return path_of("rows", given[0])
+
+
+def _experts(run_folder: Path, folder: Path) -> Report:
+    """Learning curves of a run's experts: a figure of mean and minimum, a table of the experts, and all curves as rows."""
+    curves, missing = expert_curves.curves(load_folder(run_folder), str(run_folder))
+    caption = expert_curves.caption(curves, missing)
+    panel, table = expert_curves.panel(curves, caption), expert_curves.sheet(curves, caption)
+    title = f"{expert_curves.TITLE}, {run_folder.resolve().name}"
+    written = styles.save([panel], title, folder / "experts")
+    rows = folder / "experts-rows.csv"
+    atomic_write(rows, lambda file: file.write(expert_curves.csv_rows(curves).encode()))
+    section = Section(title, (table,), picture=written[0], data=[data(panel)])
+    return Report((section,), (), (*written, rows))
 
 
 def _budgets(given: Sequence[str]) -> tuple[str, ...]:

@@ -143,7 +143,7 @@ def posterior(
     return Evaluation(frame, tuple(tables), tuple(_notes(stored, unstored)), summary)
 
 
-def experts(frame: pd.DataFrame) -> Evaluation:
+def experts(frame: pd.DataFrame, notes: tuple[str, ...] = ()) -> Evaluation:
     """The evaluation with these rows of suite ``experts``."""
     found = summaries.experts(frame)
-    return Evaluation(frame, (experts_table(found),), (), {"experts": found})
+    return Evaluation(frame, (experts_table(found),), notes, {"experts": found})

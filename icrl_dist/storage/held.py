@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from icrl_dist.config.run import ConfigError, Run, parse_written
-from icrl_dist.config.sac import SACConfig
+from icrl_dist.config.sac import NOT_IN_TRAINING, SACConfig
 from icrl_dist.storage.checkpoint import Checkpoint, DamagedCheckpoint, load_checkpoint, version_file
 from icrl_dist.storage.files import StoreError, require_plain
 from icrl_dist.storage.fork import Lineage
@@ -22,7 +22,7 @@ from icrl_dist.stream import wire
 
 _FREE: Mapping[str, tuple[str, ...] | None] = {
     "stream": ("job_tasks", "staleness"),
-    "sac": tuple(field.name for field in dataclasses.fields(SACConfig) if field.name != "cache"),
+    "sac": tuple(field.name for field in dataclasses.fields(SACConfig) if field.name not in NOT_IN_TRAINING),
     "learner": ("reproducible",),
     **dict.fromkeys(("evaluate", "alerts"), ()),
 }

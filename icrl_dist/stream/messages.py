@@ -111,6 +111,8 @@ class Failed:
     record: CrashRecord
     file: _FileName
     """Name of the file in ``crashes/`` that the worker has written; empty if it could not."""
+    ends_run: _Line = ""
+    """Why the run cannot go on before a person decides, with the remedy; empty: the job is repeated."""
 
 
 @dataclass(frozen=True, slots=True)

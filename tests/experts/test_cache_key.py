@@ -2,15 +2,17 @@
 
 import dataclasses
 import hashlib
+import itertools
 import math
 from importlib import metadata
 from typing import Any
 
+import numpy as np
 import pytest
 
 from icrl_dist.config import plugins
 from icrl_dist.config.sac import SACConfig
-from icrl_dist.experts import cache
+from icrl_dist.experts import cache, checkpoints
 from icrl_dist.problems.continuous import network_adversary
 from icrl_dist.problems.dmc import domains
 from icrl_dist.types import NULL, Adversary, Task, Variation
@@ -52,8 +54,12 @@ CHANGED = {
     "update_every": 3,
     "steps": 220,
     "cache": "elsewhere",
+    "checkpoints": 2,
+    "checkpoint_episodes": 1,
 }
 """Another value of every setting in ``[sac]``."""
+NO_EFFECT = ("cache", "checkpoint_episodes")
+"""Settings that do not change a history where the others are those of ``SAC``."""
 REACHER = Task.of("dmc-reacher-easy", arm_mass=0.04, hand_mass=1 / 30, forces="paper", horizon=20)
 PUSHED = Variation(REACHER, network_adversary.network(7, 6, 2, 0.1))
 PICK_PLACE = Variation(Task.of("metaworld-pick-place", object=(0.0, 0.6, 0.02), goal=(0.0, 0.8, 0.1), horizon=20))
@@ -134,7 +140,9 @@ def unchanged():
 
 
 @pytest.mark.parametrize("name", [item.name for item in dataclasses.fields(SACConfig)])
-def test_a_setting_is_in_the_key_if_and_only_if_it_changes_the_history(run, unchanged, tmp_path, name):
+def test_a_setting_is_in_the_key_if_and_only_if_it_changes_the_history(run, unchanged, tmp_path, monkeypatch, name):
+    worse = itertools.count()  # of several checkpoints the first is the best; in a real training this short all are equal
+    monkeypatch.setattr(checkpoints, "evaluate", lambda env, *_: np.full((1, env.batch), -float(next(worse))))
     sac = dataclasses.replace(SAC, cache=str(tmp_path / "a"))
     unchanged[:] = unchanged or [digest(run, sac)]
     value = str(tmp_path / "b") if name == "cache" else CHANGED[name]
@@ -142,7 +150,13 @@ def test_a_setting_is_in_the_key_if_and_only_if_it_changes_the_history(run, unch
     other = dataclasses.replace(sac, **change)
     changes = digest(run, other) != unchanged[0]
     assert (key(sac=other) != key(sac=sac)) == changes
-    assert changes == (name != "cache"), "another value would show it"
+    assert changes == (name not in NO_EFFECT), "another value would show it"
+
+
+def test_the_episodes_of_an_evaluation_are_in_the_key_only_with_several_checkpoints():
+    several = dataclasses.replace(SAC, checkpoints=2)
+    assert len({key(), key(sac=several), key(sac=dataclasses.replace(several, checkpoint_episodes=1))}) == 3
+    assert key(sac=dataclasses.replace(SAC, checkpoint_episodes=1)) == key()
 
 
 @pytest.mark.integration

@@ -86,7 +86,10 @@ def test_files_of_another_shape_number_of_updates_or_kind_are_refused(tmp_path):
     fixed.save(paths[0])
     with pytest.raises(ValueError, match="temperature is fixed"):
         SACBatch([0], SPEC, SMALL, "cpu").load_sb3(paths[:1])
-    for low, activation, words in ((-1, torch.nn.Tanh, "with activation Tanh"), (-2, torch.nn.ReLU, r"actions from \[-2.0")):
+    for low, activation, words in (
+        (-1, torch.nn.Tanh, "with activation Tanh .* train it with ReLU"),
+        (-2, torch.nn.ReLU, r"actions from \[-2.0.* rescaled to \[-1, 1\]"),
+    ):
         spaces = Spaces()
         spaces.action_space = gymnasium.spaces.Box(low, 1, (A,), np.float32)
         kinds = {"net_arch": [16, 8], "activation_fn": activation}

@@ -60,8 +60,9 @@ class Server:
     def ask(self, worker, **counts):
         return self.request("ask", worker, **{**COUNTS, **counts})
 
-    def fail(self, worker, job, file="", **record):
-        return self.request("failed", worker, job=list(job.name), file=file, record={**RECORD, "worker": worker, **record})
+    def fail(self, worker, job, file="", ends_run="", **record):
+        fields = {"job": list(job.name), "file": file, "ends_run": ends_run, "record": {**RECORD, "worker": worker, **record}}
+        return self.request("failed", worker, **fields)
 
     def wait(self, kind, count=1):
         """Wait for ``count`` events of this kind; returns them."""
@@ -245,6 +246,14 @@ def test_the_learner_records_a_failed_job_if_the_worker_could_not(server):
     path = server.folder / "crashes" / "w0-1.json"
     assert event["text"] == f"worker w0: job pretrain/0/0 failed: ValueError: no (room.py:3); {path}"
     assert records(server) == {"w0-1.json": {**RECORD, "worker": "w0"}}
+
+
+def test_a_job_can_end_the_run_if_its_worker_holds_it(server):
+    server.ask("w0")
+    server.fail("w1", server.jobs[0], ends_run="not mine")
+    assert server.failures == []
+    server.fail("w0", server.jobs[0], ends_run="2 experts failed:\nuse --sac.failed-experts teach")
+    assert server.failures == ["pretrain/0/0: 2 experts failed: use --sac.failed-experts teach"]
 
 
 def test_a_record_of_the_worker_is_named_and_not_written_again(server):

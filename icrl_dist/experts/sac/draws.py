@@ -12,9 +12,9 @@ from torch import Tensor
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.types import Spec
 
-INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS = range(5)
-"""The purpose of a generator: initial parameters, initial states, actions, updates, and the episodes after training
-from which action windows are cut."""
+INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS, CHECKPOINTS, EVALUATION = range(7)
+"""The purpose of a generator: initial parameters, initial states, actions, updates, the episodes after training from which
+action windows are cut, those by which checkpoints are compared, and those of an evaluation of the expert."""
 
 
 def key(seed: int, *purpose: int) -> np.random.SeedSequence:

@@ -75,7 +75,7 @@ class Replay:
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """The inverse of ``state``.  Raises ValueError if the number of experts, the capacity or the width differs."""
-        rows, added = torch.from_numpy(np.array(state["rows"])), int(state["added"])
+        rows, added = torch.from_numpy(np.require(state["rows"], requirements="W")), int(state["added"])
         experts, capacity, width = self._rows.shape
         if rows.shape != (experts, min(added, capacity), width):
             raise ValueError(

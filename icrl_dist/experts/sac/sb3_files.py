@@ -79,7 +79,7 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
     if activation != "ReLU" or set(low) != {-1.0} or set(high) != {1.0}:
         raise ValueError(
             f"{path} holds an expert with activation {plain(activation)} and actions from {show(low)} to {show(high)}: "
-            "only ReLU and actions in [-1, 1] are supported"
+            "train it with ReLU, and with actions rescaled to [-1, 1]"
         )
     if "ent_coef_optimizer" not in tensors:
         raise ValueError(f"{path}: {_FIXED_TEMPERATURE}")
@@ -89,7 +89,7 @@ def load(path: Path, spec: Spec, config: SACConfig, shapes: Shapes) -> tuple[dic
         raise _unreadable(path, error) from error
 
 
-_FIXED_TEMPERATURE = "the temperature is fixed: only experts with an automatic temperature (ent_coef='auto') are supported"
+_FIXED_TEMPERATURE = "the temperature is fixed: train it with an automatic temperature (ent_coef='auto')"
 _MALFORMED = (KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError)
 """What the parts of a malformed file raise."""
 

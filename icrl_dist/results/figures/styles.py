@@ -41,8 +41,10 @@ STYLES = {
     "exact:paper": Style("exact, Algorithm 1", "#57606a", "", (0, (5, 1.5))),
     "oracle": Style("oracle", "#000000", "", "-"),
     "random": Style("random", "#afb8c1", "", "-."),
+    "undisturbed": Style("undisturbed experts", "#0a3069", "o", "-"),
+    "disturbed": Style("disturbed experts", "#bc4c00", "^", "-"),
 }
-"""By method, and by key of a reference agent."""
+"""By method, by key of a reference agent, and by kind of variation of SAC experts."""
 _OTHER = Style("", "#1f6feb", "x", "-", "||")
 _MARKERS = "so*XPDv"
 """Of the second series of one method and of those after it."""
