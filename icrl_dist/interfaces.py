@@ -327,6 +327,13 @@ class Problem(abc.ABC):
         """Histories of a learning agent, of at most ``trials`` episodes in each variation, for Algorithm Distillation."""
         return None
 
+    def robust_contexts(self, run: Run) -> Contexts | None:
+        """``contexts`` with labels of the robust policy pi^rb of each task (eq. 4); None if the problem has no such policies.
+
+        Raises ConfigError, with the key and the remedy, if it has none with these settings.
+        """
+        return None
+
     @property
     def behaviors(self) -> Behaviors | None:
         """Behavior policies, which jobs of the kind ``behavior_context`` need."""

@@ -117,7 +117,9 @@ def test_temperature_is_the_last_component_and_0_is_in_its_range() -> None:
     at_test = curriculum.appended(observation)
     np.testing.assert_array_equal(at_test[:, :2], observation)
     assert not at_test[:, 2].any() and at_test.dtype == np.float32
-    np.testing.assert_array_equal(curriculum.appended(observation, np.array([0.1, 0.2, 0.3]))[:, 2], np.float32([0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(
+        curriculum.appended(observation, np.array([0.1, 0.2, 0.3]))[:, 2], np.float32([0.1, 0.2, 0.3])
+    )
 
 
 def test_returns_are_discounted_from_the_first_step() -> None:
