@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
-    from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite
+    from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite, SecondPlayer
 
 __all__ = ["Batch", "Link", "Method", "Policy", "Problem"]
 
@@ -371,6 +371,11 @@ class Problem(abc.ABC):
     @property
     def certify(self) -> Certificate | None:
         """Exact returns of policies that are fixed within an episode, also against the worst adversary of a strength p."""
+        return None
+
+    @property
+    def second_player(self) -> SecondPlayer | None:
+        """The adversary as a player that can be trained against a policy, or together with one (RARL, QARL)."""
         return None
 
     @property
