@@ -567,6 +567,8 @@ class Method(abc.ABC):
     """Frozen dataclass of that section; every field has a default."""
     trains: ClassVar[bool] = True
     """Whether it trains a model that can be deployed."""
+    product: ClassVar[str] = "expert"
+    """If it trains no model: the key, in result rows, of the policies that it trains."""
     shows_states: ClassVar[bool] = False
     """Whether its policy calls ``watch`` with the model's final hidden states, which the OOD score is computed from."""
 

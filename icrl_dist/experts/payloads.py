@@ -51,8 +51,12 @@ class ExpertHistories(Payload):
 
         An expert acts in ``WINDOW_EPISODES`` episodes also if no action windows are cut from them.
         """
-        training = max(1, self.sac.steps // horizon)
-        return (training + max(WINDOW_EPISODES, self.labelling.window_episodes)) * horizon
+        return self.training_steps(self.sac, horizon) + max(WINDOW_EPISODES, self.labelling.window_episodes) * horizon
+
+    @staticmethod
+    def training_steps(sac: SACConfig, horizon: int) -> int:
+        """The steps of an expert's training in whole episodes."""
+        return max(1, sac.steps // horizon) * horizon
 
 
 @dataclass(frozen=True)

@@ -146,4 +146,4 @@ def posterior(
 def experts(frame: pd.DataFrame) -> Evaluation:
     """The evaluation with these rows of suite ``experts``."""
     found = summaries.experts(frame)
-    return Evaluation(frame, (experts_table(found),), (), {"experts": found})
+    return Evaluation(frame, (experts_table(found, frame["agent"].iloc[0]),), (), {"experts": found})

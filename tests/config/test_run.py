@@ -86,7 +86,7 @@ def test_values_are_read_into_their_fields() -> None:
         # Bad choices.
         (
             'method = "ppo"',
-            ["method = 'ppo'", "choose one of ad, ardt, dpt, dr, experts, ic2rl, icaa, icag, mix_dpt, prompt_dt"],
+            ["method = 'ppo'", "choose one of ad, ardt, dpt, dr, experts, ic2rl, icaa, icag, mix_dpt, prompt_dt, qarl, rarl"],
         ),
         ("method = 3", ["method = 3", "expected str, got int"]),
         ('[darkroom]\nlabels = "hard"', ["darkroom.labels = 'hard'", "'soft', 'sampled', 'heuristic'"]),

@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
-from scipy.optimize import brentq
-from scipy.special import digamma, gammaln
 
 from icrl_dist.config.robust import RobustConfig
 from icrl_dist.types import Spec
@@ -20,6 +18,8 @@ from icrl_dist.types import Spec
 
 def divergence(concentration: float, other: float) -> float:
     """KL divergence of one Gamma distribution from another one of the same rate, in nats; it does not depend on the rate."""
+    from scipy.special import digamma, gammaln  # imported here because scipy is slow to import
+
     return float((concentration - other) * digamma(concentration) - gammaln(concentration) + gammaln(other))
 
 
@@ -30,6 +30,8 @@ def moved(concentration: float, target: float, most: float) -> float:
     this is a Gamma distribution of that rate, with a concentration between theirs: the one at which the constraint
     holds with equality, or the target.
     """
+    from scipy.optimize import brentq
+
     if divergence(target, concentration) <= most:
         return target
     return float(brentq(lambda new: divergence(new, concentration) - most, concentration, target, xtol=1e-12, rtol=1e-12))
