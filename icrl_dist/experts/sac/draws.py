@@ -12,9 +12,10 @@ from torch import Tensor
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.types import Spec
 
-INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS, PLAYERS, TEMPERATURES = range(7)
+INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS, PLAYERS, TEMPERATURES, ADVERSARIES = range(8)
 """The purpose of a generator: initial parameters, initial states, actions, updates, and the episodes after training
-from which action windows are cut; of a game of two players their seeds, and the adversary's temperatures."""
+from which action windows are cut; of a game of two players their seeds, and the adversary's temperatures;
+the seeds of adversaries that are trained against a fixed policy."""
 
 
 def key(seed: int, *purpose: int) -> np.random.SeedSequence:
