@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import icrl_dist
 from icrl_dist.config.robust import RobustConfig
 from icrl_dist.config.run import ConfigError, Run, load_run
 from icrl_dist.config.sac import SACConfig
@@ -224,3 +225,10 @@ def test_a_run_trains_the_policies_and_a_later_one_uses_them(run: Run, games: li
     assert "RARL policies" in str(trained.evaluation.tables[0].title)
     later = train(dataclasses.replace(run, method="ic2rl"), tmp_path / "ic2rl", engine="inline")
     assert {"t0", "random", "expert", "rarl"} == set(later.evaluation.rows["agent"]) and len(games) == 2
+    worst = icrl_dist.evaluate(later.folder, suite="worst", p=1.0, adversaries=1, steps=60, episodes=1)
+    assert [row["key"] for row in worst.summary["worst"]] == ["t0", "expert", "rarl"]
+    assert [path.name.split("-")[0] for path in (later.folder / "report").glob("worst-*-1adversaries-60steps.json")] == [
+        "worst"
+    ]
+    with pytest.raises(ConfigError, match=r"^--steps 0: at least 1 is needed$"):
+        icrl_dist.evaluate(later.folder, suite="worst", steps=0)
