@@ -32,6 +32,8 @@ class RARL(DPT):
         if registry.of(run).second_player is None:
             remedy = f"{run.problem} has no second player, which {run.method} trains as adversary: use dpt or icag"
             yield "method", run.method, remedy
+        if not run.sac.cache:
+            yield "sac.cache", "", f"{run.method} keeps its policies only there: name a folder"
 
     def phases(self, run: Run) -> tuple[Phase, ...]:
         return (Phase("pretrain", 0, 0, run.optim.learning_rate),)

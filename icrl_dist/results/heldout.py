@@ -193,9 +193,9 @@ def worst(
     unstored: list[StoreError] | None = None,
     with_references: bool = True,
 ) -> pd.DataFrame:
-    """The rows of suite ``worst`` (``results.worst``) of the folder's models, by Algorithm 1, and of references; see ``online``.
+    """The rows of suite ``worst`` (``results.worst``) of the folder's models, by Algorithm 1, and of references.
 
-    References are those that tables have, without the random policy.
+    ``unstored`` as in ``rows.record``.  References are those that tables have, without the random policy.
     """
     agents = _deployed(run, models(what, "paper"), "paper")
     if with_references:

@@ -53,10 +53,9 @@ def evaluate(
     Suites ``posterior`` and ``worst`` always use ``paper``.
     ``episodes``: online episodes; ``seeds``: evaluations per task; ``p``: override probabilities of the test adversary,
     0 to 1; ``prior``: distribution of the test adversaries; evaluation e of a task is under adversary draw e.  None: the
-    run's (suite ``posterior``: 40 episodes, 4 seeds, p 0, 0.2, 0.4 and 0.6, uniform; ``attack`` and ``worst``: the run's p above 0).
-    ``draws``: sampled adversaries of suite ``attack``.  ``adversaries``: of suite ``worst``, for each agent and task, with
-    ``steps`` of training each.  ``references``: False leaves random policy, exact agents and
-    oracle out.
+    run's (suite ``posterior``: 40 episodes, 4 seeds, p 0, 0.2, 0.4 and 0.6, uniform; ``attack`` and ``worst``: the run's p
+    above 0).  ``draws``: sampled adversaries of suite ``attack``.  ``adversaries``: of suite ``worst``, for each agent and
+    task, with ``steps`` of training each.  ``references``: False leaves random policy, exact agents and oracle out.
     ``progress``: True shows it on standard output; a function receives each event, a dictionary.
 
     Raises ConfigError if there is no such agent or a setting is impossible, StoreError for a file that was not written

@@ -121,7 +121,7 @@ def _rounded(value: float) -> float:
 def table(found: Sequence[Mapping[str, Any]], title: str, adversaries: int, steps: int, episodes: int) -> Table:
     """One row for each p and agent; ``found``: ``summary``."""
     caption = (
-        f"for each agent and task, {adversaries} SAC adversaries are trained for {steps:,} steps against this agent alone, whose "
+        f"for each agent and task, {adversaries} SAC adversaries are trained for {steps:,} steps against this agent, whose "
         f"context is that of {statistics.counted(episodes, 'undisturbed episode')}.  Returns are means over "
         f"{statistics.counted(episodes, 'episode')} and over tasks.  mean: over the adversaries.  worst: of each task the "
         "adversary with the lowest mean, which lies below the lowest true mean, because means are noisy.  lowest: the worst of "

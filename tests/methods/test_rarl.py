@@ -11,7 +11,7 @@ import pytest
 
 import icrl_dist
 from icrl_dist.config.robust import RobustConfig
-from icrl_dist.config.run import ConfigError, Run, load_run
+from icrl_dist.config.run import ConfigError, Run, load_run, override
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import AdversaryConfig
 from icrl_dist.experts import cache
@@ -130,6 +130,10 @@ def test_only_what_decides_a_policy_is_in_its_key(run: Run) -> None:
         game = Game(strength, dataclasses.replace(robust, **changes), curriculum)
         return cache.key(Variation(task), HORIZON, sac, seed, "lockstep", game=game.key())
 
+    def qarl(name: str, value: float) -> str:
+        changes: dict[str, Any] = {name: value}
+        return key(curriculum=True, **changes)
+
     assert key() == key(bound=0.5) == key(rate=9.0), "RARL has no curriculum"
     others = [
         key(strength=0.6),
@@ -138,8 +142,8 @@ def test_only_what_decides_a_policy_is_in_its_key(run: Run) -> None:
         key(adversary_episodes=3),
         key(protagonist_episodes=3),
         key(curriculum=True),
-        *(key(curriculum=True, **{name: 2.0}) for name in ("first_concentration", "last_concentration", "rate", "divergence")),
-        *(key(curriculum=True, **{name: 0.25}) for name in ("bound", "most_temperature")),
+        *(qarl(name, 2.0) for name in ("first_concentration", "last_concentration", "rate", "divergence")),
+        *(qarl(name, 0.25) for name in ("bound", "most_temperature")),
         key(curriculum=True, teacher_episodes=4),
         cache.key(Variation(task), HORIZON, run.sac, 0, "lockstep"),
     ]
@@ -155,7 +159,7 @@ def test_tables_have_the_policies_of_the_evaluated_tasks_that_are_in_the_cache(r
     do(run, second)
     references = problem.references(run)
     assert list(references) == ["random", "rarl"] and not references["rarl"].ceiling
-    other = dataclasses.replace(run, robust=dataclasses.replace(run.section("robust"), adversary_episodes=3))
+    other = override(run, ["robust.adversary_episodes=3"], "x")
     assert list(problem.references(other)) == ["random"]
     rows = [Variation(task) for task in problem.evaluated]
     env = problem.batch(rows)
@@ -210,6 +214,11 @@ def test_a_problem_without_a_second_player_is_refused_in_one_line(problem: str, 
     name = load_run(problem).problem
     remedy = f"{name} has no second player, which {method} trains as adversary: use dpt or icag"
     assert str(caught.value) == f"{problem}: method = {method!r}: {remedy}"
+
+
+def test_a_run_that_would_keep_no_policy_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"^dmc-reacher-easy-laptop: sac.cache = '': rarl keeps its policies only there"):
+        load_run("dmc-reacher-easy-laptop", "method=rarl", "sac.cache=")
 
 
 def test_a_strength_that_is_not_known_is_refused_with_the_remedy() -> None:

@@ -13,7 +13,7 @@ from icrl_dist.config.sac import SACConfig
 from icrl_dist.config.sections import EvaluateConfig
 from icrl_dist.experts.adversarial import worst_case
 from icrl_dist.experts.cache import expert_seed
-from icrl_dist.interfaces import Batch, Reference
+from icrl_dist.interfaces import Batch, MakePolicy, Reference
 from icrl_dist.problems import registry
 from icrl_dist.problems.continuous.config import ControlConfig
 from icrl_dist.results import heldout, worst
@@ -57,7 +57,10 @@ def reacher(small_run: Run) -> Run:
 
 @pytest.mark.integration
 def test_rows_are_those_of_adversaries_that_a_loop_trains_one_after_another(reacher: Run) -> None:
-    agents = {Agent("t0", "paper", 0, "digest"): counting, Agent("rarl"): Reference(counting)}
+    agents: dict[Agent, MakePolicy | Reference] = {
+        Agent("t0", "paper", 0, "digest"): counting,
+        Agent("rarl"): Reference(counting),
+    }
     made = frame(*worst.blocks(reacher, agents, 2, STEPS, "run"), suite="worst")
     problem = registry.of(reacher)
     assert set(zip(made["agent"], made["data"], strict=True)) == {
@@ -96,7 +99,10 @@ def test_the_summary_has_the_mean_and_the_worst_of_each_tasks_adversaries(
         return worst_case.Returns(rng.random((len(seeds), episodes)), np.zeros((len(seeds), episodes), bool))
 
     monkeypatch.setattr(worst_case, "against", against)
-    agents = {Agent("t0", "paper", 0, "digest"): counting, Agent("expert"): Reference(counting, ceiling=True)}
+    agents: dict[Agent, MakePolicy | Reference] = {
+        Agent("t0", "paper", 0, "digest"): counting,
+        Agent("expert"): Reference(counting, ceiling=True),
+    }
     made = frame(*worst.blocks(reacher, agents, 2, STEPS, "run"), suite="worst")
     found = worst.summary(made)
     assert [(row["p"], row["key"]) for row in found] == [(0.5, "t0"), (0.5, "expert")]

@@ -75,7 +75,7 @@ def load(task: Task, horizon: int, sac: SACConfig, seed: int, game: Game) -> Rob
         return None
     for trainer in ("lockstep", "lockstep, cuda"):
         try:
-            path = cache.file(sac, _file_key(task, horizon, sac, seed, game, trainer))  # type: ignore[arg-type]
+            path = cache.file(sac, _file_key(task, horizon, sac, seed, game, trainer))
             if path.exists():
                 return Robust(**load_checkpoint(path).arrays)
         except (StoreError, OSError, TypeError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,8 @@ def test_the_divergence_is_the_integral(shape: float, other: float) -> None:
 def test_the_teachers_update_is_scipys_optimum_over_concentration_and_rate(old: float, target: float, most: float) -> None:
     """The rate is free in scipy's problem: that it stays is a result, not a restriction."""
     rate = 1000.0
-    best = optimize.minimize(
+    minimize: Any = optimize.minimize  # its stubs know fewer forms of constraints
+    best = minimize(
         lambda x: general_divergence(math.exp(x[0]), math.exp(x[1]), target, rate),
         [math.log(old), math.log(rate)],
         method="SLSQP",
@@ -118,7 +120,7 @@ def test_temperature_is_the_last_component_and_0_is_in_its_range() -> None:
     np.testing.assert_array_equal(at_test[:, :2], observation)
     assert not at_test[:, 2].any() and at_test.dtype == np.float32
     np.testing.assert_array_equal(
-        curriculum.appended(observation, np.array([0.1, 0.2, 0.3]))[:, 2], np.float32([0.1, 0.2, 0.3])
+        curriculum.appended(observation, np.array([0.1, 0.2, 0.3]))[:, 2], np.array([0.1, 0.2, 0.3], np.float32)
     )
 
 

@@ -66,7 +66,7 @@ def test_both_replays_hold_every_step_and_the_rewards_are_opposite(which: str) -
     np.testing.assert_array_equal(own[..., :S], theirs[..., :S])
     np.testing.assert_array_equal(own[..., S + 1], -theirs[..., S + 2])
     np.testing.assert_array_equal(own[..., S + 2 :], theirs[..., S + 3 :])
-    moved = own[..., 0] + np.float32([1.0, 2.0])[:, None] * own[..., S] + theirs[..., S] - theirs[..., S + 1]
+    moved = own[..., 0] + np.array([[1.0], [2.0]], np.float32) * own[..., S] + theirs[..., S] - theirs[..., S + 1]
     np.testing.assert_allclose(own[..., S + 2], moved, atol=1e-5)
     np.testing.assert_allclose(own[..., S + 1], own[..., S + 2], atol=1e-6)
     if extra:
@@ -95,7 +95,7 @@ def test_at_test_the_protagonist_of_qarl_is_given_the_temperature_0() -> None:
     players, observation = players_of("qarl"), np.random.default_rng(0).normal(size=(2, 5, 2)).astype(np.float32)
     with_zero = np.concatenate([observation, np.zeros((2, 5, 1), np.float32)], axis=2)
     np.testing.assert_array_equal(players.act(observation), players.protagonist.act(with_zero))
-    assert (players.act(observation) != players.protagonist.act(with_zero + np.float32([0, 0, 0.05]))).any()
+    assert (players.act(observation) != players.protagonist.act(with_zero + np.array([0, 0, 0.05], np.float32))).any()
 
 
 # The adversary's given temperature.

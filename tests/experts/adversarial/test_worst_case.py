@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def test_an_adversary_does_not_depend_on_the_other_rows_and_its_number_changes_i
 
 @pytest.mark.integration
 def test_an_adversary_learns_to_push_with_its_whole_strength_and_no_policy_is_worse_off_without_it() -> None:
-    rates = {"actor_rate": 1e-2, "critic_rate": 1e-2, "temperature_rate": 1e-2}
+    rates: dict[str, Any] = {"actor_rate": 1e-2, "critic_rate": 1e-2, "temperature_rate": 1e-2}
     sac = SACConfig(hidden=(16,), batch=32, random_steps=70, warmup=70, update_every=1, replay=2000, gamma=0.9, **rates)
     steps, seeds = 900, [worst_case.adversary_seed(0, number) for number in range(2)]
     reported = list[int]()
