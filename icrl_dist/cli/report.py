@@ -28,7 +28,8 @@ class ReportArguments:
     """One figure.  ``2``: return lost under p = 0.2.  ``3``: all methods offline (``3a``), online (``3b``), against p
     (``3c``), with unseen priors (``3d``).  ``6``: the same for ICAG with K = 4, 8, 16.  ``7``: ICAA after each round
     beside ICAG (``7a``, ``7b``).  ``strength``: return against p in the settings wind and permuted.
-    ``deployment``: each method by each of its rules.  ``budgets``: the table of equal budgets."""
+    ``deployment``: each method by each of its rules.  ``budgets``: the table of equal budgets.  ``digests``: the table of
+    all trainings with their digests."""
     claims: bool = False
     """Print the paper's claims one by one, with effect sizes, intervals over training seeds and verdicts, and the table of
     ICAA's rounds."""

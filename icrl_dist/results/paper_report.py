@@ -14,7 +14,7 @@ from icrl_dist.config.toml import nearest
 from icrl_dist.results import page
 from icrl_dist.results.claims import costs, icaa, labels, questions
 from icrl_dist.results.claims import sheets as claim_sheets
-from icrl_dist.results.figures import budgets, catalog, sheets, styles
+from icrl_dist.results.figures import catalog, sheets, styles
 from icrl_dist.results.figures.panels import data
 from icrl_dist.results.figures.reading import BUDGETS, Rows, files_of
 from icrl_dist.results.figures.selection import Rules, Study, is_inferred, study
@@ -143,8 +143,8 @@ def _figure(
 ) -> tuple[Section, list[Path]]:
     """One figure and its files, whose names begin with ``prefix``."""
     path = folder / f"{prefix}figure-{name}"
-    if name == catalog.BUDGETS:
-        table = budgets.sheet(study(rows, setting, rules))
+    if name in catalog.TABLES:
+        table = catalog.TABLES[name](study(rows, setting, rules))
         written = [path.with_suffix(".md"), path.with_suffix(".json")]
         atomic_write(written[0], lambda file: file.write(table.markdown().encode()))
         write_json(written[1], table.data())
@@ -201,7 +201,7 @@ def _whole(rows: Rows, files: Sequence[Path], setting: str | None, rules: Rules,
     for name in settings:
         of = study(rows, name, rules)
         tables += _tables(of, costs.ledger(files), refused)
-        for figure in ("strength", catalog.BUDGETS) if is_inferred(name) else (f for f in catalog.WHOLE if f != "strength"):
+        for figure in ("strength", *catalog.TABLES) if is_inferred(name) else (f for f in catalog.WHOLE if f != "strength"):
             try:
                 section, made = _figure(rows, name, lenient, figure, folder, f"{name}-" if name else "")
             except ConfigError as error:

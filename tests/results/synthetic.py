@@ -113,3 +113,10 @@ def write(folder: Path, *sweeps: Sweep, offline: bool = True) -> Path:
     path = folder / "rows.parquet"
     pq.write_table(pa.concat_tables([pq.read_table(file) for file in files]), path)
     return path
+
+
+def small(folder, *, seeds=6, mean=plain, agents=None, columns=None, levels=(0.0, 0.2), **others):
+    """The rows of a small sweep, online only."""
+    chosen = agents or {"dpt": ("t0",), "icag": ("t0",), "icaa": ("t0", "t1"), "mix_dpt": ("t0",), "prompt_dt": ("t0",)}
+    options = {"goals": 2, "evaluations": 1, "episodes": 2} | others
+    return Sweep(mean, chosen, "room", seeds, columns=columns or {}, levels=levels, **options)

@@ -24,7 +24,7 @@ from icrl_dist.results.figures.selection import Rules, study
 from icrl_dist.results.paper_report import report
 from icrl_dist.results.statistics import Interval
 from icrl_dist.storage.files import StoreError
-from tests.results.synthetic import AGENTS, Sweep, plain, write
+from tests.results.synthetic import AGENTS, Sweep, plain, small, write
 
 WIND = {name: AGENTS[name] for name in ("dpt", "icag", "icaa", "exact")}
 
@@ -38,13 +38,6 @@ def sweep(tmp_path_factory):
 @pytest.fixture(scope="module")
 def frame(sweep):
     return pq.read_table(sweep).to_pandas()
-
-
-def small(folder, *, seeds=6, mean=plain, agents=None, columns=None, levels=(0.0, 0.2), **others):
-    """The rows of a small sweep, online only."""
-    chosen = agents or {"dpt": ("t0",), "icag": ("t0",), "icaa": ("t0", "t1"), "mix_dpt": ("t0",), "prompt_dt": ("t0",)}
-    options = {"goals": 2, "evaluations": 1, "episodes": 2} | others
-    return Sweep(mean, chosen, "room", seeds, columns=columns or {}, levels=levels, **options)
 
 
 def slow(frame, variant, agent, p, prior, episodes, suite="online", data=""):
@@ -394,18 +387,23 @@ def test_the_page_needs_no_other_file_and_no_network(tmp_path):
 
 def test_deployment_rules_are_shown_beside_each_other(tmp_path):
     agents = {"dpt": ("t0",), "icag": ("t0",)}
+    exact = {"exact": ("exact:dpt", "exact:dpt-committed")}
 
     def mean(variant, agent, p):
         return 50.0 - 10.0 * p
 
-    paper = small(tmp_path, agents=agents, mean=mean)
-    own = small(
+    frozen = small(tmp_path, agents={**agents, **exact}, mean=mean)
+    growing = small(
         tmp_path, agents=agents, mean=lambda *of: mean(*of) + 7, columns={name: {"deployment": "committed"} for name in agents}
     )
-    rows = Rows([write(tmp_path, paper, own, offline=False)])
+    rows = Rows([write(tmp_path, frozen, growing, offline=False)])
     panels = catalog.numbers("deployment", rows, None, Rules())
-    found = {name: point(panels, "deployment", f"ICAG, {name}", "p = 0.2").value.value for name in ("Algorithm 1", "committed")}
-    assert found["committed"] - found["Algorithm 1"] == pytest.approx(7, abs=0.1)
+    for panel in ("deployment", "deployment (all)"):
+        paper, own = (point(panels, panel, f"ICAG, {rule}", "p = 0.2").value.value for rule in ("Algorithm 1", "committed"))
+        assert own - paper == pytest.approx(7, abs=0.1)
+    ranks = {one.name: one.rank for one in panels[0].series}
+    assert (ranks["ICAG, Algorithm 1"], ranks["ICAG, committed"]) == (0, 1), "two shades of one colour"
+    assert (ranks["exact, DPT's prior"], ranks["exact, DPT's prior, committed"]) == (0, 1)
     shown = study(rows, None, Rules()).model("icag", 0.2)
     assert shown is not None and shown.key.deployment == "paper", "other figures show Algorithm 1"
 
@@ -416,35 +414,6 @@ def test_a_figure_with_some_panels_names_the_others(tmp_path):
     text = str(report(path, figure="3", out=tmp_path, partial=True))
     assert "**3b: " in text and "**3a: " not in text
     assert "Left out: figure 3a: rows are missing; these runs make them: room/dpt, seeds 0 to 5 (evaluated at offline" in text
-
-
-def test_the_budgets_of_a_single_variant_are_called_equal_to_nothing(tmp_path):
-    path = write(tmp_path, small(tmp_path, agents={"dpt": ("t0",)}), offline=False)
-    (section,) = report(path, figure="budgets", out=tmp_path / "report").sections
-    assert "A single variant: nothing is compared." in section.sheets[0].caption and "Equal" not in section.sheets[0].caption
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_the_budgets_name_the_steps_of_ardts_return_nets(tmp_path, known):
-    path = write(tmp_path, small(tmp_path, agents={"dpt": ("t0",), "ardt": ("t0",)}), offline=False)
-    if known:
-        runs = [
-            {"setting": "room", "variant": "ardt", "seed": seed, "budget": {"extra_steps": 2500, "optimizer_steps": 300}}
-            for seed in range(6)
-        ]
-        (tmp_path / "runs.json").write_text(json.dumps(runs))
-    (section,) = report(path, figure="budgets", out=tmp_path / "report").sections
-    number = "2,500" if known else "ardt.steps"
-    assert f"the return nets of ardt take {number} smaller steps beside its optimizer steps" in section.sheets[0].caption
-
-
-def test_small_differences_of_budgets_are_named(tmp_path):
-    columns = {"icag": {"environment_steps": 1950}}
-    path = write(tmp_path, small(tmp_path, columns=columns), offline=False)
-    assert "environment_steps is 1,950 of icag and 2,000 of dpt" in str(report(path, figure="2", out=tmp_path))
-    wide = small(tmp_path, columns={"icag": {"environment_steps": 1790}})
-    with pytest.raises(ConfigError, match="environment_steps is 1790 of room/icag"):
-        report(write(tmp_path / "wide", wide, offline=False), figure="2", out=tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from icrl_dist.config.run import ConfigError
 from icrl_dist.config.toml import nearest
-from icrl_dist.results.figures import deployment, figure2, figure3, figure6, figure7, strength
+from icrl_dist.results.figures import budgets, deployment, digests, figure2, figure3, figure6, figure7, strength
 from icrl_dist.results.figures.panels import Panel
 from icrl_dist.results.figures.reading import Rows
-from icrl_dist.results.figures.selection import INFERRED, MissingError, Rules, is_inferred, study
+from icrl_dist.results.figures.selection import INFERRED, MissingError, Rules, Study, is_inferred, study
+from icrl_dist.results.markup import Sheet
 
 _FIGURES = {"2": figure2, "3": figure3, "6": figure6, "7": figure7, "strength": strength, "deployment": deployment}
 _LETTERS = {"3": "abcd", "6": "abcd", "7": "ab"}
-BUDGETS = "budgets"
-"""The name of the table of budgets."""
-WHOLE = (*_FIGURES, BUDGETS)
+TABLES: Mapping[str, Callable[[Study], Sheet]] = {"budgets": budgets.sheet, "digests": digests.sheet}
+"""What is a table and no picture."""
+WHOLE = (*_FIGURES, *TABLES)
 """The names of whole figures, in the order of a report."""
-NAMES = (*(name + letter for name in _FIGURES for letter in ("", *_LETTERS.get(name, ""))), BUDGETS)
+NAMES = (*(name + letter for name in _FIGURES for letter in ("", *_LETTERS.get(name, ""))), *TABLES)
 """All names of ``--figure``."""
 
 
@@ -38,7 +39,7 @@ def _parts(name: str) -> tuple[str, str]:
 
 
 def numbers(name: str, rows: Rows, setting: str | None, rules: Rules) -> list[Panel]:
-    """The panels of a figure other than ``budgets``.
+    """The panels of a figure that is no table.
 
     ``setting``: None for the only one; of figure ``strength`` for all in which the disturbance must be inferred.  Raises
     ConfigError for an unknown figure, for rows that are missing (with the runs that make them) and for rows that may

@@ -15,7 +15,10 @@ _RULES = {"committed": "committed", "paper": "Algorithm 1"}
 
 
 def numbers(study: Study, letter: str = "") -> list[Panel]:
-    """One panel of bars in groups by p: each method by each of its rules, and the exact agents by both."""
+    """Bars in groups by p: each method by each of its rules, and the exact agents by both.
+
+    One panel for the last episodes, and one for all, in which rules that learn within an episode are ahead.
+    """
     choices = []
     for method in METHODS:
         variant = study.variant(method)
@@ -35,7 +38,13 @@ def numbers(study: Study, letter: str = "") -> list[Panel]:
     spots = [Spot(p, group=f"p = {p:g}") for p in shown_levels]
     shown, note = entries(study, "figure deployment", [*choices, *exact], spots)
     arms = [arm for entry in shown for arm in entry.arms]
-    last = min(LAST, arms[0].returns.shape[3])
-    caption = panels.resampled(arms, last)
-    panel = Panel("deployment", f"last {last} episodes", "bars", "", "return", panels.bars(shown, last), caption)
-    return [panels.with_note(panel, note)]
+    episodes = arms[0].returns.shape[3]
+    found: list[Panel] = []
+    for suffix, last, text in (
+        ("", min(LAST, episodes), f"last {min(LAST, episodes)}"),
+        (" (all)", episodes, f"all {episodes}"),
+    ):
+        title, caption = f"{text} episodes", panels.resampled(arms, last)
+        panel = Panel(f"deployment{suffix}", title, "bars", "", "return", panels.bars(shown, last), caption)
+        found.append(panels.with_note(panel, note))
+    return found

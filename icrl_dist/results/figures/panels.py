@@ -130,9 +130,9 @@ def _lost(scores: Float64[np.ndarray, "R 2 S C"]) -> Float64[np.ndarray, "R 3"]:
 
 
 def ranked(series: Sequence[Series]) -> list[Series]:
-    """The series with their ranks among those of equal style."""
-    styles = [one.style for one in series]
-    return [one._replace(rank=styles[:i].count(one.style)) for i, one in enumerate(series)]
+    """The series with their ranks among those of equal style; an exact agent and its ``-committed`` have one style."""
+    styles = [one.style.removesuffix("-committed") for one in series]
+    return [one._replace(rank=styles[:i].count(style)) for i, (one, style) in enumerate(zip(series, styles, strict=True))]
 
 
 def resampled(arms: Sequence[Arm], last: int = LAST) -> str:
