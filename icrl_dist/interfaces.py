@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from icrl_dist.config.run import Deployment, Run
     from icrl_dist.config.sections import AdversaryConfig, ContextConfig
     from icrl_dist.problems.benchmarks import Benchmarks
-    from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite
+    from icrl_dist.problems.parts import Certificate, MakeGame, PosteriorSuite, SecondPlayer
 
 __all__ = ["Batch", "EndsRun", "Link", "Method", "Policy", "Problem"]
 
@@ -331,6 +331,13 @@ class Problem(abc.ABC):
         """Histories of a learning agent, of at most ``trials`` episodes in each variation, for Algorithm Distillation."""
         return None
 
+    def robust_contexts(self, run: Run) -> Contexts | None:
+        """``contexts`` with labels of the robust policy pi^rb of each task (eq. 4); None if the problem has no such policies.
+
+        Raises ConfigError, with the key and the remedy, if it has none with these settings.
+        """
+        return None
+
     @property
     def behaviors(self) -> Behaviors | None:
         """Behavior policies, which jobs of the kind ``behavior_context`` need."""
@@ -368,6 +375,11 @@ class Problem(abc.ABC):
     @property
     def certify(self) -> Certificate | None:
         """Exact returns of policies that are fixed within an episode, also against the worst adversary of a strength p."""
+        return None
+
+    @property
+    def second_player(self) -> SecondPlayer | None:
+        """The adversary as a player that can be trained against a policy, or together with one (RARL, QARL)."""
         return None
 
     @property
@@ -559,6 +571,8 @@ class Method(abc.ABC):
     """Frozen dataclass of that section; every field has a default."""
     trains: ClassVar[bool] = True
     """Whether it trains a model that can be deployed."""
+    product: ClassVar[str] = "expert"
+    """If it trains no model: the key, in result rows, of the policies that it trains."""
     shows_states: ClassVar[bool] = False
     """Whether its policy calls ``watch`` with the model's final hidden states, which the OOD score is computed from."""
 

@@ -23,29 +23,35 @@ class EvaluateArguments:
     pretrained: str | None = None
     """Instead, the name of an agent that is part of the package: ``darkroom``.  Its report is
     written to runs/NAME-pretrained."""
-    suite: Literal["online", "offline", "posterior", "attack"] = "online"
+    suite: Literal["online", "offline", "posterior", "attack", "worst"] = "online"
     """``online``: consecutive episodes from an empty context.  ``offline``: one episode, given the
     context of a random or an expert episode (Algorithm 1).  ``posterior``: KL divergence of its action
     distribution from the exact posterior's, in nats, and the difference of its return to the exact agent's.
     ``attack``: the return of one episode, given its context, without adversary, under sampled ones and under the
-    worst one of strength p, which is exact for Algorithm 1 (Dark Room)."""
+    worst one of strength p, which is exact for Algorithm 1 (Dark Room).  ``worst``: the return under SAC adversaries that
+    are trained against each agent (DeepMind Control); it takes as long as training that many experts."""
     deploy: Deployment | None = None
     """``paper``: Algorithm 1, the context is fixed within an episode.  ``committed``: every transition
     joins the context at once, and the agent's own recent actions are its action window.  ``growing``: every
     transition joins the context at once.  Default: ``committed`` for an agent trained on action windows
-    (model.window), ``growing`` for one of the method ``ad``, else ``paper``.  The posterior suite always
-    uses ``paper``."""
+    (model.window), ``growing`` for one of the method ``ad``, else ``paper``.  The suites posterior and worst
+    always use ``paper``."""
     episodes: int | None = None
     """Online episodes.  Default: the run's number (posterior: 40)."""
     seeds: int | None = None
     """Evaluations per task.  Default: the run's number (posterior: 4).  Each evaluation of a task has a test
     adversary of its own."""
     p: tuple[float, ...] = ()
-    """Probabilities p of a disturbed step to test.  Default: the run's (posterior: 0 0.2 0.4 0.6; attack: those above 0)."""
+    """Probabilities p of a disturbed step to test.  Default: the run's (posterior: 0 0.2 0.4 0.6; attack, worst: those above
+    0)."""
     prior: Literal["uniform", "unseen"] | None = None
     """Distribution of the test adversaries.  Default: the run's (posterior: uniform)."""
     draws: int = 8
     """Suite ``attack``: adversaries that are sampled from the unseen prior."""
+    adversaries: int = 3
+    """Suite ``worst``: adversaries for each agent and task."""
+    steps: int = 50_000
+    """Suite ``worst``: environment steps of the training of each adversary; the other settings are those of ``[sac]``."""
     references: bool = True
     """Also evaluate random policy, exact agents and oracle."""
     json: bool = False
@@ -64,7 +70,8 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     if arguments.pretrained is not None:
         shipped(arguments.pretrained)  # a name of the package only, never that of a folder
     options = {
-        name: getattr(arguments, name) for name in ("suite", "deploy", "episodes", "seeds", "prior", "draws", "references")
+        name: getattr(arguments, name)
+        for name in ("suite", "deploy", "episodes", "seeds", "prior", "draws", "adversaries", "steps", "references")
     }
     with Display(console) as display:
         found = suites.evaluate(what, **options, p=arguments.p or None, progress=display.report)

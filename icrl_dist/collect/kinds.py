@@ -9,6 +9,8 @@ from typing import Any
 
 from icrl_dist.collect.adapt import LabelledRollouts, Look, Rollouts, rollouts
 from icrl_dist.collect.behavior import BehaviorContexts, behavior_contexts
+from icrl_dist.collect.robust import robust_labels, train_robust
+from icrl_dist.experts.adversarial.payloads import RobustlyLabelledHistories, RobustPolicies
 from icrl_dist.experts.payloads import ExpertHistories
 from icrl_dist.experts.train import train_expert
 from icrl_dist.interfaces import JobKind, Method, Problem, Progress, WeightSource, no_progress
@@ -19,6 +21,8 @@ from icrl_dist.types import Job, Payload, Trajectory
 _WITHOUT_MODEL: dict[str, JobKind] = {
     BehaviorContexts.kind: JobKind(BehaviorContexts, behavior_contexts),
     ExpertHistories.kind: JobKind(ExpertHistories, train_expert),
+    RobustPolicies.kind: JobKind(RobustPolicies, train_robust),
+    RobustlyLabelledHistories.kind: JobKind(RobustlyLabelledHistories, robust_labels),
 }
 _WITH_MODEL: dict[str, type[Payload]] = {kind.kind: kind for kind in (Rollouts, LabelledRollouts)}
 

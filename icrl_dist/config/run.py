@@ -60,9 +60,9 @@ class Run:
 
     method: str = "icag"
     """Method that trains the transformer: ``icag`` or ``icaa`` of section 4, or a baseline (``dpt``; ``mix_dpt``, which goes
-    on with its own histories; ``dr``, domain randomisation; ``prompt_dt`` and ``ardt``, decision transformers; ``ad``,
-    Algorithm Distillation).  ``experts`` trains no transformer: it only trains and stores the SAC experts of a continuous
-    problem, for later runs."""
+    on with its own histories; ``dr``, domain randomisation; ``ic2rl``, labels of robust policies; ``prompt_dt`` and
+    ``ardt``, decision transformers; ``ad``, Algorithm Distillation).  ``experts`` trains no transformer: it only trains
+    and stores the SAC experts of a continuous problem, for later runs."""
     seed: Seed = 0
     """Seed of every random draw of the run."""
     problem: str = "darkroom"

@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import tempfile
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Literal, get_args
@@ -93,9 +94,18 @@ def recorded_episodes(horizon: int, config: SACConfig, trials: int = 1) -> int:
     return episodes if trials > RECORDED_EPISODES else min(RECORDED_EPISODES, episodes)
 
 
-def key(variation: Variation, horizon: int, config: SACConfig, seed: int, trainer: Trainer, trials: int = 1) -> str:
+def key(
+    variation: Variation,
+    horizon: int,
+    config: SACConfig,
+    seed: int,
+    trainer: Trainer,
+    trials: int = 1,
+    game: Mapping[str, object] | None = None,
+) -> str:
     """Cache key of a history: the SHA-256 of all that determines it, as JSON with sorted keys.
 
+    ``game``: of a robust policy, the settings of its training against an adversary that learns.
     Floats have their shortest exact form.  No name of a file, module or class is part of it.
     """
     task, adversary = variation.task, variation.adversary
@@ -114,6 +124,7 @@ def key(variation: Variation, horizon: int, config: SACConfig, seed: int, traine
         "window_episodes": WINDOW_EPISODES,
         "libraries": {name: metadata.version(name) for name in libraries},
         "plugin": [source.distribution, source.version] if source else None,
+        **({} if game is None else {"game": dict(game)}),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
 

@@ -64,10 +64,15 @@ class ExpertHistories(Payload):
 
         An expert acts in ``WINDOW_EPISODES`` episodes also if no action windows are cut from them.
         """
-        training = max(1, self.sac.steps // horizon)
-        checkpoints = len(checkpoint_numbers(self.sac, training))
-        compared = checkpoints * self.sac.checkpoint_episodes if checkpoints > 1 else 0
-        return (training + compared + max(WINDOW_EPISODES, self.labelling.window_episodes)) * horizon
+        return self.training_steps(self.sac, horizon) + max(WINDOW_EPISODES, self.labelling.window_episodes) * horizon
+
+    @staticmethod
+    def training_steps(sac: SACConfig, horizon: int) -> int:
+        """The steps of an expert's training in whole episodes, and of the comparison of its checkpoints."""
+        training = max(1, sac.steps // horizon)
+        checkpoints = len(checkpoint_numbers(sac, training))
+        compared = checkpoints * sac.checkpoint_episodes if checkpoints > 1 else 0
+        return (training + compared) * horizon
 
 
 @dataclass(frozen=True)

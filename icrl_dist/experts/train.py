@@ -54,7 +54,7 @@ def train_expert(job: Job, problem: Problem, worker: str, progress: Progress = n
     """
     payload = job.payload
     assert isinstance(payload, ExpertHistories)
-    found = _histories(job, problem, payload.sac, progress)
+    found = histories(job, problem, payload.sac, progress)
     if standing.labels_come_from_experts(problem):
         standings = standing.of(job.rows(), job.variations, found, payload.sac)
         if payload.sac.failed_experts == "refuse":
@@ -64,7 +64,7 @@ def train_expert(job: Job, problem: Problem, worker: str, progress: Progress = n
     yield from history_trajectories(job, problem, payload.labelling, found, worker, _mean_actions(found, payload.sac))
 
 
-def _histories(job: Job, problem: Problem, config: SACConfig, progress: Progress) -> list[History]:
+def histories(job: Job, problem: Problem, config: SACConfig, progress: Progress) -> list[History]:
     """The history of each variation of the job, from the cache; those that are missing are trained and cached."""
     backend, horizon = sac_backend(len(job.variations)), problem.spec_of(job.variations[0].task).horizon
     trainer = _trainer(backend)
@@ -77,13 +77,13 @@ def _histories(job: Job, problem: Problem, config: SACConfig, progress: Progress
         )
     if missing:
         if reason := cache.unusable(config):  # found before the training, which may take hours
-            config = _without_cache(config, reason, progress)
+            config = without_cache(config, reason, progress)
         for variation, history in zip(missing, _train(job, problem, missing, backend, config, progress), strict=True):
             found[variation] = history
             try:
                 cache.save(history, variation, horizon, config, job.seed, trainer, job.trials)
             except StoreError as error:
-                config = _without_cache(config, cache.unusable(config) or str(error), progress)
+                config = without_cache(config, cache.unusable(config) or str(error), progress)
     return [found[variation] for variation in job.variations]
 
 
@@ -91,7 +91,7 @@ _reported = set[str]()
 """Caches that cannot be used and were reported by this process."""
 
 
-def _without_cache(config: SACConfig, reason: str, progress: Progress) -> SACConfig:
+def without_cache(config: SACConfig, reason: str, progress: Progress) -> SACConfig:
     """The section without its cache, which cannot be used; the first time, a note says so."""
     if config.cache not in _reported:
         _reported.add(config.cache)
@@ -148,11 +148,11 @@ def _train(
     checkpoints.choose(env, seeds, experts, lambda text: progress(f"{job.label}: {text}", reached=experts.steps))
     columns = with_labels(recorder.columns(), problem, experts.act)
     windows = window_episodes(env, problem, experts.act, seeds, range(env.batch))
-    histories = make_histories(job, variations, columns, windows, experts.arrays["actor"].cpu().numpy(), progress)
+    made = make_histories(job, variations, columns, windows, experts.arrays["actor"].cpu().numpy(), progress)
     if part is not None:
         with contextlib.suppress(OSError):
             part.unlink()
-    return histories
+    return made
 
 
 def make_histories(
@@ -168,7 +168,7 @@ def make_histories(
     ``columns``: training episodes; ``windows``: episodes of ``window_episodes``; ``actors``: parameters per
     variation.  Raises RuntimeError for a variation without any other episode.
     """
-    parts, histories = {"": columns, "window_": windows}, []
+    parts, made = {"": columns, "window_": windows}, []
     for row, variation in enumerate(variations):
         whole = {prefix: part["whole"][row] for prefix, part in parts.items()}
         diverged = sum(int((~one).sum()) for one in whole.values())
@@ -184,8 +184,8 @@ def make_histories(
             for name, column in part.items()
             if name != "whole"
         }
-        histories.append(History(**arrays, actor=actors[row]))
-    return histories
+        made.append(History(**arrays, actor=actors[row]))
+    return made
 
 
 def _load_training(part: Path, recorder: Recorder, checkpoints: Checkpoints) -> dict[str, np.ndarray] | None:
@@ -202,13 +202,18 @@ def _load_training(part: Path, recorder: Recorder, checkpoints: Checkpoints) -> 
 
 def _mean_actions(histories: Sequence[History], config: SACConfig) -> Act:
     """The mean actions of the experts of these histories."""
+    first = histories[0]
+    widths = first.observations.shape[-1], first.actions.shape[-1]
+    return mean_actions(np.stack([history.actor for history in histories]), widths, config)
+
+
+def mean_actions(actors: Float32[np.ndarray, "N P"], widths: tuple[int, int], config: SACConfig) -> Act:
+    """The mean actions of N actors; ``widths``: components of an observation and of an action."""
     import torch
 
     from icrl_dist.experts.sac.stacked import Shape
 
-    first = histories[0]
-    sizes = first.observations.shape[-1], *config.hidden, 2 * first.actions.shape[-1]
-    return functools.partial(_mean, Shape(sizes), torch.from_numpy(np.stack([history.actor for history in histories])))
+    return functools.partial(_mean, Shape((widths[0], *config.hidden, 2 * widths[1])), torch.from_numpy(actors))
 
 
 def _mean(shape: Shape, actors: torch.Tensor, states: np.ndarray) -> np.ndarray:
@@ -220,19 +225,26 @@ def _mean(shape: Shape, actors: torch.Tensor, states: np.ndarray) -> np.ndarray:
     return mean
 
 
-class ExpertPolicy:
-    """The experts of B variations, one per row; they act by their mean actions."""
+class MeanPolicy:
+    """Actors of B environments, one per row; they act by their mean actions."""
 
-    def __init__(self, histories: Sequence[History], config: SACConfig) -> None:
-        self._act = _mean_actions(histories, config)
+    def __init__(self, act: Act) -> None:
+        self._act = act
 
     def act(self, observation: Float32[np.ndarray, "B S"], u: np.ndarray) -> Float32[np.ndarray, "B A"]:
-        """The mean action of each expert."""
+        """The mean action of each actor."""
         mean: Float32[np.ndarray, "B A"] = self._act(observation[:, None])[:, 0]
         return mean
 
     def observe(self, *transition: object) -> None:
         """Does nothing: the policy does not learn."""
+
+
+class ExpertPolicy(MeanPolicy):
+    """The experts of B variations, one per row."""
+
+    def __init__(self, histories: Sequence[History], config: SACConfig) -> None:
+        super().__init__(_mean_actions(histories, config))
 
 
 class ScriptedPolicy:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from icrl_dist.collect.adapt import LabelledRollouts, Rollouts
 from icrl_dist.config.run import Run
 from icrl_dist.config.sections import Deployment
-from icrl_dist.interfaces import Phase
+from icrl_dist.interfaces import Contexts, Phase
 from icrl_dist.problems import registry
 from icrl_dist.types import Job, Payload, Task, Variation
 
@@ -16,15 +16,17 @@ Choose = Callable[[int, Task], tuple[Variation, ...]]
 """The variations of training task number i."""
 
 
-def pretraining_contexts(run: Run, phase: Phase, choose: Choose) -> tuple[Job, ...]:
+def pretraining_contexts(run: Run, phase: Phase, choose: Choose, contexts: Contexts | None = None) -> tuple[Job, ...]:
     """Algorithm 2, lines 4 to 14: for every task, contexts and labels in every variation.
+
+    ``contexts``: how they are collected; None: as ``Problem.contexts`` says.
 
     The variations divide ``pretrain.contexts`` episodes among them, so all methods and all K get the same number.
     """
     problem = registry.of(run)
     chosen = [choose(i, task) for i, task in enumerate(problem.split.train)]
     trials = max(1, run.pretrain.contexts // sum(map(len, chosen)))
-    contexts = problem.contexts(run)
+    contexts = problem.contexts(run) if contexts is None else contexts
     if contexts.most_trials is not None:
         trials = min(trials, contexts.most_trials)
     return grouped(run, phase, chosen, trials, contexts.payload)

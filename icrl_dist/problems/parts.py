@@ -1,4 +1,4 @@
-"""Optional parts of a problem with interfaces of their own: ``Problem.posterior``, ``Problem.game``, ``Problem.certify``."""
+"""Optional parts of a problem with interfaces of their own: ``posterior``, ``game``, ``certify`` and ``second_player``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from icrl_dist.interfaces import MakePolicy
-from icrl_dist.types import Variation
+from icrl_dist.types import Spec, Step, Task, Variation
 
 if TYPE_CHECKING:
     from icrl_dist.agent.in_context_agent import InContextAgent
@@ -89,6 +89,37 @@ class Certificate(Protocol):
 
     def expected(self, policies: Float[np.ndarray, "P C A"], variations: Sequence[Variation]) -> Float64[np.ndarray, " B"]:
         """Under the adversary of each variation."""
+        ...
+
+
+class TwoPlayerBatch(Protocol):
+    """B tasks stepped together, in which agent and adversary act simultaneously."""
+
+    spec: Spec
+    """The agent's spec; the adversary has the same observations."""
+    batch: int
+    disturbance: int
+    """Components of the adversary's action, F."""
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
+        """Start an episode in every row."""
+        ...
+
+    def step(self, actions: Float32[np.ndarray, "B A"], disturbances: Float32[np.ndarray, "B F"]) -> Step:
+        """Execute both actions in every row, each in [-1, 1].  Raises RuntimeError past the horizon."""
+        ...
+
+
+class SecondPlayer(Protocol):
+    """``Problem.second_player``: the adversary as a player that can be trained."""
+
+    @property
+    def strength(self) -> float:
+        """Strength of its largest action with the problem's settings.  Raises ConfigError if it is not known."""
+        ...
+
+    def batch(self, tasks: Sequence[Task], strength: float) -> TwoPlayerBatch:
+        """These tasks; a disturbance of 1 has this strength."""
         ...
 
 

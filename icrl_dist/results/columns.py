@@ -49,7 +49,7 @@ COLUMNS: dict[str, Column] = {
     "labelled_episodes": Column("int64", "those of them whose labels the fits used; null if not known", True),
     "environment_steps": Column("int64", "environment steps of the training, of demonstrations too; null if not known", True),
     "optimizer_steps": Column("int64", "optimizer steps of the in-context model; null if not known", True),
-    "suite": Column("string", "`online`, `offline`, `posterior`, `attack`, `label_quality` or `experts`"),
+    "suite": Column("string", "`online`, `offline`, `posterior`, `attack`, `worst`, `label_quality` or `experts`"),
     "tasks": Column("string", "the tasks: `evaluated` (of the online evaluation), `test` or `train`"),
     "agent": Column("string", "key of the agent: `t2` is T^2; other keys are those of reference agents"),
     "policy_version": Column("int64", "version of the weights; -1 for an agent without weights of this run"),
@@ -59,7 +59,8 @@ COLUMNS: dict[str, Column] = {
     "data": Column(
         "string",
         "in suite `offline`: whose episode the context holds, `random` or `expert`; in suite `label_quality`: what the trial "
-        "became, `context`, or `labels` if labels come from it or from trials as late; else empty",
+        "became, `context`, or `labels` if labels come from it or from trials as late; in suite `worst`: whether the agent's "
+        "context stayed as it was when its adversary was trained, `frozen`, or began empty, `adapting`; else empty",
     ),
     "prior": Column("string", "`evaluate.prior`: distribution of the test adversaries; empty if they are of training"),
     "task_index": Column("int64", "number of the task among `tasks`"),

@@ -23,6 +23,7 @@ from icrl_dist.problems import registry
 from icrl_dist.results import attack as attack_suite
 from icrl_dist.results import evaluate, rows, training_rows
 from icrl_dist.results import posterior as posterior_suite
+from icrl_dist.results import worst as worst_suite
 from icrl_dist.results.evaluate import Agent
 from icrl_dist.results.names import key_of
 from icrl_dist.storage.checkpoint import Checkpoint, save_checkpoint
@@ -182,6 +183,37 @@ def attack(
     return rows.record(results, "attack", settings, attack_suite.blocks(run, agents, draws, name_of(what), progress), unstored)
 
 
+def worst(
+    run: Run,
+    what: Path,
+    results: Path,
+    report: ReportEvent,
+    adversaries: int,
+    steps: int,
+    unstored: list[StoreError] | None = None,
+    with_references: bool = True,
+) -> pd.DataFrame:
+    """The rows of suite ``worst`` (``results.worst``) of the folder's models, by Algorithm 1, and of references.
+
+    ``unstored`` as in ``rows.record``.  References are those that tables have, without the random policy.
+    """
+    agents = _deployed(run, models(what, "paper"), "paper")
+    if with_references:
+        agents |= {agent: reference for agent, reference in _references(run).items() if agent.key != "random"}
+    total = len(agents) * len(run.evaluate.p)
+    order = [(agent.key, p) for agent in agents for p in run.evaluate.p]
+
+    def progress(agent: str, p: float, done: int) -> None:
+        step = order.index((agent, p)) * steps + done
+        report(
+            {"event": "progress", "stage": "evaluate", "phase": "steps of adversaries", "step": step, "steps": total * steps}
+        )
+
+    settings = f"{report_name(run, what, 'worst', 'paper')}-{adversaries}adversaries-{steps}steps"
+    made = worst_suite.blocks(run, agents, adversaries, steps, name_of(what), progress)
+    return rows.record(results, "worst", settings, made, unstored)
+
+
 def _recorded(
     run: Run,
     what: Path,
@@ -228,6 +260,12 @@ def check_suite(run: Run, suite: str) -> None:
         )
     if suite == "attack" and min(run.evaluate.p) <= 0:
         raise ConfigError("--suite attack: at p = 0 there is no adversary; name strengths above 0, as in --p 0.2 0.4")
+    if suite == "worst" and problem.second_player is None:
+        raise ConfigError(
+            f"--suite worst: {run.problem} has no second player that can be trained as adversary; use --suite online --p 1"
+        )
+    if suite == "worst" and min(run.evaluate.p) <= 0:
+        raise ConfigError("--suite worst: at p = 0 there is no adversary; name strengths above 0, as in --p 0.5 1")
     if suite == "posterior" and (problem.posterior is None or type(method).distributions is Method.distributions):
         raise ConfigError(f"--suite posterior: {run.problem} with {run.method} has no exact posterior; use --suite online")
     if suite == "posterior" and problem.exact is None:

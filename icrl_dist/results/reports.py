@@ -17,6 +17,7 @@ from icrl_dist.config.run import Run
 from icrl_dist.console.terminal import PlainConsole
 from icrl_dist.problems import registry
 from icrl_dist.results import attack, plots, summaries
+from icrl_dist.results import worst as worst_suite
 from icrl_dist.results.returns import Returns, returns
 from icrl_dist.results.rows import keeping
 from icrl_dist.results.tables import experts_table, gap_table, kl_table, returns_table
@@ -121,6 +122,19 @@ def attacked(run: Run, report: Path, frame: pd.DataFrame, draws: int, unstored: 
     )
 
 
+def worst(
+    run: Run, report: Path, frame: pd.DataFrame, adversaries: int, steps: int, unstored: list[StoreError] | None = None
+) -> Evaluation:
+    """The evaluation with these rows of suite ``worst``, whose numbers are written to ``report``.json."""
+    found = worst_suite.summary(frame)
+    with keeping(unstored):
+        write_json(report.with_name(f"{report.name}.json"), found)
+    title = f"Adversaries trained against each agent: {registry.of(run).title(registry.of(run).evaluated_count)}"
+    table = worst_suite.table(found, title, adversaries, steps, run.evaluate.episodes)
+    summary = {"adversaries": adversaries, "steps": steps, "worst": found}
+    return Evaluation(frame, (table,), tuple(_notes({}, unstored)), summary)
+
+
 def posterior(
     run: Run, report: Path, frame: pd.DataFrame, found: dict[str, Any], unstored: list[StoreError] | None = None
 ) -> Evaluation:
@@ -146,4 +160,4 @@ def posterior(
 def experts(frame: pd.DataFrame, notes: tuple[str, ...] = ()) -> Evaluation:
     """The evaluation with these rows of suite ``experts``."""
     found = summaries.experts(frame)
-    return Evaluation(frame, (experts_table(found),), notes, {"experts": found})
+    return Evaluation(frame, (experts_table(found, frame["agent"].iloc[0]),), notes, {"experts": found})

@@ -16,10 +16,10 @@ from icrl_dist.models.compiled import Unusable, library
 from icrl_dist.results import heldout, reports
 from icrl_dist.results.reports import Evaluation
 from icrl_dist.results.rows import is_unfinished
-from icrl_dist.results.suite_numbers import DRAWS, numbers
+from icrl_dist.results.suite_numbers import ADVERSARIES, DRAWS, STEPS, numbers
 from icrl_dist.storage.files import StoreError
 
-Suite = Literal["online", "offline", "posterior", "attack"]
+Suite = Literal["online", "offline", "posterior", "attack", "worst"]
 Prior = Literal["uniform", "unseen"]
 
 
@@ -33,6 +33,8 @@ def evaluate(
     p: Sequence[float] | float | None = None,
     prior: Prior | None = None,
     draws: int = DRAWS,
+    adversaries: int = ADVERSARIES,
+    steps: int = STEPS,
     references: bool = True,
     progress: Show = False,
 ) -> Evaluation:
@@ -45,14 +47,15 @@ def evaluate(
 
     ``suite``: ``online`` for consecutive episodes from an empty context; ``offline`` for one episode given the context
     of a random or an expert episode; ``posterior`` for the distance to the exact posterior; ``attack`` for one episode,
-    given its context, without adversary, under sampled ones and under the worst one (Dark Room).
+    given its context, without adversary, under sampled ones and under the worst one (Dark Room); ``worst`` for SAC
+    adversaries that are trained against each agent (DeepMind Control).
     ``deploy``: the deployment rule, ``paper``, ``committed`` or ``growing``; None for the rule that the model was trained for.
-    Suite ``posterior`` always uses ``paper``.
+    Suites ``posterior`` and ``worst`` always use ``paper``.
     ``episodes``: online episodes; ``seeds``: evaluations per task; ``p``: override probabilities of the test adversary,
     0 to 1; ``prior``: distribution of the test adversaries; evaluation e of a task is under adversary draw e.  None: the
-    run's (suite ``posterior``: 40 episodes, 4 seeds, p 0, 0.2, 0.4 and 0.6, uniform; ``attack``: the run's p above 0).
-    ``draws``: sampled adversaries of suite ``attack``.  ``references``: False leaves random policy, exact agents and
-    oracle out.
+    run's (suite ``posterior``: 40 episodes, 4 seeds, p 0, 0.2, 0.4 and 0.6, uniform; ``attack`` and ``worst``: the run's p
+    above 0).  ``draws``: sampled adversaries of suite ``attack``.  ``adversaries``: of suite ``worst``, for each agent and
+    task, with ``steps`` of training each.  ``references``: False leaves random policy, exact agents and oracle out.
     ``progress``: True shows it on standard output; a function receives each event, a dictionary.
 
     Raises ConfigError if there is no such agent or a setting is impossible, StoreError for a file that was not written
@@ -74,13 +77,18 @@ def evaluate(
         raise ConfigError("--suite posterior: it compares with the exact agent, a reference; leave --no-references out")
     if suite == "attack" and draws < 1:
         raise ConfigError(f"--draws {draws}: at least 1 sampled adversary is needed")
+    for option, count in (("adversaries", adversaries), ("steps", steps)):
+        if suite == "worst" and count < 1:
+            raise ConfigError(f"--{option} {count}: at least 1 is needed")
     run = dataclasses.replace(run, evaluate=dataclasses.replace(run.evaluate, **numbers(run, suite, given)))
     validate(run, "evaluate")
     heldout.check_suite(run, suite)
-    rule = "paper" if suite == "posterior" else deploy or methods.of(run).deployment(run)
+    rule = "paper" if suite in ("posterior", "worst") else deploy or methods.of(run).deployment(run)
     report = folder / "report" / heldout.report_name(run, source, suite, rule)
     if suite == "attack":
         report = report.with_name(f"{report.name}-{draws}draws")
+    if suite == "worst":
+        report = report.with_name(f"{report.name}-{adversaries}adversaries-{steps}steps")
     if not references:
         report = report.with_name(f"{report.name}-no-references")
     results = (heldout.run_folder(source) or folder) / "results"  # rows of a checkpoint in a run folder belong to that run
@@ -99,6 +107,9 @@ def evaluate(
         elif suite == "attack":
             rows = heldout.attack(run, source, results, show, draws, deploy, unstored, references)
             found = reports.attacked(run, report, rows, draws, unstored)
+        elif suite == "worst":
+            rows = heldout.worst(run, source, results, show, adversaries, steps, unstored, references)
+            found = reports.worst(run, report, rows, adversaries, steps, unstored)
         else:
             found = reports.posterior(run, report, *heldout.posterior(run, source, results, show, unstored), unstored)
     answer = {"suite": suite, "deploy": rule, "what": str(source)}

@@ -166,9 +166,13 @@ _FORMS = {"ratio": "{:+.1%}", "improvement": "{:.0%}"}
 _STATISTICS = {"ratio": "ratio of means, less 1", "improvement": "probability of improvement"}
 
 
-def experts_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return of each expert's first and last recorded episode, one row per variation; ``rows``: ``summaries.experts``."""
-    table = NarrowTable(title="SAC experts: return of the first and of the last recorded episode", title_justify="left")
+def experts_table(rows: Sequence[Mapping[str, Any]], agent: str = "expert") -> Table:
+    """Return of each expert's first and last recorded episode, one row per variation; ``rows``: ``summaries.experts``.
+
+    ``agent``: their key in result rows; robust policies have no recorded training, but episodes after it.
+    """
+    what = "SAC experts: return" if agent == "expert" else f"{agent.upper()} policies, undisturbed after training: return"
+    table = NarrowTable(title=f"{what} of the first and of the last recorded episode", title_justify="left")
     for name in ("task", "adversary", "first", "last"):
         table.add_column(name, justify="left" if name in ("task", "adversary") else "right")
     for row in rows:

@@ -52,8 +52,14 @@ def rate_labels(
 
 
 def of_expert(run: Run, name: str, trials: Sequence[Trajectory]) -> Block:
-    """The recorded episodes of one expert's training.  ``name``: of the run."""
-    return {**_of_trials(run, name, trials), "agent": "expert", "policy_version": -1, "weights_digest": "", "deployment": ""}
+    """The recorded episodes of one expert's training, or of one robust policy.  ``name``: of the run."""
+    return {
+        **_of_trials(run, name, trials),
+        "agent": methods.of(run).product,
+        "policy_version": -1,
+        "weights_digest": "",
+        "deployment": "",
+    }
 
 
 def _of_trials(run: Run, name: str, trials: Sequence[Trajectory]) -> dict[str, Any]:

@@ -8,14 +8,16 @@ from pathlib import Path
 
 from icrl_dist.storage.files import StoreError, require_plain
 
-_REPORTS = r"(online|posterior|attack)-(.+-)?T\d+-[0-9a-f]*-.+\.(json|png)|(online|posterior)\.json|(adaptation|posterior)\.png"
+_REPORTS = (
+    r"(online|posterior|attack|worst)-(.+-)?T\d+-[0-9a-f]*-.+\.(json|png)|(online|posterior)\.json|(adaptation|posterior)\.png"
+)
 NAMES = {
     "checkpoints/report": _REPORTS,
     "checkpoints": r"version-\d+\.npz|partial\.npz|agent\.npz",
     "crashes": r".+-\d+\.json|.+\.stacks",
     "dataset": r"segment-\d+\.frames",
     "report": _REPORTS,
-    "results": r"(online|offline|posterior|attack|label_quality|experts)-[0-9a-f]{8}-\d{8}T\d{6}\.\d{6}Z\.parquet",
+    "results": r"(online|offline|posterior|attack|worst|label_quality|experts)-[0-9a-f]{8}-\d{8}T\d{6}\.\d{6}Z\.parquet",
     "tensorboard": r"events\.out\.tfevents\..+",
     "": r"(run\.toml|(env|fork|result)\.json|(metrics\.jsonl|learner\.(log|err))(\.\d)?|agent\.npz|endpoint"
     r"|\.(lock|replacement|beginning))",

@@ -84,7 +84,10 @@ def test_values_are_read_into_their_fields() -> None:
         ("[evaluate]\np = 0.2", ["evaluate.p = 0.2", "expected a list"]),
         ('[evaluate]\np = [0.2, "x"]', ["evaluate.p = 'x'", "expected float, got str"]),
         # Bad choices.
-        ('method = "ppo"', ["method = 'ppo'", "choose one of ad, ardt, dpt, dr, experts, icaa, icag, mix_dpt, prompt_dt"]),
+        (
+            'method = "ppo"',
+            ["method = 'ppo'", "choose one of ad, ardt, dpt, dr, experts, ic2rl, icaa, icag, mix_dpt, prompt_dt, qarl, rarl"],
+        ),
         ("method = 3", ["method = 3", "expected str, got int"]),
         ('[darkroom]\nlabels = "hard"', ["darkroom.labels = 'hard'", "'soft', 'sampled', 'heuristic'"]),
         ('[learner]\ndevice = "tpu"', ["learner.device = 'tpu'", "choose one of 'auto', 'cpu', 'cuda'"]),

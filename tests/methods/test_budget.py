@@ -39,6 +39,7 @@ CASES: dict[str, tuple[str, dict[str, Any], str]] = {
     "icag with rounds": ("icag", {"dagger": DAggerConfig(rounds=1, trials=3, steps=4)}, "optimal"),
     "mix_dpt": ("mix_dpt", {}, "optimal"),
     "dr": ("dr", {}, "undisturbed optimal"),
+    "ic2rl": ("ic2rl", {}, "robust optimal"),
     "icaa": ("icaa", {}, "optimal, own actions"),
     "icaa, the better half": ("icaa", {"label_trials": "top_return"}, "optimal, own actions"),
     "icag with windows": ("icag", {"windows": True}, "optimal"),

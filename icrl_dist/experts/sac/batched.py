@@ -21,7 +21,7 @@ from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts.sac import draws, sb3_files
 from icrl_dist.experts.sac.cuda_graph import GraphedCallable
 from icrl_dist.experts.sac.draws import EpisodeDraws
-from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED, Lockstep, in_own_cache_lines
+from icrl_dist.experts.sac.lockstep import MOMENTS, TRAINED, GivenTemperature, Lockstep, in_own_cache_lines
 from icrl_dist.experts.sac.replay import Replay, ReplayBatch
 from icrl_dist.experts.sac.sb3_updater import SB3Updater
 from icrl_dist.experts.sac.stacked import Shape, outputs
@@ -55,13 +55,15 @@ class SACBatch:
         capacity: int | None = None,
         graph: bool = True,
         backend: Backend = "lockstep",
+        given_temperature: bool = False,
     ) -> None:
         """One expert per seed; the seed draws its initial parameters.
 
         ``matmul_dtype`` is the precision of matrix products; parameters and Adam are always float32.
         ``capacity`` of the replay defaults to ``config.replay``.  On a GPU an update is a CUDA graph,
         unless ``graph`` is false.  The backend stable-baselines3 supports one expert in float32 on the
-        CPU.  Raises ValueError for discrete actions, for no expert, and for what the backend does not support.
+        CPU.  ``given_temperature``: see ``GivenTemperature``; only lockstep has it.
+        Raises ValueError for discrete actions, for no expert, and for what the backend does not support.
         """
         experts = len(seeds)
         if spec.discrete or experts < 1:
@@ -89,7 +91,7 @@ class SACBatch:
         }
         """By name, with the expert as first axis: ``actor``, ``critic`` (two per expert), ``target``,
         ``log_temperature``, and Adam's moments as ``actor/exp_avg`` and so on."""
-        self._updater = updater = self._make_updater(backend, matmul_dtype)
+        self._updater = updater = self._make_updater(backend, matmul_dtype, given_temperature)
 
         def step(*inputs: Tensor) -> None:
             updater.update(ReplayBatch(*inputs[:-1]), inputs[-1])
@@ -99,10 +101,11 @@ class SACBatch:
             self._step = GraphedCallable(step, updater.changed())
         self.replay = Replay(experts, config.replay if capacity is None else capacity, S, A, self.device)
 
-    def _make_updater(self, backend: Backend, matmul_dtype: MatmulDtype) -> Lockstep | SB3Updater:
+    def _make_updater(self, backend: Backend, matmul_dtype: MatmulDtype, given_temperature: bool) -> Lockstep | SB3Updater:
         shapes = self.actor_shape, self.critic_shape
         if backend == "lockstep":
-            return Lockstep(self.arrays, *shapes, self.config, getattr(torch, matmul_dtype))
+            lockstep = GivenTemperature if given_temperature else Lockstep
+            return lockstep(self.arrays, *shapes, self.config, getattr(torch, matmul_dtype))
         if (self.experts, matmul_dtype, self.device.type) == (1, "float32", "cpu"):
             return SB3Updater(self.arrays, shapes, self.spec, self.config)
         found = f"{self.experts} experts, {matmul_dtype} products, {self.device}"
@@ -216,15 +219,12 @@ def train(
     if state is not None:
         experts.load(state)
 
-    def has_update(step: int) -> bool:
-        return step > config.warmup and step % config.update_every == 0
-
     if experts.steps % horizon:
         raise ValueError(f"the state is of step {experts.steps}, within an episode of {horizon} steps: take it in `progress`")
     while experts.steps < steps:
         first, total = experts.steps, np.zeros(experts.experts)
         last = min(first + horizon, steps)
-        count = sum(map(has_update, range(first + 1, last + 1)))
+        count = sum(has_update(config, step) for step in range(first + 1, last + 1))
         episode = EpisodeDraws(seeds, first // horizon, env.spec, config, count, experts.device)
         updates = iter(episode.updates)
         observation = np.asarray(env.reset(episode.starts), np.float32)
@@ -233,18 +233,24 @@ def train(
                 action = episode.uniform[number].astype(np.float32)
             else:
                 action = experts.act(observation, episode.normal[number])
-                _require_finite(action, experts.steps)
+                require_finite(action, experts.steps)
             step = env.step(action)
             experts.store(observation, action, step)
-            if has_update(experts.steps):
+            if has_update(config, experts.steps):
                 experts.update_from_replay(*next(updates))
             observation, total = step.observation, total + step.reward
-        _require_finite(experts.arrays["actor"].cpu().numpy(), experts.steps)
+        require_finite(experts.arrays["actor"].cpu().numpy(), experts.steps)
         progress(experts, total)
     return experts
 
 
-def _require_finite(values: Float32[np.ndarray, "N *_"], steps: int) -> None:
+def has_update(config: SACConfig, step: int) -> bool:
+    """Whether an update follows this step of the training, counted from 1."""
+    return step > config.warmup and step % config.update_every == 0
+
+
+def require_finite(values: Float32[np.ndarray, "N *_"], steps: int) -> None:
+    """Raises FloatingPointError, with the experts, for actions or weights of N experts that are NaN or infinite."""
     diverged = [number for number, row in enumerate(values) if not np.isfinite(row).all()]
     if diverged:
         raise FloatingPointError(f"weights of experts {diverged} are NaN or infinite at step {steps}: lower the learning rates")

@@ -12,9 +12,11 @@ from torch import Tensor
 from icrl_dist.config.sac import SACConfig
 from icrl_dist.types import Spec
 
-INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS, CHECKPOINTS, EVALUATION = range(7)
+INITIALIZATION, STARTS, ACTIONS, UPDATES, WINDOWS, CHECKPOINTS, EVALUATION, PLAYERS, TEMPERATURES, ADVERSARIES = range(10)
 """The purpose of a generator: initial parameters, initial states, actions, updates, the episodes after training from which
-action windows are cut, those by which checkpoints are compared, and those of an evaluation of the expert."""
+action windows are cut, those by which checkpoints are compared, and those of an evaluation of the expert; of a game of
+two players their seeds, and the adversary's temperatures; the seeds of adversaries that are trained against a fixed
+policy."""
 
 
 def key(seed: int, *purpose: int) -> np.random.SeedSequence:

@@ -120,7 +120,7 @@ class Lockstep:
     def update(self, batch: ReplayBatch, noise: Float[Tensor, "2 G B A"]) -> None:
         """Update temperature, critics, actor and target critics once each, as ``stable_baselines3.SAC.train`` does."""
         experts, count, observed = batch.observations.shape
-        temperature = self._log_temperature.exp()
+        temperature = self._temperature(batch)
 
         self._actor_buffers.input[:, :count] = batch.observations
         self._actor_buffers.input[:, count:] = batch.next_observations
@@ -128,7 +128,7 @@ class Lockstep:
         current = SquashedSample(*(part[:, :count] for part in both))
 
         next_value = self._values(self._target, batch.next_observations, both.actions[:, count:]).amin(1)
-        next_value -= temperature.unsqueeze(1) * both.log_likelihood[:, count:]
+        next_value -= temperature * both.log_likelihood[:, count:]
         targets = batch.rewards + self._config.gamma * next_value
 
         error = self._values(self._critic, batch.observations, batch.actions) - targets.unsqueeze(1)
@@ -144,21 +144,28 @@ class Lockstep:
         self._target.flat.lerp_(self._critic.flat, self._config.tau)
         self._target.refresh()
 
+    def _temperature(self, batch: ReplayBatch) -> Float[Tensor, "G #B"]:
+        """The temperature of each transition, or one of each expert."""
+        return self._log_temperature.exp().unsqueeze(1)
+
+    def _tune_temperature(self, current: SquashedSample) -> None:
+        """The temperature's gradient, for an entropy of -A."""
+        torch.neg(current.log_likelihood.mean(1) - current.actions.shape[2], out=self._temperature_gradient[:, 0])
+
     def _update_actor(
-        self, current: SquashedSample, d_actions: Float[Tensor, "G B A"], temperature: Float[Tensor, " G"]
+        self, current: SquashedSample, d_actions: Float[Tensor, "G B A"], temperature: Float[Tensor, "G #B"]
     ) -> None:
-        """Minimize the mean of temperature * log likelihood - min of both values; tune the temperature to entropy -A.
+        """Minimize the mean of temperature * log likelihood - min of both values; tune the temperature.
 
         ``d_actions``: the derivative of -value by the actions.
         """
-        count, actions = current.actions.shape[1:]
-        weight = (temperature / count).view(-1, 1, 1)
+        weight = (temperature / current.actions.shape[1]).unsqueeze(2)
         d_u = current.da_du * (d_actions + weight * 2 * current.actions / (current.da_du + _EPSILON))
         mean, deviation = self._output_gradient.chunk(2, dim=2)
         mean.copy_(d_u)
         torch.sub(d_u * current.du_dlog, weight * current.unclamped, out=deviation)
         self._actor.backward(self._actor_buffers, self._output_gradient)
-        torch.neg(current.log_likelihood.mean(1) - actions, out=self._temperature_gradient[:, 0])
+        self._tune_temperature(current)
         self._actor_adam.step()
         self._actor.refresh()
 
@@ -171,3 +178,13 @@ class Lockstep:
         inputs[..., :observed] = observations.unsqueeze(1)
         inputs[..., observed:] = actions.unsqueeze(1)
         return critics.forward(self._critic_buffers).view(experts, 2, count)
+
+
+class GivenTemperature(Lockstep):
+    """As ``Lockstep``, but the last component of an observation is the temperature, which is not learned (QARL's adversary)."""
+
+    def _temperature(self, batch: ReplayBatch) -> Float[Tensor, "G B"]:
+        return batch.observations[..., -1]
+
+    def _tune_temperature(self, current: SquashedSample) -> None:
+        """Leaves the gradient at 0."""

@@ -32,7 +32,12 @@ class ContinuousProblem(Problem):
     Config = ControlConfig
     Labelling = ExpertLabelling
     free_in_forks = ("strength", "solved")
-    agent_names: ClassVar[Mapping[str, str]] = {EXPERT: "SAC expert", SCRIPTED: "scripted expert"}
+    agent_names: ClassVar[Mapping[str, str]] = {
+        EXPERT: "SAC expert",
+        SCRIPTED: "scripted expert",
+        "rarl": "RARL",
+        "qarl": "QARL",
+    }
     rewards: ClassVar[tuple[float, float]] = (0.0, 1.0)
     """Smallest and largest reward of a step."""
     config: ControlConfig

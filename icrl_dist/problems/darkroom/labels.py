@@ -10,12 +10,12 @@ import numpy as np
 from annotated_types import Gt, Le
 from jaxtyping import Float32, Int, Int16
 
-from icrl_dist.config.ranges import NotNegative, NotNegativeFloat, Positive, Share
+from icrl_dist.config.ranges import NotNegative, NotNegativeFloat, Positive, Probability, Share
 from icrl_dist.interfaces import LabelledQueries
 from icrl_dist.models.sampling import sample
 from icrl_dist.problems.darkroom.exact_agents import OptimalAgent
 from icrl_dist.problems.darkroom.room import DarkRoom, cells
-from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, soft_labels
+from icrl_dist.problems.darkroom.solver import Hypotheses, cell_numbers, heuristic_labels, robust_labels, soft_labels
 from icrl_dist.rollout.episode import episode
 from icrl_dist.types import Identity, Job, LabelCounts, Variation
 
@@ -41,6 +41,8 @@ class RoomLabelling:
     """Cell numbers of the goals that decoys may have."""
     undisturbed: bool = False
     """Whether the labels are those of the task without its adversary, pi*_{tau,phi_0}."""
+    worst_p: Probability | None = None
+    """If given, the labels are those of pi^rb_tau: of the policy that is best against the worst override of this p."""
 
     @property
     def label_counts(self) -> LabelCounts:
@@ -66,7 +68,10 @@ class RoomLabeller:
         hypotheses = Hypotheses.of([Variation(v.task) for v in job.variations] if labelling.undisturbed else job.variations)
         self._size, self._cells = hypotheses.size, cells(hypotheses.size)
         self._row = {place: row for row, place in enumerate(job.rows())}
-        self._table = labels_of(hypotheses, labelling.labels, labelling.gamma, labelling.slack)
+        if labelling.worst_p is None:
+            self._table = labels_of(hypotheses, labelling.labels, labelling.gamma, labelling.slack)
+        else:
+            self._table = robust_labels(hypotheses, labelling.worst_p, labelling.gamma, labelling.slack)
         if labelling.windows:
             self._decoys = self._undisturbed()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,6 +14,7 @@ from icrl_dist.collect.behavior import BehaviorContexts
 from icrl_dist.config.q_learning import QLearning
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.sections import AdversaryConfig
+from icrl_dist.config.toml import ConfigError
 from icrl_dist.interfaces import (
     Batch,
     Behaviors,
@@ -181,6 +183,18 @@ class DarkRoomProblem(Problem):
 
     def contexts(self, run: Run) -> Contexts:
         return Contexts(BehaviorContexts(run.pretrain.behaviors, self.labelling(run)))
+
+    def robust_contexts(self, run: Run) -> Contexts:
+        """The contexts of ``contexts``, labelled by the exact max-min policy against overrides of ``adversary.p_max``."""
+        of = self.config
+        if of.disturbance != "override":
+            raise ConfigError(
+                f"darkroom.disturbance = {of.disturbance!r}: robust policies are known for 'override' only: use it"
+            )
+        if of.labels == "heuristic":
+            raise ConfigError("darkroom.labels = 'heuristic': robust policies are exact: use 'soft' or 'sampled'")
+        labelling = dataclasses.replace(self.labelling(run), worst_p=run.adversary.p_max)
+        return Contexts(BehaviorContexts(run.pretrain.behaviors, labelling))
 
     def learning_histories(self, run: Run, trials: int) -> LearningHistories:
         """Histories of tabular Q-learning, of ``ad.history_episodes`` episodes or more, so that no episode is left over."""

@@ -113,10 +113,34 @@ def soft_labels(h: Hypotheses, gamma: float, slack: float) -> Float32[np.ndarray
 
     Without slack the model would have to learn differences between actions that hardly change the return.
     """
-    q = q_values(h, gamma)
+    return _near_best(q_values(h, gamma), slack)
+
+
+def _near_best(q: Float64[np.ndarray, "M C A"], slack: float) -> Float32[np.ndarray, "M C A"]:
     good = q >= q.max(axis=2, keepdims=True) - slack
     result: np.ndarray = (good / good.sum(axis=2, keepdims=True)).astype(np.float32)
     return result
+
+
+def robust_q_values(h: Hypotheses, p: float, gamma: float) -> Float64[np.ndarray, "M C A"]:
+    """Action values of the robust policy (eq. 4) at the start of an episode, discounted by gamma.
+
+    The adversary set is s-rectangular: in every cell and step the worst distribution q of the override, whose probability
+    is p.  Q_h(s, a) = (1 - p) U_h(s_a) + p min_b U_h(s_b) with U_h(s') = R(s') + gamma max_a Q_{h+1}(s', a).  What the
+    adversary does is independent of the agent's action, so no randomized policy of the agent is better.  ``h``: the
+    tasks; their own adversaries must be the null adversary.
+    """
+    value = np.zeros((len(h.goal), h.size**2))
+    for _ in range(h.horizon):
+        undisturbed = _backup(h, value, gamma)
+        q = (1 - p) * undisturbed + p * undisturbed.min(axis=2, keepdims=True)
+        value = q.max(axis=2)
+    return q
+
+
+def robust_labels(h: Hypotheses, p: float, gamma: float, slack: float) -> Float32[np.ndarray, "M C A"]:
+    """pi^rb_tau as a label: uniform over the actions whose ``robust_q_values`` are within ``slack`` of the best."""
+    return _near_best(robust_q_values(h, p, gamma), slack)
 
 
 def heuristic_labels(h: Hypotheses) -> Float32[np.ndarray, "M C A"]:

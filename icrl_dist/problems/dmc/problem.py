@@ -11,7 +11,10 @@ import numpy as np
 
 from icrl_dist.config.random_keys import RandomKey, generator
 from icrl_dist.config.ranges import remedy
-from icrl_dist.interfaces import Batch, MakeDrawing, Reference
+from icrl_dist.experts.adversarial.payloads import RobustlyLabelledHistories
+from icrl_dist.experts.payloads import ExpertHistories
+from icrl_dist.interfaces import Batch, Contexts, MakeDrawing, Reference
+from icrl_dist.problems.continuous import robust
 from icrl_dist.problems.continuous.problem import EXPERT, ContinuousProblem, experts_of, missing_experts
 from icrl_dist.problems.dmc import domains
 from icrl_dist.types import Spec, Split, Task, Variation
@@ -19,6 +22,7 @@ from icrl_dist.types import Spec, Split, Task, Variation
 if TYPE_CHECKING:
     from icrl_dist.config.run import Run
     from icrl_dist.problems.benchmarks import Benchmarks
+    from icrl_dist.problems.parts import TwoPlayerBatch
 
 _TASKS = domains.GRID**2
 
@@ -65,10 +69,26 @@ class DMCProblem(ContinuousProblem):
 
         return DMCVariations(variations)
 
+    @property
+    def second_player(self) -> ForcePlayer:
+        """The adversary, which applies its forces."""
+        return ForcePlayer(self)
+
+    def robust_contexts(self, run: Run) -> Contexts:
+        """DPT's contexts, labelled by the RARL policy of each task."""
+        found, game = self.contexts(run), robust.game(self, run, curriculum=False)
+        assert isinstance(found.payload, ExpertHistories)
+        return Contexts(RobustlyLabelledHistories(found.payload.sac, found.payload.labelling, game), found.most_trials)
+
     def references(self, run: Run) -> dict[str, Reference]:
-        """A random policy, and the experts of the undisturbed tasks if they are in this node's cache."""
+        """A random policy, and those of the undisturbed experts, RARL's and QARL's policies that are in this node's cache.
+
+        Experts and policies are those of the evaluated tasks; RARL's and QARL's were trained against an adversary.
+        """
         experts = experts_of(self, run)
-        return super().references(run) | ({} if experts is None else {EXPERT: Reference(experts, ceiling=True)})
+        found = super().references(run) | ({} if experts is None else {EXPERT: Reference(experts, ceiling=True)})
+        policies = {key: robust.policies_of(self, run, curriculum) for key, curriculum in robust.KEYS.items()}
+        return found | {key: Reference(make) for key, make in policies.items() if make is not None}
 
     def missing_reference(self, run: Run, what: str) -> str:
         return missing_experts(self, run, what)
@@ -95,6 +115,24 @@ class DMCProblem(ContinuousProblem):
         from icrl_dist.problems.dmc import bench
 
         return bench.benchmarks(self)
+
+
+class ForcePlayer:
+    """``Problem.second_player`` of a problem."""
+
+    def __init__(self, problem: DMCProblem) -> None:
+        self._problem = problem
+
+    @property
+    def strength(self) -> float:
+        """Strength of its largest forces: that of training adversaries."""
+        return self._problem.strength
+
+    def batch(self, tasks: Sequence[Task], strength: float) -> TwoPlayerBatch:
+        """These tasks; a force of 1 has this strength."""
+        from icrl_dist.problems.dmc.simulation import DMCPlayers
+
+        return DMCPlayers(tasks, strength)
 
 
 def _sticks(name: str, states: np.ndarray, adversary: np.ndarray, task: Mapping[str, Any], every: int) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from icrl_dist.arrays import short
 from icrl_dist.copies import CopiedWhole
 from icrl_dist.problems.checks import check_generators
 from icrl_dist.problems.continuous import renderer
@@ -187,3 +188,22 @@ class DMCVariations(CopiedWhole):
     def image(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
         """One row through the suite's first camera.  Raises RuntimeError if MuJoCo cannot render on this node."""
         return self.simulation.image(row)
+
+
+class DMCPlayers(CopiedWhole):
+    """B simulations with the adversary's forces as the actions of a second player."""
+
+    def __init__(self, tasks: Sequence[Task], strength: float) -> None:
+        """``strength``: of a force of 1, as ``control.strength``."""
+        self.simulation, self._strength = DMC(tasks), np.float32(strength)
+        self.spec, self.batch, self.disturbance = self.simulation.spec, self.simulation.batch, self.simulation.disturbance
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> Float32[np.ndarray, "B S"]:
+        """Start an episode in every row."""
+        return self.simulation.reset(rngs)
+
+    def step(self, actions: Float32[np.ndarray, "B A"], disturbances: Float32[np.ndarray, "B F"]) -> Step:
+        """Execute both actions.  Raises ValueError for disturbances outside [-1, 1], and as ``DMC.step`` does."""
+        if not np.abs(disturbances).max() <= 1:
+            raise ValueError(f"dmc: disturbances {short(disturbances)}: expected numbers in [-1, 1]")
+        return self.simulation.step(actions, disturbances * self._strength)

@@ -8,12 +8,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 from icrl_dist.problems.darkroom import solver
 from icrl_dist.problems.darkroom.adversaries import argmax_distribution
 from icrl_dist.problems.darkroom.room import ACTIONS, DarkRoom
 from icrl_dist.problems.darkroom.solver import Hypotheses
 from icrl_dist.types import NULL, Adversary, Identity, Task, Trajectory, Variation
+from tests.optional import known
 
 ALPHA = (0.1, 1.0, 0.5, 2.0, 0.3)
 ADVERSARIES = (NULL, Adversary.of("dirichlet", p=0.35, alpha=ALPHA))
@@ -264,3 +266,51 @@ def test_hypotheses_of_unlike_rooms_are_refused(room: Room) -> None:
         Hypotheses.of([Variation(room(3, 6)[0]), Variation(room(4, 6)[0])])
     with pytest.raises(ValueError, match=r"goal=\(5, 5\)"):
         Hypotheses.of([Variation(room(3, 6)[0].replace(goal=(5, 5)))])
+
+
+def slow_robust(task: Task, p: float, gamma: float) -> dict[Cell, list[float]]:
+    """max-min Q at the first step: in every cell and step the matrix game of all pairs (agent's action, override)."""
+    size, horizon = int(task.number("size")), int(task.number("horizon"))
+    value, q = dict.fromkeys(every_cell(size), 0.0), dict[Cell, list[float]]()
+    for _ in range(horizon):
+        fresh = {}
+        for cell in value:
+            arrived = [moved(cell, action, size) for action in range(ACTIONS)]
+            worth = [(1.0 if there == task["goal"] else 0.0) + gamma * value[there] for there in arrived]
+            game = np.array([[(1 - p) * worth[a] + p * worth[b] for b in range(ACTIONS)] for a in range(ACTIONS)])
+            q[cell] = [min(row) for row in game]
+            # The value over randomized policies: the largest v that some mixture of rows secures in every column.
+            found = scipy.optimize.linprog(
+                [0.0] * ACTIONS + [-1.0],
+                A_ub=np.hstack([-game.T, np.ones((ACTIONS, 1))]),
+                b_ub=np.zeros(ACTIONS),
+                A_eq=[[1.0] * ACTIONS + [0.0]],
+                b_eq=[1.0],
+                bounds=[(0, None)] * ACTIONS + [(None, None)],
+            )
+            fresh[cell] = -known(found.fun)
+        value = fresh
+    return q
+
+
+@pytest.mark.parametrize("p", [0.0, 0.2, 0.7])
+def test_robust_labels_are_those_of_the_matrix_games(room: Room, p: float) -> None:
+    """Goals in a corner, on a wall and in the middle.  No randomized policy is worth more than the best action."""
+    gamma, tasks = 0.9, [room(SIZE, HORIZON)[cell] for cell in (0, 1, 4)]
+    h = Hypotheses.of([Variation(task) for task in tasks])
+    q = solver.robust_q_values(h, p, gamma)
+    for slack in (1e-6, 0.1):
+        labels = solver.robust_labels(h, p, gamma, slack)
+        for m, task in enumerate(tasks):
+            slow = slow_robust(task, p, gamma)
+            for c, cell in enumerate(every_cell()):
+                np.testing.assert_allclose(q[m, c], slow[cell], atol=1e-9)
+                good = [value >= max(slow[cell]) - slack for value in slow[cell]]
+                np.testing.assert_allclose(labels[m, c], [g / sum(good) for g in good], atol=1e-6)
+
+
+def test_the_best_robust_value_is_the_minimax_oracles_and_p_0_is_the_optimum(room: Room) -> None:
+    task = room(SIZE, HORIZON)[5].replace(start=(0, 0))
+    h = Hypotheses.of([Variation(task)])
+    assert solver.robust_q_values(h, 0.4, 1.0)[0, 0].max() == pytest.approx(solver.worst_case(None, Variation(task), 0.4))
+    np.testing.assert_array_equal(solver.robust_labels(h, 0.0, 0.99, 0.1), solver.soft_labels(h, 0.99, 0.1))
