@@ -80,9 +80,8 @@ def test_the_files_act_as_the_experts_and_earn_in_dm_control_what_the_manifest_s
             env, total = reference(task.kind, physical, int(start)), 0.0
             step = env.reset()
             for _ in range(HORIZON):
-                shown = np.clip(
-                    np.float32(flat(step.observation)), np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-                )
+                low, high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
+                shown = np.clip(np.asarray(flat(step.observation), np.float32), low, high)
                 step = env.step(model.predict(shown, deterministic=True)[0])
                 total += step.reward
             plain.append(total)
