@@ -139,10 +139,11 @@ def test_calibration_deploys_in_training_tasks_under_new_adversaries_and_repeats
 
 def test_each_method_is_calibrated_under_the_disturbances_that_it_trains_on(small_run):
     task = registry.of(small_run).split.train[0]
+    undisturbed = ("ad", "dpt", "ic2rl", "mix_dpt", "prompt_dt", "qarl", "rarl")
     for name in methods.names():
         method = methods.of(dataclasses.replace(small_run, method=name))
         trained_on = {v.adversary.kind for v in method.training_variations(small_run, 0, task, 5)}
-        assert trained_on == ({"null"} if name in ("ad", "dpt", "mix_dpt", "prompt_dt") else {"null", "dirichlet"})
+        assert trained_on == ({"null"} if name in undisturbed else {"null", "dirichlet"})
 
 
 class Mirrored:

@@ -39,7 +39,7 @@ def refused(capsys, *arguments):
         ("[darkroom]\nsize = 1", r"darkroom.size = 1: a room has 2 to 1000 cells"),
         ("[adversary]\np_max = 1.5", r"adversary.p_max = 1.5: a probability lies in \[0, 1\]"),
         ("[evaluate]\np = [0.0, -0.1]", r"evaluate.p = -0.1: a probability lies in \[0, 1\]"),
-        ('method = "ppo"', r"method = 'ppo': choose one of ad, ardt, dpt, dr, experts, icaa, icag, mix_dpt, prompt_dt"),
+        ('method = "ppo"', r"method = 'ppo': choose one of ad, ardt, dpt, dr, experts, ic2rl, icaa, icag, mix_dpt, "),
         ("[icaa]\ntrials = 5\ncontext_trials = 5", r"icaa.context_trials = 5: use 0 to 4: it must be below icaa.trials"),
         ("darkroom = [", r"not valid TOML"),
     ],

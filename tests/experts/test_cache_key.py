@@ -56,9 +56,12 @@ CHANGED = {
     "cache": "elsewhere",
     "checkpoints": 2,
     "checkpoint_episodes": 1,
+    "least_return": 1.0,
+    "least_return_disturbed": 1.0,
+    "failed_experts": "teach",
 }
 """Another value of every setting in ``[sac]``."""
-NO_EFFECT = ("cache", "checkpoint_episodes")
+NO_EFFECT = ("cache", "checkpoint_episodes", "least_return", "least_return_disturbed", "failed_experts")
 """Settings that do not change a history where the others are those of ``SAC``."""
 REACHER = Task.of("dmc-reacher-easy", arm_mass=0.04, hand_mass=1 / 30, forces="paper", horizon=20)
 PUSHED = Variation(REACHER, network_adversary.network(7, 6, 2, 0.1))

@@ -139,6 +139,7 @@ CHANGED = [
     *("alerts.collapse=0", "alerts.zero_episodes=0", "alerts.silent_s=0", "alerts.ingest=0", "alerts.labels=0"),
     *("evaluate.episodes=2", "evaluate.p=[0.3]", "evaluate.prior=uniform", "evaluate.seeds=1"),
     *("learner.cache_mb=0", "learner.device=cpu", "learner.prometheus=127.0.0.1:PORT", "learner.restarts=0"),
+    *("sac.failed_experts=teach", "sac.least_return=1", "sac.least_return_disturbed=1"),
     *("sac.cache=elsewhere", "stream.certificates=elsewhere", "stream.connect=tls/127.0.0.1:9", "stream.credits=1"),
     *("stream.endpoint=tls/127.0.0.1:1", "stream.lease_s=9.5", "stream.max_message_bytes=99999", "stream.reply_timeout_s=3.5"),
 ]
