@@ -56,8 +56,8 @@ CHANGED = {
     "cache": "elsewhere",
     "checkpoints": 2,
     "checkpoint_episodes": 1,
-    "least_return": 1.0,
-    "least_return_disturbed": 1.0,
+    "least_return": -1.0,
+    "least_return_disturbed": -1.0,
     "failed_experts": "teach",
 }
 """Another value of every setting in ``[sac]``."""
