@@ -15,19 +15,18 @@ from icrl_dist.experts.adversarial.payloads import Game, RobustlyLabelledHistori
 from icrl_dist.experts.adversarial.policies import Bounds, Robust
 from icrl_dist.experts.cache import History
 from icrl_dist.experts.train import histories
-from icrl_dist.experts.trajectories import history_trajectories
+from icrl_dist.experts.trajectories import evenly_spaced, history_trajectories
 from icrl_dist.interfaces import Problem, Progress
-from icrl_dist.types import Identity, Job, Task, Trajectory, Variation
+from icrl_dist.types import Job, Task, Trajectory, Variation
 
 
 def train_robust(job: Job, problem: Problem, worker: str, progress: Progress) -> Iterator[Trajectory]:
     """Undisturbed episodes of the robust policy of each task, which is trained and cached if it is missing."""
     payload = job.payload
     assert isinstance(payload, RobustPolicies)
-    for (task, variation), one in zip(job.rows(), _policies(job, problem, payload.sac, payload.game, progress), strict=True):
-        chosen = np.linspace(0, len(one.window_rewards) - 1, job.trials).round().astype(int)
-        for trial, episode in enumerate(chosen.tolist()):
-            identity = Identity(job.stage, job.round, task, variation, trial)
+    found = _policies(job, problem, payload.sac, payload.game, progress)
+    for row, one in zip(range(len(job.variations)), found, strict=True):
+        for identity, episode in evenly_spaced(job, row, len(one.window_rewards)):
             rewards = one.window_rewards[episode]
             yield Trajectory(
                 identity=identity,

@@ -52,11 +52,17 @@ _OF_CHECKPOINTS = frozenset({"checkpoints", "checkpoint_episodes"})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class History:
-    """E episodes of one expert's training with the expert's actions as labels, and the expert.
+class Stored:
+    """Arrays that are kept in one file of the cache; field names are also their names in the file."""
 
-    Field names are also the names of the arrays in the cache's files.
-    """
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by name, as stored in a file."""
+        return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class History(Stored):
+    """E episodes of one expert's training with the expert's actions as labels, and the expert."""
 
     actions: Float32[np.ndarray, "E H A"]
     observations: Float32[np.ndarray, "E H+1 S"]
@@ -72,10 +78,6 @@ class History:
     """The right action at each of their first H states."""
     actor: Float32[np.ndarray, " P"]
     """The expert's parameters, in the layout of ``experts.sac.stacked.Shape``."""
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays by name, as stored in a file."""
-        return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
 
 
 def expert_seed(variation: Variation, seed: int) -> int:

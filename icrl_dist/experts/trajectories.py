@@ -34,12 +34,9 @@ def history_trajectories(
     ``act``: the experts, which act in decoys and give labels; None: the problem's scripted policy does.
     """
     decoys = _decoy_episodes(job, problem, labelling, act)
-    for row, (task, variation) in enumerate(job.rows()):
-        history = histories[row]
+    for row, history in zip(range(len(job.variations)), histories, strict=True):
         windows = _WindowEpisodes.of(history, {name: column[row] for name, column in decoys.items()})
-        chosen = np.linspace(0, len(history.rewards) - 1, job.trials).round().astype(int)
-        for trial, episode in enumerate(chosen.tolist()):
-            identity = Identity(job.stage, job.round, task, variation, trial)
+        for identity, episode in evenly_spaced(job, row, len(history.rewards)):
             yield Trajectory(
                 identity=identity,
                 variation=job.variation(identity),
@@ -53,6 +50,13 @@ def history_trajectories(
                 origin="expert",
                 **_labelled_queries(labelling, history, windows, identity.rng(job.seed, _LABELLING)),
             )
+
+
+def evenly_spaced(job: Job, row: int, episodes: int) -> Iterator[tuple[Identity, int]]:
+    """The trajectories of one row of a job, each with the number of its episode, evenly spaced among so many."""
+    task, variation = job.rows()[row]
+    for trial, episode in enumerate(np.linspace(0, episodes - 1, job.trials).round().astype(int).tolist()):
+        yield Identity(job.stage, job.round, task, variation, trial), episode
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from icrl_dist.config.sac import SACConfig
 from icrl_dist.experts import cache
 from icrl_dist.experts.adversarial.curriculum import appended, discounted
 from icrl_dist.experts.adversarial.payloads import Game
-from icrl_dist.experts.cache import Trainer, expert_seed
+from icrl_dist.experts.cache import Stored, Trainer, expert_seed
 from icrl_dist.experts.train import mean_actions, without_cache
 from icrl_dist.experts.trajectories import Act, window_episodes
 from icrl_dist.interfaces import Problem, Progress
@@ -25,11 +25,8 @@ _log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Robust:
-    """A robust policy of one task, its last adversary, and G undisturbed episodes after training.
-
-    Field names are also the names of the arrays in the cache's files.
-    """
+class Robust(Stored):
+    """A robust policy of one task, its last adversary, and G undisturbed episodes after training."""
 
     actor: Float32[np.ndarray, " P"]
     """The protagonist's parameters, in the layout of ``experts.sac.stacked.Shape``."""
@@ -46,10 +43,6 @@ class Robust:
     window_rewards: Float32[np.ndarray, "G H"]
     window_labels: Float32[np.ndarray, "G H A"]
     """The policy's action at each of the first H states."""
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays by name, as stored in a file."""
-        return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
 
 
 def act_of(found: Sequence[Robust], sac: SACConfig, game: Game) -> Act:
